@@ -20,19 +20,6 @@ from pathlib import Path
 
 from unrender.backend import access
 
-__all__ = [
-    "ENVIRONMENT_VARIABLE",
-    "KERNELS",
-    "REFERENCES",
-    "bypassed",
-    "folder",
-    "root",
-    "size",
-    "tidy",
-    "trim",
-    "use_for_kernels",
-]
-
 ENVIRONMENT_VARIABLE = "UNRENDER_CACHE_DIR"
 REFERENCES, KERNELS = "references", "kernels"
 LARGEST = {REFERENCES: 1 << 29, KERNELS: 1 << 30}

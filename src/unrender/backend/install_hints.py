@@ -11,8 +11,6 @@ import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 
-__all__ = ["APT_LLVM", "NEEDS", "apt_packages", "command", "is_root", "manager"]
-
 NEEDS = ("llvm", "libatomic.so.1", "libstdc++.so.6", "venv")
 """What can be asked for."""
 

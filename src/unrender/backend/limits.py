@@ -7,8 +7,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["address_space", "cores", "free_memory", "group_memory", "most_address_space"]
-
 _GROUPS, _MOUNT, _MEMORY = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"), Path("/proc/meminfo")
 _STATUS = Path("/proc/self/status")
 _UNLIMITED = 1 << 60

@@ -20,21 +20,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = [
-    "ENVIRONMENT_VARIABLE",
-    "NEWEST",
-    "OLDEST",
-    "Library",
-    "candidates",
-    "choose",
-    "folders",
-    "identify",
-    "is_usable",
-    "missing_companions",
-    "version_by_asking",
-    "version_by_name",
-]
-
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 """What Dr.Jit reads, once, when it is imported."""
 

@@ -22,8 +22,6 @@ from typing import Any
 
 from unrender.core.errors import InputError
 
-__all__ = ["check_type", "only", "own_folder", "prefer_own", "search_paths"]
-
 _FOLDER = "plugins"
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,100}")
 _ENDING = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")

@@ -23,21 +23,6 @@ from unrender.core.errors import InputError, VariantError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.text import reason_of
 
-__all__ = [
-    "CUDA",
-    "LLVM",
-    "VARIANTS",
-    "check_threads",
-    "current",
-    "ensure",
-    "gpu_problem",
-    "has_cuda_driver",
-    "llvm_version",
-    "prepare",
-    "use",
-    "use_threads",
-]
-
 CUDA = "cuda_ad_rgb"
 LLVM = "llvm_ad_rgb"
 VARIANTS = (CUDA, LLVM)

@@ -9,8 +9,6 @@ from typing import Any
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
-__all__ = ["encode_text", "integer", "number"]
-
 
 def number(
     owner: str, name: str, value: Any, above: float = -math.inf, below: float = math.inf, inclusive: bool = False

@@ -7,8 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["solve"]
-
 
 def solve(
     gradient: np.ndarray,

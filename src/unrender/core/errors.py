@@ -2,8 +2,6 @@
 
 from unrender.core.text import one_line
 
-__all__ = ["InputError", "UnrenderError", "VariantError"]
-
 
 class UnrenderError(Exception):
     """Base of every error that `unrender` raises on purpose.

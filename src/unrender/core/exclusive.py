@@ -12,8 +12,6 @@ from typing import ParamSpec, TypeVar
 
 from unrender.core.errors import InputError
 
-__all__ = ["exclusive"]
-
 _Parameters = ParamSpec("_Parameters")
 _Returned = TypeVar("_Returned")
 

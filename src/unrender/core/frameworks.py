@@ -15,8 +15,6 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 
-__all__ = ["Framework", "framework", "host", "is_torch", "shape", "to_torch"]
-
 Framework = Literal["numpy", "drjit", "torch"]
 
 

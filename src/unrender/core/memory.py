@@ -16,17 +16,6 @@ import drjit as dr
 from unrender.core import arrays
 from unrender.core.arrays import Array
 
-__all__ = [
-    "LARGE",
-    "evaluate_in_turn",
-    "every",
-    "inner_products",
-    "is_large",
-    "small_parts",
-    "square",
-    "trim_cache",
-]
-
 LARGE = 1 << 20
 """Elements from which on an array is large: 4 MB. Of smaller ones the launches would cost more than the memory is worth."""
 

@@ -13,8 +13,6 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 
-__all__ = ["interior", "interior_shape", "pad", "repeat"]
-
 
 def interior_shape(shape: tuple[int, ...], columns: int) -> tuple[int, ...]:
     """Return the shape of the array without its repeated columns.

@@ -19,8 +19,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Protocol
 
-__all__ = ["Listener", "Stopwatch", "listening", "phase"]
-
 
 class Listener(Protocol):
     """Hears of the phases of all calls within `listening`. Phases may lie within one another."""
@@ -82,7 +80,6 @@ class Stopwatch:
         self._since = 0.0
 
     def on_phase(self, name: str) -> None:
-        """See `Listener.on_phase`."""
         self._charge()
         self._within.append(name)
         self.seconds.setdefault(name, 0.0)
@@ -91,7 +88,6 @@ class Stopwatch:
         """See `Listener.on_progress`."""
 
     def on_phase_end(self, name: str) -> None:
-        """See `Listener.on_phase_end`."""
         del name
         self._charge()
         self._within.pop()

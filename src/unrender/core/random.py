@@ -9,8 +9,6 @@ from typing import Any
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
-__all__ = ["LARGEST_SEED", "LEAST_SEED", "Key", "check_seed"]
-
 _MASK = 0xFFFFFFFFFFFFFFFF
 
 

@@ -33,20 +33,6 @@ from typing import Any, TypeVar, overload
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 
-__all__ = [
-    "GROUP",
-    "KINDS",
-    "Component",
-    "Kind",
-    "component_of",
-    "components",
-    "find",
-    "kind_of_protocol",
-    "register",
-    "state_modules",
-    "table_components",
-]
-
 GROUP = "unrender.components"
 """The entry-point group."""
 

@@ -6,8 +6,6 @@ import os
 import signal
 import sys
 
-__all__ = ["GRACEFUL", "end_at_once"]
-
 GRACEFUL = "unrender_graceful"
 """Attribute of a handler of SIGTERM in whose place a run may put its own, which ends the run after the present step."""
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}

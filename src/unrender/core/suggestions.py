@@ -6,8 +6,6 @@ import difflib
 import itertools
 from collections.abc import Iterable
 
-__all__ = ["did_you_mean"]
-
 _MOST, _LONGEST = 1000, 200
 """Names that are compared and their characters: comparing takes time, and names may come from a file that anybody made."""
 _SYNONYMS = {

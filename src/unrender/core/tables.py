@@ -23,9 +23,6 @@ from unrender.core.errors import InputError
 from unrender.core.registry import GROUP
 from unrender.core.suggestions import did_you_mean
 
-__all__ = ["NotStorable", "build", "component", "fields", "parse", "table"]
-
-
 _CALL = re.compile(r"\s*([A-Za-z_]\w*)\s*(?:\(([^()]*)\))?\s*")
 _NEXT = "then"
 """The field that takes what follows the word "then"."""

@@ -9,18 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-__all__ = [
-    "LONGEST_LINE",
-    "grouped",
-    "listed",
-    "one_line",
-    "plain",
-    "printable",
-    "reason_of",
-    "shorten",
-    "visible",
-]
-
 LONGEST_LINE = 1000
 """Characters of the longest message."""
 _NAMED = 4

@@ -7,8 +7,6 @@ from typing import Any
 
 from unrender.core import arrays
 
-__all__ = ["Tree", "add", "all_finite", "map", "numpy", "scale", "shapes", "subtract", "zeros_like"]
-
 Tree = dict[str, Any]
 
 

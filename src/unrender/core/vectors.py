@@ -10,8 +10,6 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.trees import Tree
 
-__all__ = ["clip_norm", "parts", "ravel", "repeat_per_element", "unravel"]
-
 
 def ravel(tree: Tree) -> np.ndarray:
     """All elements in key order, (n,), double precision. Waits for the device."""

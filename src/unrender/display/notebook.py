@@ -10,8 +10,6 @@ import numpy as np
 from unrender.display import pictures
 from unrender.display.plots import Chart
 
-__all__ = ["block", "charts", "facts", "lines", "picture_row"]
-
 _COLOURS = ("#2a6fdb", "#d9622b", "#1a9a6c", "#8a4fc4", "#b8860b", "#c2407f")
 _FEW_PIXELS = 200
 _SHOWN_WIDTH = 180

@@ -11,8 +11,6 @@ from typing import Any
 
 from unrender.core import phases
 
-__all__ = ["NotebookBar", "in_notebook", "shown"]
-
 _INTERVAL = 0.2
 
 

@@ -10,8 +10,6 @@ import numpy as np
 from unrender.io.thumbnails import reduced
 from unrender.losses.metrics import exposure, srgb
 
-__all__ = ["data_uri", "is_map", "plane", "planes", "png", "shown_image", "shown_map"]
-
 
 def png(colours: np.ndarray, effort: int = 6) -> bytes:
     """(H, W, 3) in [0, 1], as they are to be seen, as a PNG file; `effort` of compression, 0 to 9."""

@@ -10,8 +10,6 @@ import numpy as np
 
 from unrender.display import formatting
 
-__all__ = ["AXES", "Axis", "Chart", "Curve", "Line", "axis_format", "chart", "is_logarithmic"]
-
 AXES = ("seconds", "samples")
 """Horizontal axes."""
 WIDTH, HEIGHT = 420, 270

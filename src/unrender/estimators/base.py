@@ -27,8 +27,6 @@ from unrender.estimators.capabilities import (
 )
 from unrender.scene.problem import Problem
 
-__all__ = ["Estimate", "Estimator", "as_numpy"]
-
 C = TypeVar("C", bound=Capability)
 
 

@@ -11,21 +11,6 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
-__all__ = [
-    "BlockEstimate",
-    "Capabilities",
-    "Capability",
-    "FreshGradient",
-    "Gradient",
-    "Hessian",
-    "HessianNoise",
-    "HessianProduct",
-    "LossFunction",
-    "PastWeight",
-    "Smoothing",
-    "Variance",
-]
-
 
 @dataclass(frozen=True)
 class Capability:

@@ -19,18 +19,6 @@ from unrender.rendering.renderer import EmitterMoments, RenderSession, drawing_e
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler
 
-__all__ = [
-    "EmitterRequest",
-    "EmitterSelection",
-    "EmitterState",
-    "check",
-    "connections",
-    "init",
-    "learned",
-    "observed",
-    "request",
-]
-
 EmitterSelection = Literal["scene", "adaptive"]
 """Probabilities as the scene has them, uniform but for its sampling weights; or by the variance of the gradient."""
 

@@ -26,9 +26,6 @@ from unrender.preconditioners import grid
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler, upsampled
 
-__all__ = ["FilteredGradient", "FilteredGradientState", "details", "levels_of", "shrunk"]
-
-
 _TAPS = {-1: 0.25, 0: 0.5, 1: 0.25}
 """Of the smoothing along an axis."""
 _POOLED = 128 / 35

@@ -10,9 +10,6 @@ from unrender.core import arrays, memory
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
-__all__ = ["GradientSum", "damping", "smoothed_variance"]
-
-
 _SIDE = 9
 """Of the square of pixels that variances are averaged over, twice."""
 

@@ -24,8 +24,6 @@ from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler, upsampled
 from unrender.statistics import meta
 
-__all__ = ["MetaEstimator", "MetaState"]
-
 _PROPORTIONAL, _DIFFERENCE, _OBSERVED = 0, 1, 2  # streams of a step's key
 _PROPORTIONAL_SPP, _DIFFERENCE_SPP, _COUPLED_SPP = 2, 1, 3
 

@@ -28,19 +28,6 @@ from unrender.scene.batches import Frame, PixelBatch, PixelSample, WholeView, wh
 from unrender.scene.problem import Problem
 from unrender.scene.sample_counts import SampleCounts
 
-__all__ = [
-    "PIXELS",
-    "TREES",
-    "FrameGradient",
-    "GradientRequest",
-    "GradientSample",
-    "check_pixels",
-    "draws_pixels",
-    "estimate_frame",
-    "fresh_weights",
-    "leave_one_out_groups",
-]
-
 PIXELS = 1 << 32
 """The stream of a step's key that draws its pixels; the streams below are its frames'."""
 

@@ -40,9 +40,6 @@ from unrender.scene.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 from unrender.statistics import diagonal_curvature
 
-__all__ = ["SmoothedDerivatives", "SmoothedState"]
-
-
 _MOST_KEPT = 4096
 """Parameters up to which a Hessian is kept between steps."""
 _DIRECTIONS = 1

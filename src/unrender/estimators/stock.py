@@ -16,8 +16,6 @@ from unrender.estimators.path import PathGradient, PathGradientState
 from unrender.rendering.renderer import StockRenderer
 from unrender.scene.problem import Problem
 
-__all__ = ["StockGradient", "StockState"]
-
 
 @dataclass(frozen=True)
 class StockState:

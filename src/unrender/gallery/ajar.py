@@ -17,8 +17,6 @@ from unrender.losses import Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Ajar"]
-
 _LEAVES = 7
 
 

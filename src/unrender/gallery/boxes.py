@@ -16,8 +16,6 @@ from unrender.gallery import fields, parts, staging
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Box2", "Box10"]
-
 _GREY = 0.4
 """Of the wall behind."""
 

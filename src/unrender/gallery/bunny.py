@@ -15,8 +15,6 @@ from unrender.gallery import fields, mesh_files, meshes, parts, staging
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Bunny"]
-
 
 @register(name="bunny", position=19)
 @dataclass(frozen=True)

@@ -13,8 +13,6 @@ from unrender.gallery import fields, meshes, parts, staging, textures
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Camera"]
-
 _PLACES = {"left": (-1.95, 1.36, 1.95), "middle": (0.15, 1.89, 2.55), "right": (2.18, 1.06, 1.5)}
 _TARGET = (0.0, 0.35, 0.0)
 _TURN, _SHIFT = np.radians(2.0), 0.02

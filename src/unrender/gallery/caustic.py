@@ -18,8 +18,6 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Caustic"]
-
 _RADIUS, _HEIGHT = 0.34, 0.85
 """Of the balls, and of their middles above the floor."""
 

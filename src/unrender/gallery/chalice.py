@@ -17,8 +17,6 @@ from unrender.losses import Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Chalice"]
-
 _LIGHTS = ((-1.4, 2.6, 1.6), (1.5, 2.2, 1.2), (0.2, 2.9, 2.2), (-1.9, 1.2, 0.4), (2.0, 1.0, 0.2), (0.0, 2.4, -1.2))
 
 

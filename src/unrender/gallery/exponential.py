@@ -14,8 +14,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["Exponential"]
-
 _MEAN, _START = 2.0, 1.5
 
 

@@ -12,8 +12,6 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.losses import Loss
 
-__all__ = ["LOSS", "Option", "fill", "integer", "max_depth", "of", "reference_spp", "resolution", "texture_resolution"]
-
 
 @dataclass(frozen=True)
 class Option:

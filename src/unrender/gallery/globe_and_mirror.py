@@ -17,8 +17,6 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["GlobeAndMirror"]
-
 _GLOBE, _INNER, _OUTER = 0.72, 0.92, 1.0
 """Radii of the globe and of the two sides of the glass."""
 _EYE, _MIRROR = np.array([1.4, 0.8, 6.0]), np.array([-2.1, 0.1, -1.5])

@@ -19,8 +19,6 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["GlossyRoom"]
-
 _LIGHTS = [
     # centre, normal
     *(((x, 2.99, z), (0, -1, 0)) for z in (0.3, 2.2) for x in (-1.2, 0.1, 1.3)),

@@ -16,8 +16,6 @@ from unrender.losses import L1, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["IndirectRoom"]
-
 
 @register(name="indirect-room", position=1)
 @dataclass(frozen=True)

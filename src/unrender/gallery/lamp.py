@@ -16,8 +16,6 @@ from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import Loss, RelativeL2
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Lamp"]
-
 _BULB = np.array([0.86, 1.68, -0.25])
 """The middle of the bulb."""
 

@@ -12,8 +12,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.description import load
 
-__all__ = ["centred", "option", "standing"]
-
 _KINDS = (".ply", ".obj")
 
 

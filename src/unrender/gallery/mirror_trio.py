@@ -17,8 +17,6 @@ from unrender.gallery import fields, meshes, parts
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["MirrorTrio"]
-
 _ALPHA = 0.06
 """The mirror's roughness in truth."""
 

@@ -18,8 +18,6 @@ from unrender.gallery import fields, meshes, parts, staging, textures
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Mug"]
-
 _SIDE = np.radians(105.0)
 """Where the handle is in truth: 0 is towards the camera, a right angle to its right."""
 

@@ -19,8 +19,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["NerfVolume"]
-
 
 @register(name="nerf-volume", position=25)
 @dataclass(frozen=True)

@@ -8,22 +8,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-__all__ = [
-    "CLEAR",
-    "Vector",
-    "camera",
-    "colour",
-    "diffuse",
-    "environment",
-    "light",
-    "picture",
-    "rectangle",
-    "room",
-    "twosided",
-    "uplight",
-]
-
-
 Vector = Sequence[float] | np.ndarray
 
 

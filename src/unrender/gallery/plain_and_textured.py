@@ -17,8 +17,6 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["PlainAndTextured"]
-
 
 @register(name="plain-and-textured", position=10)
 @dataclass(frozen=True)

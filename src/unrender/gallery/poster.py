@@ -16,8 +16,6 @@ from unrender.gallery import fields, parts, textures
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Poster"]
-
 
 @register(name="poster", position=20)
 @dataclass(frozen=True)

@@ -14,8 +14,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["Quad"]
-
 _MATRIX = np.array([[5.0, 3.75], [3.75, 5.0]])
 _START = (1.5, 1.0)
 

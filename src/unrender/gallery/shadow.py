@@ -17,8 +17,6 @@ from unrender.gallery import fields, parts, staging
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Shadow"]
-
 _SUN = np.array([0.4, 1.0, -0.25])
 _HEIGHT = 4.0
 _RADIUS = 0.32

@@ -19,8 +19,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["ShadowArt"]
-
 _RADIUS = 0.7
 _WALL = 3.4
 _SPACING = 0.05

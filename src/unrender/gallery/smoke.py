@@ -17,8 +17,6 @@ from unrender.gallery import fields, textures, volumes
 from unrender.losses import L1, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Smoke"]
-
 
 @register(name="smoke", position=24)
 @dataclass(frozen=True)

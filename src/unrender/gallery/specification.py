@@ -35,9 +35,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["ProblemSource", "Specification", "build_problem", "digest", "recall", "reference"]
-
-
 _FORMAT = 2
 _NAME = "reference"
 _ADDRESS = re.compile(r"\bobject_\d+|0x[0-9a-f]+|\[\d{9,}\]")

@@ -16,8 +16,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["SphereToBunny"]
-
 _CENTRE, _RADIUS = np.array([0.0, -0.15, 0.0]), 0.62
 _SPACING = 0.035
 _PARTS = (

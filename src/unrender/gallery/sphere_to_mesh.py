@@ -21,8 +21,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["SphereToMesh"]
-
 _RADIUS = 0.7
 """Of the sphere; the body fits into a ball of radius 1 or so."""
 

@@ -16,8 +16,6 @@ from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import Loss, RelativeL2
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Spiral"]
-
 _TURNS = 2.5
 
 

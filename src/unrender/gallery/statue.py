@@ -16,8 +16,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["Statue"]
-
 _RADIUS = 0.68
 _FINE = 5
 """Subdivisions of the true mesh."""

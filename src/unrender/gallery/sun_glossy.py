@@ -17,8 +17,6 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["SunGlossy"]
-
 _SUN = np.array([0.5, 0.55, 0.67]) / np.linalg.norm([0.5, 0.55, 0.67])
 """Direction to the sun."""
 

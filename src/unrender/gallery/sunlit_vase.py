@@ -24,9 +24,6 @@ from unrender.losses import L1, Loss
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.scene.parameter import Parameter
 
-__all__ = ["SUN", "SunlitVase", "photographs", "vase"]
-
-
 SUN = np.array([-0.55, 0.62, 0.56]) / np.linalg.norm([-0.55, 0.62, 0.56])
 """Direction to the sun."""
 _SUN_RADIUS = np.radians(2.5)

@@ -14,8 +14,6 @@ from unrender.gallery import fields, parts
 from unrender.losses import L1, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Tea"]
-
 
 @register(name="tea", position=23)
 @dataclass(frozen=True)

@@ -15,8 +15,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.io.images import srgb_to_linear
 
-__all__ = ["Photograph", "bitmap", "grid", "photograph", "ramp"]
-
 Photograph = Literal["astronaut", "chelsea", "coffee", "rocket", "brick", "gravel", "grass"]
 """Those that lie inside scikit-image's wheel, so that nothing is downloaded."""
 

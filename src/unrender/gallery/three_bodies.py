@@ -10,8 +10,6 @@ from unrender.gallery import fields, parts
 from unrender.losses import L1, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["ThreeBodies"]
-
 
 @register(name="three-bodies", position=22)
 @dataclass(frozen=True)

@@ -18,8 +18,6 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["ThreeTextures"]
-
 _SUN = np.array([0.45, 0.7, 0.55]) / np.linalg.norm([0.45, 0.7, 0.55])
 """Direction to the sun."""
 _APART = 0.72

@@ -17,8 +17,6 @@ from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
-__all__ = ["TwoPlanets", "blue", "red", "shell", "sky"]
-
 _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
 """Radii of the planets and of the two sides of the glass."""
 

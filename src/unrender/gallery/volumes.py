@@ -9,8 +9,6 @@ import numpy as np
 
 from unrender.gallery import parts
 
-__all__ = ["around", "cube", "grid", "noise", "positions"]
-
 
 def grid(values: np.ndarray) -> dict[str, Any]:
     """A volume over the cube [-1, 1]³, linear between the middles of its voxels.

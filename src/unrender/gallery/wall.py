@@ -16,8 +16,6 @@ from unrender.gallery.indirect_room import IndirectRoom
 from unrender.losses import L1, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["Wall"]
-
 
 @register(name="wall", position=26)
 @dataclass(frozen=True)

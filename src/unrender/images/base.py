@@ -15,8 +15,6 @@ from unrender.scene.batches import Frame, PixelSample
 from unrender.scene.problem import Problem
 from unrender.scene.sample_counts import SampleCounts
 
-__all__ = ["ImageEstimate", "ImageEstimator", "PairRequest", "leave_one_out", "variance_of_mean"]
-
 
 @dataclass(frozen=True)
 class ImageEstimate:

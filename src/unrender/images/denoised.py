@@ -20,8 +20,6 @@ from unrender.rendering.renderer import Space
 from unrender.scene.batches import Frame, PixelSample
 from unrender.scene.problem import Problem
 
-__all__ = ["Denoised"]
-
 
 @register
 @dataclass(frozen=True)
@@ -83,7 +81,6 @@ class Denoised:
         key: Key,
         pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, Any]:
-        """See `ImageEstimator.estimate`."""
         found, kept = self.inner.estimate(
             problem, parameters, state, frame, spp, self._groups(groups), key, pair_request
         )
@@ -95,17 +92,14 @@ class Denoised:
         return True
 
     def prepare(self, problem: Problem, state: Any) -> Any:
-        """See `ImageEstimator.prepare`."""
         del problem
         return state
 
     def learn(self, problem: Problem, state: Any, sample: PixelSample, kept: Any) -> Any:
-        """See `ImageEstimator.learn`."""
         del problem, sample, kept
         return state
 
     def advance(self, parameters: Tree, state: Any, kept: tuple[Any, ...]) -> Any:
-        """See `ImageEstimator.advance`."""
         return self.inner.advance(parameters, state, kept)
 
     def _groups(self, asked: int) -> int:

@@ -17,8 +17,6 @@ from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 
-__all__ = ["Denoiser", "choose", "denoise"]
-
 Denoiser = Literal["auto", "oidn", "optix", "variation"]
 """Who denoises: "oidn" (package pyoidn), "optix" (Mitsuba's, where its variant runs on a GPU), "variation" (scikit-image's total
 variation, for maps: it keeps the mean, and knows nothing of how pictures look), or "auto": optix where it runs, else oidn."""

@@ -14,8 +14,6 @@ from unrender.scene.batches import Frame, PixelSample, WholeView
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["Plain", "PlainState"]
-
 
 @dataclass(frozen=True)
 class PlainState:
@@ -43,7 +41,6 @@ class Plain:
         return True
 
     def init(self, problem: Problem, parameters: Tree) -> PlainState:
-        """See `ImageEstimator.init`."""
         del problem, parameters
         return PlainState()
 
@@ -58,7 +55,6 @@ class Plain:
         key: Key,
         pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, None]:
-        """See `ImageEstimator.estimate`."""
         del state
         request = frame.request(spp, key.uint32(), groups)
         if pair_request is None:
@@ -77,16 +73,13 @@ class Plain:
         return False
 
     def prepare(self, problem: Problem, state: PlainState) -> PlainState:
-        """See `ImageEstimator.prepare`."""
         del problem
         return state
 
     def learn(self, problem: Problem, state: PlainState, sample: PixelSample, kept: Any) -> PlainState:
-        """See `ImageEstimator.learn`."""
         del problem, sample, kept
         return state
 
     def advance(self, parameters: Tree, state: PlainState, kept: tuple[Any, ...]) -> PlainState:
-        """See `ImageEstimator.advance`."""
         del parameters, kept
         return state

@@ -27,8 +27,6 @@ from unrender.scene.upsampling import Upsampler
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
 
-__all__ = ["RecursiveControlVariate", "RecursiveControlVariateState", "Snapshot", "ViewMemory"]
-
 _MOST_PIXELS = 64
 """Of all views for each of a mini-batch's, for its samples to be remembered: to add them takes time by the number of all."""
 
@@ -150,7 +148,6 @@ class RecursiveControlVariate:
             raise InputError(f"RecursiveControlVariate: max_weight must be in (0, 1], got {self.max_weight!r}")
 
     def init(self, problem: Problem, parameters: Tree) -> RecursiveControlVariateState:
-        """See `ImageEstimator.init`."""
         del problem, parameters
         return RecursiveControlVariateState()
 
@@ -164,7 +161,6 @@ class RecursiveControlVariate:
         return batches >= self.whole_views or self._is_first(parameters, state)
 
     def prepare(self, problem: Problem, state: RecursiveControlVariateState) -> RecursiveControlVariateState:
-        """See `ImageEstimator.prepare`."""
         del problem
         parts = [(memory.image, self._weight(memory), memory.relative_variance) for memory in state.views]
         return replace(
@@ -322,7 +318,6 @@ class RecursiveControlVariate:
     def advance(
         self, parameters: Tree, state: RecursiveControlVariateState, kept: tuple[Any, ...]
     ) -> RecursiveControlVariateState:
-        """See `ImageEstimator.advance`."""
         return RecursiveControlVariateState(parameters, kept, step=state.step + 1)
 
     def _is_first(self, parameters: Tree, state: RecursiveControlVariateState) -> bool:

@@ -27,24 +27,6 @@ from unrender.core.text import printable, shorten, visible
 from unrender.io import files
 from unrender.io.npy_format import MalformedHeader, Shape, read_npy
 
-__all__ = [
-    "LARGEST_ARRAY",
-    "LARGEST_JSON",
-    "LARGEST_TEXT",
-    "exists",
-    "kind",
-    "no_file",
-    "open_regular",
-    "parse_json",
-    "parse_object",
-    "read_array",
-    "read_arrays",
-    "read_bytes",
-    "read_float_arrays",
-    "read_object",
-    "read_text",
-]
-
 LARGEST_TEXT = 1 << 28
 """Of a text file, in bytes."""
 LARGEST_JSON = 16 << 20

@@ -17,8 +17,6 @@ from pathlib import Path
 from unrender.core.errors import InputError
 from unrender.core.text import shorten, visible
 
-__all__ = ["VARIABLE", "allow", "check", "is_confined", "is_outside_allowed", "within"]
-
 VARIABLE = "UNRENDER_ALLOW_OUTSIDE"
 """Environment variable that allows files outside: any value but "" and "0". Worker processes inherit it."""
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from unrender.core import periodic
 
-__all__ = ["MESH_FILES", "PLAIN", "FileConversion"]
-
 MESH_FILES = (".obj", ".ply", ".serialized")
 """File name endings of meshes."""
 

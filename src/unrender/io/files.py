@@ -27,24 +27,6 @@ from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
-__all__ = [
-    "COMPRESSED_BYTES",
-    "check_member",
-    "check_replaceable",
-    "flush",
-    "make_folder",
-    "member_leads_out",
-    "remove",
-    "remove_leftovers",
-    "replace_folder",
-    "sync_folder",
-    "sync_tree",
-    "temporary",
-    "write",
-    "write_arrays",
-    "write_folder",
-]
-
 _T = TypeVar("_T")
 
 PARTIAL, RETIRED = "part", "old"

@@ -19,8 +19,6 @@ from PIL import Image, UnidentifiedImageError
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, tiff_header
 
-__all__ = ["LONGEST_SIDE", "MOST_VALUES", "Header", "Sizes", "check", "read_photograph_header"]
-
 MOST_VALUES = 1 << 28
 """Pixels times channels of the largest picture that is decoded: one gigabyte in single precision."""
 

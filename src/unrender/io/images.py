@@ -13,8 +13,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import bounded_files, image_size
 
-__all__ = ["READABLE", "Picture", "luminance", "read", "resize", "srgb_to_linear", "xyz_to_rgb"]
-
 READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
 """File name endings that `read` knows."""
 

@@ -22,9 +22,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.io import bounded_files
 
-__all__ = ["LARGEST", "check_obj", "check_ply", "check_serialized", "obj", "ply", "rows", "upwards"]
-
-
 LARGEST = 1 << 32
 """Of a file, in bytes."""
 _LARGEST_HEADER = 1 << 16

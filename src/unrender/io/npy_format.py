@@ -12,8 +12,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
-__all__ = ["MalformedHeader", "Shape", "read_npy"]
-
 Shape = tuple[int, ...]
 
 _AXES = 32

@@ -12,8 +12,6 @@ from unrender.core.errors import InputError
 from unrender.io import images, resampling, volumes
 from unrender.io.file_conversion import MESH_FILES, PLAIN, FileConversion
 
-__all__ = ["fill"]
-
 
 def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> tuple[np.ndarray, str]:
     """Return `initial` as float32 of `shape`, and a notice on what was done to it ("" if nothing).

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-__all__ = ["downsample", "resize", "upsample"]
-
 
 def upsample(values: np.ndarray, size: Sequence[int], wrap: Sequence[bool] = ()) -> np.ndarray:
     """The linear interpolant of `values` at the middles of finer texels.

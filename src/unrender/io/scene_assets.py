@@ -14,9 +14,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import shorten
 from unrender.io import bounded_files, image_size, mesh_files, spectrum_files, volumes
 
-__all__ = ["MOST_VALUES", "AssetChecks", "check_tensors"]
-
-
 MOST_VALUES = 1 << 30
 """Of all pictures and grids of a scene together."""
 _LARGEST = 1 << 32

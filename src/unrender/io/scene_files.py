@@ -18,8 +18,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import shorten
 from unrender.io import bounded_files, spectrum_files
 
-__all__ = ["SceneFiles", "of", "read", "resolve"]
-
 _DEEPEST = 128
 _DEEPEST_INCLUDE = 14
 _MOST_INCLUDES = 1000

@@ -7,8 +7,6 @@ from pathlib import Path
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
 
-__all__ = ["check"]
-
 _LARGEST = 1 << 20
 
 

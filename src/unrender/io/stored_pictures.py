@@ -12,8 +12,6 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
-__all__ = ["PictureStore", "StoredPicture"]
-
 _PAGE = mmap.ALLOCATIONGRANULARITY
 _LEVELS = 255
 

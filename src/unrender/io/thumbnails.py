@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["reduced", "resize_nearest"]
-
 
 def resize_nearest(coarse: np.ndarray, height: int, width: int) -> np.ndarray:
     """(rows, columns, ...) as (height, width, ...), each pixel that of the place it lies in."""

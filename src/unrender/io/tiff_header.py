@@ -12,8 +12,6 @@ from typing import IO
 
 from unrender.core.errors import InputError
 
-__all__ = ["MAGICS", "TiffHeader", "read", "without_orientation"]
-
 MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 """First bytes of a file."""
 

@@ -10,8 +10,6 @@ from typing import Any
 from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
 
-__all__ = ["LARGEST", "Place", "array_table", "check", "dotted", "encode", "find", "parse"]
-
 if sys.version_info >= (3, 11):
     import tomllib
 else:  # pragma: no cover

@@ -14,8 +14,6 @@ from unrender.core.suggestions import did_you_mean
 from unrender.io import bounded_files, toml_lines
 from unrender.io.toml_lines import Place, dotted
 
-__all__ = ["Table", "error_at", "read"]
-
 
 class Table(BaseModel):
     """The fields of one table. Each has a description: what is expected there."""

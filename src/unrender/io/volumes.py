@@ -20,8 +20,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, files
 
-__all__ = ["MOST_VALUES", "READABLE", "UNIT_BOX", "Grid", "Shape", "check_vol", "read_grid", "read_numpy", "write_grid"]
-
 READABLE = (".vol", ".npy", ".npz")
 """File name endings that `read_grid` knows."""
 

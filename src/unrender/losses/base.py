@@ -6,8 +6,6 @@ from typing import Protocol
 
 from unrender.core.arrays import Array
 
-__all__ = ["Loss"]
-
 
 class Loss(Protocol):
     """How far an image is from its reference, element by element. Arrays of any equal shape, linear radiance."""

@@ -11,8 +11,6 @@ from unrender.core.registry import register
 from unrender.losses.base import Loss
 from unrender.losses.pixelwise import L1
 
-__all__ = ["Censored"]
-
 
 @register(position=6)
 @dataclass(frozen=True)
@@ -51,7 +49,6 @@ class Censored:
         return True
 
     def value(self, image: Array, reference: Array) -> Array:
-        """See `Loss.value`."""
         return self.loss.value(self._censored(image, reference), reference)
 
     def derivative(self, image: Array, reference: Array) -> Array:

@@ -17,8 +17,6 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 
-__all__ = ["FunctionLoss"]
-
 Way = Literal["drjit", "torch"]
 
 

@@ -23,8 +23,6 @@ from unrender.core.suggestions import did_you_mean
 from unrender.core.text import reason_of
 from unrender.io import bounded_files
 
-__all__ = ["LAYERS", "Perceptual"]
-
 _SAFE_UNPICKLER = (2, 6)
 """PyTorch before this version runs code from a file also with `weights_only` (CVE-2025-32434)."""
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))

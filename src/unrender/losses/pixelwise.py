@@ -8,8 +8,6 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 
-__all__ = ["L1", "L2", "Huber", "RelativeL2"]
-
 
 class _Pixelwise:
     """Of every loss here."""
@@ -40,11 +38,9 @@ class L1(_WithNonlinearDerivative):
     """|I − R|. The derivative is the sign (0 where equal): noise biases it, the more the closer I is to R."""
 
     def value(self, image: Array, reference: Array) -> Array:
-        """See `Loss.value`."""
         return arrays.absolute(image - reference)
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """See `Loss.derivative`."""
         return arrays.sign(image - reference)
 
 
@@ -54,12 +50,10 @@ class L2(_WithLinearDerivative):
     """(I − R)²."""
 
     def value(self, image: Array, reference: Array) -> Array:
-        """See `Loss.value`."""
         difference = image - reference
         return difference * difference
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """See `Loss.derivative`."""
         return 2.0 * (image - reference)
 
 
@@ -82,12 +76,10 @@ class RelativeL2(_WithLinearDerivative):
         checks.number("RelativeL2", "epsilon", self.epsilon, above=0.0)
 
     def value(self, image: Array, reference: Array) -> Array:
-        """See `Loss.value`."""
         difference = image - reference
         return difference * difference / (reference * reference + self.epsilon)
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """See `Loss.derivative`."""
         return 2.0 * (image - reference) / (reference * reference + self.epsilon)
 
 
@@ -106,11 +98,9 @@ class Huber(_WithNonlinearDerivative):
         checks.number("Huber", "delta", self.delta, above=0.0)
 
     def value(self, image: Array, reference: Array) -> Array:
-        """See `Loss.value`."""
         distance = arrays.absolute(image - reference)
         near = arrays.minimum(distance, self.delta)
         return near * (distance - 0.5 * near)
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """See `Loss.derivative`."""
         return arrays.clip(image - reference, -self.delta, self.delta)

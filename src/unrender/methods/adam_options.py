@@ -17,8 +17,6 @@ from unrender.optimizers.base import Optimizer
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 
-__all__ = ["AdamOptions", "PathOptions", "SamplingOptions"]
-
 
 class AdamOptions(Options):
     """Options of every method that descends with Adam."""

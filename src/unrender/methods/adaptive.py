@@ -16,8 +16,6 @@ from unrender.methods.adam_options import SamplingOptions
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
 
-__all__ = ["AdaptiveMethod"]
-
 
 @register(name="adaptive", position=5)
 class AdaptiveMethod(SamplingOptions):
@@ -42,7 +40,6 @@ class AdaptiveMethod(SamplingOptions):
     whole_views: PositiveInt = Field(20, description="steps between those of whole views, where image is rcv")
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`."""
         image = Plain() if self.image == "plain" else RecursiveControlVariate(whole_views=self.whole_views)
         return PathGradient(image, self._sampler(), self.spp, **self.sampling()), self.optimizer()
 

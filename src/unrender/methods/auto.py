@@ -21,8 +21,6 @@ from unrender.optimizers.base import Optimizer
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.scene.problem import Problem
 
-__all__ = ["AutoMethod"]
-
 
 @register(name="auto", position=0)
 class AutoMethod(Options):

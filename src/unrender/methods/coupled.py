@@ -14,8 +14,6 @@ from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.meta import MetaCommonOptions
 from unrender.optimizers.base import Optimizer
 
-__all__ = ["CoupledMethod"]
-
 
 @register(name="coupled", position=4)
 class CoupledMethod(MetaCommonOptions):
@@ -27,7 +25,6 @@ class CoupledMethod(MetaCommonOptions):
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`."""
         image = Plain()
         if self.image == "rcv":
             image = RecursiveControlVariate("primary" if self.space == "primary" else "path")

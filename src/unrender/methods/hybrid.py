@@ -28,8 +28,6 @@ from unrender.optimizers.meta_adam import MetaAdam
 from unrender.pixels.base import PixelSampler
 from unrender.scene.problem import Problem
 
-__all__ = ["HybridMethod"]
-
 _IMAGE_MEMORY, _GRADIENT_MEMORY = 0.95, 0.8
 """Greatest weights of the past, of images and gradients: what is remembered for longer is noise that no optimizer averages."""
 

@@ -15,8 +15,6 @@ from unrender.optimizers.base import Optimizer
 from unrender.optimizers.meta_adam import MetaAdam
 from unrender.statistics import meta
 
-__all__ = ["MetaCommonOptions", "MetaMethod"]
-
 
 class MetaCommonOptions(Options):
     """Options of `meta` and of `coupled`."""
@@ -72,6 +70,5 @@ class MetaMethod(MetaCommonOptions):
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`."""
         spp, images = (self.proportional_spp, self.difference_spp), self.difference_images
         return MetaEstimator(*spp, difference_images=images, **self.shared()), self.built_optimizer()

@@ -8,13 +8,10 @@ from unrender.images.plain import Plain
 from unrender.methods.adam_options import PathOptions
 from unrender.optimizers.base import Optimizer
 
-__all__ = ["PlainMethod"]
-
 
 @register(name="plain", position=1)
 class PlainMethod(PathOptions):
     """a fresh rendering each step, leave-one-out sample groups, Adam"""
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`."""
         return self.estimator(Plain()), self.optimizer()

@@ -14,8 +14,6 @@ from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.parameter import ParameterSettings
 from unrender.scene.problem import Problem
 
-__all__ = ["Plan"]
-
 _COMPONENTS = ("estimator", "optimizer")
 
 

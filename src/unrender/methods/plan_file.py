@@ -14,8 +14,6 @@ from unrender.io import bounded_files, toml_lines
 from unrender.methods.plan import Plan
 from unrender.scene.problem import Problem
 
-__all__ = ["SUFFIX", "PlanFile", "text"]
-
 SUFFIX = ".toml"
 _LONGEST = 1 << 20
 

@@ -12,8 +12,6 @@ from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.adam_options import PathOptions
 from unrender.optimizers.base import Optimizer
 
-__all__ = ["RecursiveControlVariateMethod"]
-
 
 @register(name="rcv", position=2)
 class RecursiveControlVariateMethod(PathOptions):
@@ -34,6 +32,5 @@ class RecursiveControlVariateMethod(PathOptions):
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`."""
         image = RecursiveControlVariate(self.space, self.alpha, self.beta, max_weight=self.max_weight)
         return self.estimator(image), self.optimizer()

@@ -17,8 +17,6 @@ from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.methods.base import Options, parse_schedule
 from unrender.optimizers.base import Optimizer
 
-__all__ = ["SmoothedMethod", "parse_widths", "widths_of"]
-
 _WIDTH = pydantic.TypeAdapter(PositiveFloat)
 
 
@@ -50,7 +48,6 @@ class SmoothedMethod(Options):
     iterations: PositiveInt = Field(3, description="products with the Hessian a step, of newton-cg")
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`."""
         schedule, sigma = parse_schedule(self.sigma_schedule), parse_widths(self.sigma)
         common = sigma["*"] if isinstance(sigma, dict) else sigma
         if self.optimizer == "cma-es":

@@ -10,8 +10,6 @@ from unrender.estimators.stock import StockGradient
 from unrender.methods.adam_options import AdamOptions
 from unrender.optimizers.base import Optimizer
 
-__all__ = ["StockMethod"]
-
 
 @register(name="stock", position=8)
 class StockMethod(AdamOptions):
@@ -20,5 +18,4 @@ class StockMethod(AdamOptions):
     spp: PositiveInt = Field(16, description="samples per pixel of the image, and as many of the adjoint")
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`."""
         return StockGradient(self.spp), self.optimizer()

@@ -15,8 +15,6 @@ from unrender.optimizers.transforms.momentum import GradientMean
 from unrender.optimizers.transforms.scale import ScaleByRms
 from unrender.schedules.functions import Schedule
 
-__all__ = ["Adam"]
-
 
 @register
 @dataclass(frozen=True)
@@ -53,5 +51,4 @@ class Adam(Recipe):
             raise InputError(f"Adam: uniform must be true or false, got {self.uniform!r}")
 
     def compose(self) -> tuple[StepTransform, ...]:
-        """See `Recipe.compose`."""
         return GradientMean(self.beta_1), ScaleByRms(self.beta_2, self.epsilon, self.uniform)

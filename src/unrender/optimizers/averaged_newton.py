@@ -16,8 +16,6 @@ from unrender.optimizers import rates
 from unrender.optimizers.directions import coordinate_scales
 from unrender.optimizers.newton import trust_region_step
 
-__all__ = ["AveragedNewton", "AveragedNewtonState"]
-
 
 @dataclass(frozen=True)
 class AveragedNewtonState:
@@ -89,7 +87,6 @@ class AveragedNewton:
         return Capabilities(Gradient, Hessian)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> AveragedNewtonState:
-        """See `Optimizer.init`."""
         own = rates.per_parameter("AveragedNewton", parameters, self.learning_rate, learning_rates)
         n = vectors.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)

@@ -10,8 +10,6 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["Choosing", "OnMeshes", "Optimizer"]
-
 
 class Optimizer(Protocol):
     """Computes steps from estimates. Immutable; all that changes is in the state."""

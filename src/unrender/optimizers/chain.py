@@ -20,8 +20,6 @@ from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 from unrender.schedules.functions import Schedule
 
-__all__ = ["Chain", "ChainState", "Recipe"]
-
 S = TypeVar("S")
 
 
@@ -79,7 +77,6 @@ class Recipe(ABC):
         return Capabilities(Gradient, *(kind for part in self._composed for kind in part.requires))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
-        """See `Optimizer.init`."""
         own = rates.per_parameter(type(self).__name__, parameters, self.learning_rate, learning_rates)
         return ChainState(0, own, tuple(part.init(parameters, own) for part in self._composed))
 
@@ -128,12 +125,10 @@ class Chain(Recipe):
         object.__setattr__(self, "transforms", checked_transforms("Chain: transforms", self.transforms))
 
     def compose(self) -> tuple[StepTransform, ...]:
-        """See `Recipe.compose`."""
         return self.transforms
 
     def on_meshes(
         self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
     ) -> Chain:
-        """See `OnMeshes.on_meshes`."""
         bound = (part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part for part in self.transforms)
         return replace(self, transforms=tuple(bound))  # pyright: ignore[reportArgumentType]

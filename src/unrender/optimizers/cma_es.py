@@ -19,8 +19,6 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.optimizers import rates
 
-__all__ = ["CMAES", "CMAESState"]
-
 _TOLERANCE = 0.01
 """Distance of the parameters from the mean, in standard deviations, up to which they count as equal."""
 
@@ -101,7 +99,6 @@ class CMAES:
         return Capabilities(LossFunction)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> CMAESState:
-        """See `Optimizer.init`."""
         own = rates.per_parameter("CMAES", parameters, self.learning_rate, learning_rates)
         start = vectors.ravel(parameters) / vectors.repeat_per_element(own, parameters)
         population = self.population or 4 + math.floor(3 * math.log(start.size))

@@ -23,8 +23,6 @@ from unrender.optimizers.chain import ChainState
 from unrender.scene.upsampling import NotCarried, Upsampler
 from unrender.schedules.functions import Schedule
 
-__all__ = ["DirectionOptions", "NewtonState", "apply_direction", "check_options", "coordinate_scales", "init_state"]
-
 
 @dataclass(frozen=True)
 class NewtonState:

@@ -23,8 +23,6 @@ from unrender.optimizers.directions import (
 )
 from unrender.schedules.functions import Schedule
 
-__all__ = ["LBFGS", "LBFGSState"]
-
 _FIRST_STEP = 0.1
 """Length of a step before any curvature is known, as a fraction of the trust radius."""
 
@@ -96,7 +94,6 @@ class LBFGS:
         return Capabilities(Gradient)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> LBFGSState:
-        """See `Optimizer.init`."""
         n = sum(math.prod(arrays.shape(x)) for x in parameters.values())
         none, rows = np.zeros(n), np.zeros((self.history, n))
         return LBFGSState(init_state("LBFGS", self, parameters, learning_rates), none, none, rows, rows)

@@ -15,8 +15,6 @@ from unrender.optimizers.transforms.base import StepTransform
 from unrender.optimizers.transforms.scale import ClipDirection, ScaleByDeviation
 from unrender.schedules.functions import Schedule
 
-__all__ = ["MetaAdam"]
-
 
 @register
 @dataclass(frozen=True)
@@ -63,6 +61,5 @@ class MetaAdam(Recipe):
             raise InputError(f"MetaAdam: rule must be one of deviation, walk, got {self.rule!r}")
 
     def compose(self) -> tuple[StepTransform, ...]:
-        """See `Recipe.compose`."""
         scale = ScaleByDeviation(self.epsilon, self.rule)
         return (scale,) if self.longest is None else (scale, ClipDirection(self.longest))

@@ -103,7 +103,6 @@ class Newton:
         return Capabilities(Gradient, Hessian)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> NewtonState:
-        """See `Optimizer.init`."""
         return init_state("Newton", self, parameters, learning_rates)
 
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:

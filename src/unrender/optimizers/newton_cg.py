@@ -22,8 +22,6 @@ from unrender.optimizers.directions import (
 )
 from unrender.schedules.functions import Schedule
 
-__all__ = ["NewtonCG"]
-
 
 @register
 @dataclass(frozen=True)
@@ -85,7 +83,6 @@ class NewtonCG:
         return Capabilities(Gradient, HessianProduct, *([LossFunction] if self.line else []))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> NewtonState:
-        """See `Optimizer.init`."""
         return init_state("NewtonCG", self, parameters, learning_rates)
 
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:

@@ -18,8 +18,6 @@ from unrender.optimizers.base import Choosing, OnMeshes, Optimizer
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
-__all__ = ["Partitioned", "PartitionedState"]
-
 
 @dataclass(frozen=True)
 class PartitionedState:
@@ -79,7 +77,6 @@ class Partitioned:
     def on_meshes(
         self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
     ) -> Partitioned:
-        """See `OnMeshes.on_meshes`."""
         own, others = (
             part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part
             for part in (self.optimizer, self.others)
@@ -96,7 +93,6 @@ class Partitioned:
         return PartitionedState(self.optimizer.init(own, rates_own), self.others.init(others, rates_others))
 
     def update(self, estimate: Estimate, state: PartitionedState, parameters: Tree) -> tuple[Tree, PartitionedState]:
-        """See `Optimizer.update`."""
         points, gradients = self._parts(parameters), self._parts(estimate.gradient)
         fresh = estimate.get(FreshGradient)
         told = ({}, {}) if fresh is None else self._parts(fresh.values)

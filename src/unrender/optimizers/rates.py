@@ -11,8 +11,6 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.schedules.functions import Schedule
 
-__all__ = ["check", "factor", "per_parameter"]
-
 
 def check(owner: str, learning_rate: Any, schedule: Any) -> None:
     """Raise `InputError` unless `learning_rate` is a positive number, or {key: one, "*": of the others}, and `schedule` a schedule or

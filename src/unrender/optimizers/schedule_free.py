@@ -21,8 +21,6 @@ from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.schedules.functions import Schedule
 
-__all__ = ["ScheduleFree"]
-
 
 @register
 @dataclass(frozen=True)
@@ -99,7 +97,6 @@ class ScheduleFree(Recipe):
     def on_meshes(
         self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
     ) -> ScheduleFree:
-        """See `OnMeshes.on_meshes`."""
         optimizer = replace(self)
         object.__setattr__(optimizer, "_smoothing", self._smoothing.on_meshes(topology, repeated))
         return optimizer
@@ -112,7 +109,6 @@ class ScheduleFree(Recipe):
         return super().init(parameters, learning_rates)
 
     def compose(self) -> tuple[StepTransform, ...]:
-        """See `Recipe.compose`."""
         shrunk = self.preconditioned if self.wiener and self.preconditioner is not None else ()
         return (
             self._smoothing,

@@ -13,8 +13,6 @@ from unrender.optimizers.transforms.base import StepTransform
 from unrender.optimizers.transforms.momentum import DecayingSum
 from unrender.schedules.functions import Schedule
 
-__all__ = ["SGD"]
-
 
 @register
 @dataclass(frozen=True)
@@ -39,5 +37,4 @@ class SGD(Recipe):
         checks.number("SGD", "momentum", self.momentum, above=0.0, below=1.0, inclusive=True)
 
     def compose(self) -> tuple[StepTransform, ...]:
-        """See `Recipe.compose`."""
         return (DecayingSum(self.momentum),)

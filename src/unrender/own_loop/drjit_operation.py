@@ -9,8 +9,6 @@ import drjit as dr
 
 from unrender.core.trees import Tree
 
-__all__ = ["apply"]
-
 
 class _Render(dr.CustomOp):
     """From parameters, tensors attached to the graph, to images that are already rendered."""

@@ -25,8 +25,6 @@ from unrender.scene.problem import Problem
 from unrender.scene.validation import open_renderer
 from unrender.scene.view import View
 
-__all__ = ["Options", "open_scene", "problem_of"]
-
 
 @dataclass(frozen=True)
 class Options:

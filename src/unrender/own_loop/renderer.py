@@ -28,8 +28,6 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import render as render_view
 from unrender.scene.validation import longest_path
 
-__all__ = ["Renderer"]
-
 _MINI_BATCHES = "mini-batches"
 
 

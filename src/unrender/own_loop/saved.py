@@ -17,8 +17,6 @@ from unrender.own_loop.options import Options
 from unrender.own_loop.stream import StreamState
 from unrender.runs.folder.state import Packed, pack, unpack
 
-__all__ = ["RendererState", "read", "with_seed", "write"]
-
 _FORMAT = "unrender.Renderer 1"
 _LARGEST = 1 << 36
 _HEADER = "__metadata__"

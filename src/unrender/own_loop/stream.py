@@ -21,8 +21,6 @@ from unrender.scene.batches import Frame, PixelBatch, whole_views
 from unrender.scene.problem import Problem
 from unrender.statistics import meta
 
-__all__ = ["Batch", "CoupledGradient", "CoupledState", "Rendered", "Stream", "StreamState", "coupled_gradient"]
-
 
 @dataclass(frozen=True)
 class CoupledState:

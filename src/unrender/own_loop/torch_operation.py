@@ -8,8 +8,6 @@ from typing import Any
 # Imported by a loop that has PyTorch's tensors alone.
 import torch  # pyright: ignore[reportMissingImports]
 
-__all__ = ["apply"]
-
 Backward = Callable[[tuple[Any, ...]], list[Any]]
 
 

@@ -17,8 +17,6 @@ from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Renderer
 
-__all__ = ["Exchange", "Given"]
-
 
 @dataclass(frozen=True)
 class Given:

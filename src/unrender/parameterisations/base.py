@@ -8,8 +8,6 @@ import numpy as np
 
 from unrender.core.arrays import Array
 
-__all__ = ["Bounds", "Parameterisation", "Transform"]
-
 Bounds = tuple[float | None, float | None]
 """(low, high); None is open."""
 

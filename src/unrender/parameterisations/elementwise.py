@@ -12,8 +12,6 @@ from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.parameterisations.base import Bounds, Transform
 
-__all__ = ["Identity", "Log", "Logit", "Softplus"]
-
 _LARGEST = 80.0
 """The magnitude of u at which exponentials end: single precision has e^88."""
 _SERIES = 0.1
@@ -29,7 +27,6 @@ class Identity:
     """u = x: steps are in units of the parameter."""
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform | None:
-        """See `Parameterisation.transform`."""
         del bounds, initial
 
 
@@ -44,7 +41,6 @@ class Log:
     """
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform:
-        """See `Parameterisation.transform`."""
         del initial
         return _Log(_lower("log", bounds))
 
@@ -58,7 +54,6 @@ class Logit:
     """
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform:
-        """See `Parameterisation.transform`."""
         del initial
         low, high = bounds
         if low is None or high is None:
@@ -87,7 +82,6 @@ class Softplus:
             checks.number("Softplus", "scale", self.scale, above=0.0)
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform:
-        """See `Parameterisation.transform`."""
         low = _lower("softplus", bounds)
         if self.scale is not None:
             return _Softplus(low, float(self.scale))

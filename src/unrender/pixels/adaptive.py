@@ -18,9 +18,6 @@ from unrender.pixels.tiles import Tiles
 from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
 
-__all__ = ["Adaptive"]
-
-
 _FEWEST = 4096
 """Pixels of a mini-batch whose paths take as long as the rest of a step: on 2 cores, with 2 samples a pixel of `caustic`."""
 
@@ -111,24 +108,20 @@ class Adaptive:
         return self._sampler(default_count(problem) if self.count is None else self.count)
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
-        """See `PixelSampler.init`."""
         del parameters
         return self._of(problem).init(problem)
 
     def draw(
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[MiniBatch, GuidedSamplerState]:
-        """See `PixelSampler.draw`."""
         return self._of(problem).draw(problem, parameters, state, key)
 
     def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
-        """See `RepeatableSampler.redraw`."""
         return self._of(problem).redraw(problem, state, key)
 
     def learn(
         self, problem: Problem, state: GuidedSamplerState, sample: PixelSample, draws: DrawStatistics
     ) -> GuidedSamplerState:
-        """See `LearningSampler.learn`."""
         return self._of(problem).learn(problem, state, sample, draws)
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:

@@ -22,8 +22,6 @@ from unrender.scene.problem import Problem
 from unrender.scene.sample_counts import SampleShares
 from unrender.scene.upsampling import SQUARES, Upsampler
 
-__all__ = ["AdaptiveCounts", "AdaptiveCountsState"]
-
 _TILES = 1 << 16
 """Of all views together at most; of single pixels where these are no more."""
 
@@ -130,7 +128,6 @@ class AdaptiveCounts:
     def draw(
         self, problem: Problem, parameters: Tree, state: AdaptiveCountsState, key: Key
     ) -> tuple[MiniBatch, AdaptiveCountsState]:
-        """See `PixelSampler.draw`."""
         traced, tangents = 0, {}
         if state.step < _FIRST or state.step % self.refresh == 0:
             scales = pixel_statistics.scales(parameters, state.second_moment)
@@ -144,7 +141,6 @@ class AdaptiveCounts:
         return batch, replace(state, step=state.step + 1, since=state.since + 1)
 
     def redraw(self, problem: Problem, state: AdaptiveCountsState, key: Key) -> MiniBatch:
-        """See `RepeatableSampler.redraw`."""
         tiles = _tiles(problem)
         maps = tiles.split((1 - state.uniform) * state.density + state.uniform)
         films = [problem.renderer.resolutions()[view.sensor] for view in problem.views]
@@ -156,7 +152,6 @@ class AdaptiveCounts:
     def learn(
         self, problem: Problem, state: AdaptiveCountsState, sample: PixelSample | None, draws: DrawStatistics
     ) -> AdaptiveCountsState:
-        """See `LearningSampler.learn`."""
         del sample
         tiles, decay, evidence = _tiles(problem), _MEMORY**state.since, state.evidence
         tile = _tile_of_each_pixel(problem, tiles)

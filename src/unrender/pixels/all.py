@@ -11,8 +11,6 @@ from unrender.pixels.base import MiniBatch
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["All", "AllState"]
-
 
 @dataclass(frozen=True)
 class AllState:
@@ -30,17 +28,14 @@ class All:
     """Every step renders all pixels of all views."""
 
     def init(self, problem: Problem, parameters: Tree) -> AllState:
-        """See `PixelSampler.init`."""
         del problem, parameters
         return AllState()
 
     def draw(self, problem: Problem, parameters: Tree, state: AllState, key: Key) -> tuple[MiniBatch, AllState]:
-        """See `PixelSampler.draw`."""
         del problem, parameters, key
         return MiniBatch(None), state
 
     def redraw(self, problem: Problem, state: AllState, key: Key) -> MiniBatch:
-        """See `RepeatableSampler.redraw`."""
         del problem, state, key
         return MiniBatch(None)
 

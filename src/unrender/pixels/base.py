@@ -14,16 +14,6 @@ from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
 from unrender.scene.sample_counts import SampleShares
 
-__all__ = [
-    "DrawStatistics",
-    "LearningSampler",
-    "MiniBatch",
-    "PixelSampler",
-    "RepeatableSampler",
-    "check_batch",
-    "learned",
-]
-
 _FEWEST_REFUSED = 1 << 16
 _MOST_DRAWS = 4
 """Draws per pixel of all views beyond which a mini-batch is refused, where it is large at all."""

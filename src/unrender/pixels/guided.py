@@ -170,7 +170,6 @@ class GuidedSampler:
             )
 
     def init(self, problem: Problem) -> GuidedSamplerState:
-        """See `PixelSampler.init`."""
         check_batch(self.owner, problem, self.options.count)
         tiles = self._tiles(problem)
         uniform_table = InverseCdfTable.of(tiles, tiles.sizes, problem.renderer.array)
@@ -189,7 +188,6 @@ class GuidedSampler:
     def draw(
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[MiniBatch, GuidedSamplerState]:
-        """See `PixelSampler.draw`."""
         traced, tangents = 0, {}
         if not state.maps or state.age >= self.options.refresh:
             state, traced = self._update_importance_map(problem, parameters, state, key.fold(0))
@@ -201,7 +199,6 @@ class GuidedSampler:
         return batch, replace(state, age=state.age + 1, since=state.since + 1)
 
     def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
-        """See `RepeatableSampler.redraw`."""
         sample = state.table.draw(self.options.count, key.fold(1), self.options.stratified)
         maps = self._tiles(problem).split(state.shares.astype(np.float32))
         return MiniBatch(sample, probability=dict(enumerate(maps)))
@@ -259,7 +256,6 @@ class GuidedSampler:
     def learn(
         self, problem: Problem, state: GuidedSamplerState, sample: PixelSample, draws: DrawStatistics
     ) -> GuidedSamplerState:
-        """See `LearningSampler.learn`."""
         tiles = self._tiles(problem)
         tile = tiles.locate(arrays.numpy(sample.views).astype(np.int64), arrays.numpy(sample.pixels))
         found = finite(draws.moments), finite(draws.squares)

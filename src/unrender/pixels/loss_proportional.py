@@ -16,8 +16,6 @@ from unrender.pixels.pixel_statistics import PixelStatistics
 from unrender.pixels.tiles import Tiles
 from unrender.scene.problem import Problem
 
-__all__ = ["LossProportional"]
-
 
 @register
 @dataclass(frozen=True)
@@ -43,18 +41,15 @@ class LossProportional:
         return GuidedSampler("LossProportional", self, _LossDerivative())
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
-        """See `PixelSampler.init`."""
         del parameters
         return self._sampler.init(problem)
 
     def draw(
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[MiniBatch, GuidedSamplerState]:
-        """See `PixelSampler.draw`."""
         return self._sampler.draw(problem, parameters, state, key)
 
     def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
-        """See `RepeatableSampler.redraw`."""
         return self._sampler.redraw(problem, state, key)
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:

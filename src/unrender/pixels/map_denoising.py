@@ -12,8 +12,6 @@ import numpy as np
 from unrender.images import denoising
 from unrender.pixels.tiles import Tiles
 
-__all__ = ["MAP_DENOISERS", "MapDenoiser", "denoise_map", "denoise_side_by_side", "pool"]
-
 
 def pool(tiles: Tiles, means: np.ndarray, counts: np.ndarray, prior: float) -> np.ndarray:
     """The means of tiles, each drawn towards that of the block around it by what is not known of it:

@@ -19,18 +19,6 @@ from unrender.rendering.renderer import CountingSession
 from unrender.scene.batches import PixelBatch, PixelSample
 from unrender.scene.problem import Problem
 
-__all__ = [
-    "PilotRequest",
-    "PixelStatistics",
-    "costs",
-    "estimate_statistics",
-    "observed",
-    "random_signs",
-    "random_tangents",
-    "reference_means",
-    "scales",
-]
-
 ROUNDS = 16
 """Sign patterns of an estimate at most. Products of different derivatives average to zero over patterns; squares remain."""
 

@@ -19,9 +19,6 @@ from unrender.core.random import Key
 from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
 
-__all__ = ["FACTORS", "MOST_TILES", "Grid", "InverseCdfTable", "Maps", "TileSamples", "Tiles", "cut", "finite"]
-
-
 MOST_TILES = 1 << 24
 _RANGE = 1 << 32
 

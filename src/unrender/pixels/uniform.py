@@ -13,8 +13,6 @@ from unrender.pixels.tiles import InverseCdfTable, cut
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["Uniform", "UniformState"]
-
 
 @dataclass(frozen=True)
 class UniformState:
@@ -45,19 +43,16 @@ class Uniform:
         checks.integer("Uniform", "count", self.count, at_least=1)
 
     def init(self, problem: Problem, parameters: Tree) -> UniformState:
-        """See `PixelSampler.init`."""
         del parameters
         check_batch("Uniform", problem, self.count)
         tiles = cut(problem, 2 * self.count)
         return UniformState(InverseCdfTable.of(tiles, tiles.sizes, problem.renderer.array))
 
     def draw(self, problem: Problem, parameters: Tree, state: UniformState, key: Key) -> tuple[MiniBatch, UniformState]:
-        """See `PixelSampler.draw`."""
         del parameters
         return self.redraw(problem, state, key), state
 
     def redraw(self, problem: Problem, state: UniformState, key: Key) -> MiniBatch:
-        """See `RepeatableSampler.redraw`."""
         del problem
         return MiniBatch(state.table.draw(self.count, key, self.stratified))
 

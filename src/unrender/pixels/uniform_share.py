@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["MOST", "SHARES", "ShareEvidence", "choose", "observed"]
-
 SHARES = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
 """Those that are compared."""
 MOST = float(SHARES[-1])

@@ -15,8 +15,6 @@ from unrender.pixels.base import MiniBatch, check_batch
 from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
 
-__all__ = ["Views"]
-
 
 @register
 @dataclass(frozen=True)
@@ -41,12 +39,10 @@ class Views:
         check_batch("Views", problem, 1)
 
     def draw(self, problem: Problem, parameters: Tree, state: None, key: Key) -> tuple[MiniBatch, None]:
-        """See `PixelSampler.draw`."""
         del parameters, state
         return self.redraw(problem, None, key), None
 
     def redraw(self, problem: Problem, state: None, key: Key) -> MiniBatch:
-        """See `RepeatableSampler.redraw`."""
         del state
         total = len(problem.views)
         count, random = min(self.count, total), np.random.default_rng(key.uint32())

@@ -9,8 +9,6 @@ from unrender.core import arrays, periodic
 from unrender.core.arrays import Array
 from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["Around", "MeshPreconditioner", "PeriodicPreconditioner", "Preconditioner", "around_axis"]
-
 
 class Preconditioner(Protocol):
     """A symmetric positive linear map S of one parameter's gradients and steps.

@@ -20,21 +20,6 @@ if TYPE_CHECKING:
 
 from unrender.core.errors import InputError
 
-__all__ = [
-    "CholeskySolver",
-    "Solver",
-    "Transform",
-    "TransformSolver",
-    "check",
-    "is_map",
-    "laplacian",
-    "per_axis",
-    "solver",
-    "square_root_solver",
-    "transform",
-    "wraps",
-]
-
 
 class Solver(Protocol):
     """(I + λ L)^-1 on one grid."""
@@ -58,7 +43,6 @@ class CholeskySolver:
         self._factor = CholeskySolverF(cells, rows, columns, entries, MatrixType.COO)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        """See `Solver.solve`."""
         right = np.ascontiguousarray(x, np.float32).reshape(-1, x.shape[-1])
         result = np.empty_like(right)
         self._factor.solve(right, result)
@@ -110,7 +94,6 @@ class TransformSolver:
         self._gain = ((1.0 + strength * self._transform.eigenvalues) ** -power).astype(np.float32)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        """See `Solver.solve`."""
         return self._transform.backward(self._transform.forward(x) * self._gain)
 
 

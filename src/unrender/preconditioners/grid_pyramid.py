@@ -15,8 +15,6 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.preconditioners import grid
 
-__all__ = ["LARGEST_EXACT", "GridPyramid", "pyramid"]
-
 LARGEST_EXACT = 1 << 17
 """Cells up to which transforms of the whole grid are used in place of a pyramid."""
 _COARSEST = 1 << 16

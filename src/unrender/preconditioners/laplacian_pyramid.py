@@ -24,8 +24,6 @@ from unrender.core.registry import register
 from unrender.preconditioners import grid
 from unrender.preconditioners.base import Around, around_axis
 
-__all__ = ["LaplacianPyramid"]
-
 _LEAST_FALLOFF = 0.001
 """Below it, nothing but the coarsest level moves."""
 
@@ -75,7 +73,6 @@ class LaplacianPyramid:
         return Around(replace(self, wrap=around_axis(self.wrap)), columns)
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
-        """See `Preconditioner.check`."""
         grid.check("LaplacianPyramid", key, shape, self.wrap)
 
     def apply(self, x: Array) -> Array:

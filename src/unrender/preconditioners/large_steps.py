@@ -14,8 +14,6 @@ from unrender.preconditioners import grid
 from unrender.preconditioners.base import Around, around_axis
 from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["LargeSteps"]
-
 
 @register
 @dataclass(frozen=True)
@@ -46,7 +44,6 @@ class LargeSteps:
         object.__setattr__(self, "wrap", grid.wraps("LargeSteps", self.wrap))
 
     def on_mesh(self, topology: MeshTopology) -> LargeSteps:
-        """See `MeshPreconditioner.on_mesh`."""
         bound = LargeSteps(self.strength, self.wrap)
         object.__setattr__(bound, "_mesh", topology)
         return bound
@@ -56,7 +53,6 @@ class LargeSteps:
         return Around(replace(self, wrap=around_axis(self.wrap)), columns)
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
-        """See `Preconditioner.check`."""
         if self._mesh is not None:
             return
         grid.check("LargeSteps", key, shape, self.wrap)

@@ -19,8 +19,6 @@ from unrender.core.errors import InputError
 if TYPE_CHECKING:
     import scipy.sparse
 
-__all__ = ["MeshSolver", "MeshSpectrum", "MeshTopology"]
-
 _POLE_FACTOR = 16.0
 """Strengths of the solvers that functions of L are sums of, from one to the next: with 4 in its place, errors are smaller, and there are
 twice as many solvers."""

@@ -17,8 +17,6 @@ from unrender.preconditioners import grid, grid_pyramid
 from unrender.preconditioners.base import Around, around_axis
 from unrender.preconditioners.mesh import MeshSpectrum, MeshTopology
 
-__all__ = ["Sobolev"]
-
 
 @register
 @dataclass(frozen=True)
@@ -60,7 +58,6 @@ class Sobolev:
         object.__setattr__(self, "wrap", grid.wraps("Sobolev", self.wrap))
 
     def on_mesh(self, topology: MeshTopology) -> Sobolev:
-        """See `MeshPreconditioner.on_mesh`."""
         return replace(self)._bound(MeshSpectrum(topology, self._strength_on(topology)))
 
     def on_repeated(self, columns: int) -> Sobolev:
@@ -68,7 +65,6 @@ class Sobolev:
         return replace(self)._bound(None, columns)
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
-        """See `Preconditioner.check`."""
         if self._spectrum is not None:
             return
         if (around := self._around(shape)) is not None:

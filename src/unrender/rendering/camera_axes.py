@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["MITSUBA_TO_OPENGL"]
-
 MITSUBA_TO_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
 """After a camera-to-world matrix (4, 4): that of the same camera in the other axes. It is its own inverse."""
 MITSUBA_TO_OPENGL.setflags(write=False)

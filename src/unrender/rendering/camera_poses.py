@@ -28,8 +28,6 @@ from unrender.rendering.renderer import (
 )
 from unrender.rendering.wrapper import SessionWrapper
 
-__all__ = ["POSES", "Corrections", "PosedCameras", "PosedCamerasSession", "PosedPaths"]
-
 POSES = "poses"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
 _FEWEST = 3

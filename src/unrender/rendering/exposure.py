@@ -13,8 +13,6 @@ from unrender.core.arrays import Array
 from unrender.rendering.picture_factors import PictureFactors
 from unrender.rendering.renderer import ParameterInfo, Renderer, SampleRequest
 
-__all__ = ["EXPOSURE", "ExposedRenderer", "gains"]
-
 EXPOSURE = "exposure"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
 _LN2 = math.log(2.0)
@@ -82,7 +80,6 @@ class ExposedRenderer(PictureFactors):
         return np.stack([gains(exposure)[self.rows[sensor]] for exposure in values])[:, None, None]
 
     def along(self, tangent: Array, places: Array, images: Array) -> Array:
-        """See `PictureFactors.along`."""
         return self._of_rows(tangent, places) * (_LN2 * images)
 
     def gradient(self, values: Array, places: Array, weighted: Array) -> Array:

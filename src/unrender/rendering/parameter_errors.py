@@ -10,8 +10,6 @@ import numpy as np
 
 from unrender.core import periodic
 
-__all__ = ["PLAIN", "ErrorMeasure", "Role", "from_record", "title"]
-
 Role = Literal["value", "normal", "direction"]
 """What the values of a parameter stand for: numbers; a normal map, n = 2 x - 1; vectors of which the direction counts."""
 

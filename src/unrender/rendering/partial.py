@@ -13,8 +13,6 @@ from unrender.core.trees import Tree
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, differentiated
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
-__all__ = ["HeldParameters", "PartialDerivatives"]
-
 
 class PartialDerivatives(RendererWrapper):
     """A renderer that changes all parameters and differentiates all but some: the derivatives by these are returned as 0.

@@ -25,8 +25,6 @@ from unrender.rendering.renderer import (
 )
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
-__all__ = ["FactorSession", "PictureFactors", "PicturePaths", "PictureRenderer", "PictureSession", "WithParameter"]
-
 
 class WithParameter(RendererWrapper):
     """A renderer with one parameter more than the one inside it, 0 at first.
@@ -173,7 +171,6 @@ class PictureFactors(PictureRenderer):
     """
 
     def session(self, inner: RenderSession) -> RenderSession:
-        """See `PictureRenderer.session`."""
         return FactorSession(self, inner)
 
     def places(self, request: SampleRequest) -> Array:
@@ -201,7 +198,6 @@ class FactorSession(PictureSession[PictureFactors]):
     """Images and derivatives with respect to what multiplies them and to the parameters of a session. See `RenderSession`."""
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `RenderSession.image_batch`."""
         renderer = self._renderer
         factors = renderer.factors_of_batch(np.asarray(parameters[renderer.key]), request.sensor)
         return self._inner_batch(parameters, request) * renderer.array(factors)

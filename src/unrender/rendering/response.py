@@ -12,8 +12,6 @@ from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import PicturePaths, PictureRenderer, PictureSession
 from unrender.rendering.renderer import ParameterInfo, RenderSession, SampleRequest
 
-__all__ = ["RESPONSE", "RESPONSE_BOUND", "Curve", "RespondingRenderer", "curve"]
-
 RESPONSE = "response"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
 RESPONSE_BOUND = 1.5
@@ -108,7 +106,6 @@ class RespondingRenderer(PictureRenderer):
         return ParameterInfo((3, 2), lowest=-RESPONSE_BOUND, highest=RESPONSE_BOUND)
 
     def session(self, inner: RenderSession) -> RenderSession:
-        """See `PictureRenderer.session`."""
         return RespondingSession(self, inner)
 
 
@@ -116,7 +113,6 @@ class RespondingSession(PictureSession[RespondingRenderer]):
     """Images and derivatives with respect to the response and to the parameters of a session. See `RenderSession`."""
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `RenderSession.image_batch`."""
         values = np.asarray(parameters[RESPONSE])
         contrast, brightness = (self._renderer.array(values[:, None, None, :, k]) for k in range(2))
         return curve(contrast, brightness, self._inner_batch(parameters, request)).values

@@ -11,8 +11,6 @@ from unrender.core.arrays import Array
 from unrender.rendering.picture_factors import PictureFactors
 from unrender.rendering.renderer import ParameterInfo, Renderer, SampleRequest
 
-__all__ = ["VIGNETTING", "VignettedRenderer", "falloff", "powers"]
-
 VIGNETTING = "vignetting"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
 _TERMS = 3
@@ -95,7 +93,6 @@ class VignettedRenderer(PictureFactors):
         return np.stack([falloff(one, *size) for one in values])
 
     def along(self, tangent: Array, places: Array, images: Array) -> Array:
-        """See `PictureFactors.along`."""
         return _laid(_stops(tangent, places), images) * (_LN2 * images)
 
     def gradient(self, values: Array, places: Array, weighted: Array) -> Array:

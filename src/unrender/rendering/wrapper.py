@@ -31,8 +31,6 @@ from unrender.rendering.renderer import (
     with_differential_bsdf,
 )
 
-__all__ = ["RendererWrapper", "SessionWrapper"]
-
 
 class RendererWrapper:
     """A renderer that answers as the one inside it does. Subclasses override what they change.

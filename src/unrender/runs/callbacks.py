@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from unrender.runs.run import Run
 
 
-__all__ = ["Callback", "TensorBoard"]
-
-
 class Callback:
     """Listens to a run. Override what is of interest; time spent here is not counted as the run's.
 
@@ -74,7 +71,6 @@ class TensorBoard(Callback):
         self._next = 0.0
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
         scalars = {name: record.get(name) for name in ("loss", "gradient_noise", "samples", "seconds")}
         scalars |= {f"parameter_error/{key}": error for key, error in record.get("parameter_error", {}).items()}
         for name, value in scalars.items():
@@ -85,7 +81,6 @@ class TensorBoard(Callback):
             self._next = time.monotonic() + self._every
 
     def on_end(self, run: Run, result: Result) -> None:
-        """See `Callback.on_end`."""
         del run, result
         self._writer.close()
 

@@ -12,8 +12,6 @@ from unrender.methods import method, methods
 from unrender.methods.plan import Plan
 from unrender.scene.problem import Problem
 
-__all__ = ["resolve", "resolve_estimator"]
-
 
 def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Plan:
     """Return the plan of a method, of two components, or a plan as it is.

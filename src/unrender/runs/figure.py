@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
 
 
-__all__ = ["ResultFigure", "plot"]
-
-
 _WIDTH, _CURVES_HEIGHT, _COLUMNS = 9.0, 2.8, 6
 _LONGEST_TITLE = 22
 

@@ -17,8 +17,6 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import render
 from unrender.statistics import debiased
 
-__all__ = ["FinalImages", "image_name", "render_final_images", "render_pictures"]
-
 _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
 _SHARE, _LEAST_SECONDS = 0.05, 1.0

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from unrender.runs.loop import Descent
     from unrender.runs.result import Result
 
-__all__ = ["CallbackHook", "Hook"]
-
 
 class Hook:
     """Takes part in a descent. Override what is of interest.
@@ -68,19 +66,16 @@ class CallbackHook(Hook):
         self._callbacks = tuple(callbacks)
 
     def on_start(self, descent: Descent) -> None:
-        """See `Hook.on_start`."""
         with descent.run.shown() as run:
             for callback in self._callbacks:
                 callback.on_start(run)
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
-        """See `Hook.on_step`."""
         with descent.run.shown() as run:
             for callback in self._callbacks:
                 callback.on_step(run, record)
 
     def on_end(self, descent: Descent, result: Result) -> None:
-        """See `Hook.on_end`."""
         with descent.run.shown() as run:
             for callback in self._callbacks:
                 callback.on_end(run, result)

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.runs.run import Run
 
-__all__ = ["Live"]
-
 _INTERVAL = 1.0
 _RETRY_SECONDS = 5.0
 _SHARE = 0.02
@@ -83,7 +81,6 @@ class Live(Callback):
         self._command: tuple[tuple[int, int], str] = ((0, 0), "run")
 
     def on_start(self, run: Run) -> None:
-        """See `Callback.on_start`."""
         try:
             if self._live.is_symlink():
                 raise InputError(f"{self._live}: a link, expected a folder")
@@ -96,7 +93,6 @@ class Live(Callback):
             self._put_off(run, error)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
         if self._disabled:
             return
         self._history.append(record)
@@ -111,7 +107,6 @@ class Live(Callback):
             self._put_off(run, error)
 
     def on_end(self, run: Run, result: Result) -> None:
-        """See `Callback.on_end`."""
         if self._disabled:
             return
         try:

@@ -7,8 +7,6 @@ import numpy as np
 from unrender.scene.self_intersections import crossing_triangles
 from unrender.scene.surfaces import area_normals
 
-__all__ = ["guarded"]
-
 _HALVINGS = 3
 _LEAST_AREA = 0.01
 """Of a triangle's area, as seen from where its normal pointed before, below which it counts as turned over."""

@@ -9,8 +9,6 @@ from unrender.core import arrays, memory, trees
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
-__all__ = ["GradientNoise"]
-
 _DECAY = 0.9
 _EVERY = 7
 """Of large arrays, whose mean gradient would take as much memory as they do, one element in so many is looked at."""

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
     from unrender.runs.run import Run
 
 
-__all__ = ["NotebookProgress", "error_title", "html", "line", "measures", "shown_pictures", "start_errors"]
-
-
 _POINTS = 200
 
 Curve = tuple[np.ndarray, np.ndarray]
@@ -72,7 +69,6 @@ class NotebookProgress(Callback):
         self._bar.close(self._told)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
         parts = [
             f"step {run.step}" + (f" of {run.steps}" if run.steps else ""),
             f"loss {formatting.number(record['loss'])}",
@@ -82,7 +78,6 @@ class NotebookProgress(Callback):
         self._bar.show(", ".join(parts), run.progress())
 
     def on_end(self, run: Run, result: Result) -> None:
-        """See `Callback.on_end`."""
         del run
         self._told = f"{result.steps} steps in {formatting.duration(result.seconds)}"
         self._told += (

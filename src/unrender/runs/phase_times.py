@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from unrender.runs.loop import Descent
     from unrender.runs.result import Result
 
-__all__ = ["ASIDE", "COMPILING", "PICTURES", "RUN_PHASES", "STEPS", "VERIFYING", "PhaseTimes", "with_phase"]
-
 COMPILING, STEPS, ASIDE = "compiling", "steps", "checkpoints and callbacks"
 VERIFYING, PICTURES = "verification", "final pictures"
 """Phases of a run, in their order: before the first step; the steps themselves; what stands between and after them."""
@@ -35,11 +33,9 @@ class PhaseTimes(Hook):
         self._clock = 0.0
 
     def on_start(self, descent: Descent) -> None:
-        """See `Hook.on_start`."""
         self._started, self._clock = time.perf_counter(), descent.run.clock
 
     def on_result(self, descent: Descent, result: Result) -> Result:
-        """See `Hook.on_result`."""
         steps = descent.run.clock - self._clock
         aside = time.perf_counter() - self._started - steps
         found = {COMPILING: self._started - self._made, STEPS: steps, ASIDE: max(aside, 0.0)}

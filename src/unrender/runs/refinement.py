@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from unrender.runs.loop import Descent
 
 
-__all__ = ["Refinement", "hurry", "is_due", "refine", "unfinished"]
-
-
 _MEASURED, _COARSE_SHARE = 3, 0.4
 """Steps whose time tells how many the budget allows; share of these after which all resolutions are the scene's own."""
 
@@ -91,14 +88,12 @@ class Refinement(Hook):
         self._refined = False
 
     def before_step(self, descent: Descent) -> None:
-        """See `Hook.before_step`."""
         hurry(descent.run)
         self._refined = is_due(descent.run)
         if self._refined:
             descent.log.warmup_seconds += refine(descent.run, descent.state) + descent.warm_up()[0]
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
-        """See `Hook.on_step`."""
         run = descent.run
         keys = run.problem.coarse_to_fine
         if self._refined or (run.step == 1 and keys):

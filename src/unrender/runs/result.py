@@ -24,8 +24,6 @@ from unrender.runs.folder.history import lines, steps_in
 if TYPE_CHECKING:
     from unrender.runs.figure import ResultFigure
 
-__all__ = ["INTERRUPTED", "NON_FINITE", "PRUNED", "TERMINATED", "Result", "deciding_versions", "hardware", "versions"]
-
 INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
 """Reasons for a run to stop (`Result.stopped`) before its budget is used up: Ctrl-C or a command to stop, SIGTERM, and gradients that
 were not finite."""

@@ -36,8 +36,6 @@ from unrender.scene.fingerprint import differences
 from unrender.scene.problem import Problem
 from unrender.scene.serialization import origin
 
-__all__ = ["StoredRun", "load_run", "resume_run"]
-
 _MOST_SHOWN = 6
 _WARNINGS = "warnings"
 _SENT, _CANDIDATE, _AHEAD = "sent", "candidate", "ahead"
@@ -227,7 +225,6 @@ class _Restore(Hook):
     writer: RunWriter
 
     def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
-        """See `Hook.on_warm_up`."""
         log, source = descent.log, self.source
         saved = (
             fresh

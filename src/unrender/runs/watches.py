@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from unrender.runs.run import Run
 
 
-__all__ = ["BoundsWatch", "InfluenceWatch", "MeshWatch"]
-
-
 _NEAR = 0.01
 """Of a range with two ends: so near to one of them counts as there."""
 
@@ -31,7 +28,6 @@ class BoundsWatch(Hook):
     """
 
     def warnings(self, descent: Descent) -> list[str]:
-        """See `Hook.warnings`."""
         run, found = descent.run, []
         for key, unknown in run.problem.unknowns.items() if run.stopped else ():
             first, (low, high) = unknown.initial, unknown.bounds
@@ -54,7 +50,6 @@ class InfluenceWatch(Hook):
     """Warns of parameters whose gradient was exactly zero in each of the first five steps."""
 
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
-        """See `Hook.on_update`."""
         run, zero = descent.run, descent.state.zero_gradient
         if not applied or run.step > _STEPS:
             return
@@ -79,7 +74,6 @@ class MeshWatch(Hook):
         self._crossing: set[str] = set()
 
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
-        """See `Hook.on_update`."""
         run = descent.run
         for key, faces in run.problem.faces.items() if applied else ():
             # None of estimators that have losses alone, or directions in its place.
@@ -96,7 +90,6 @@ class MeshWatch(Hook):
                 run.warnings.append(f"step {run.step}: {line}")
 
     def warnings(self, descent: Descent) -> list[str]:
-        """See `Hook.warnings`."""
         run, found = descent.run, []
         for key in run.problem.faces if run.stopped else ():
             before, after, joined = _joined(run, key)

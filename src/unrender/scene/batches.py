@@ -14,8 +14,6 @@ from unrender.rendering.renderer import SampleRequest
 from unrender.scene.problem import Problem
 from unrender.scene.sample_counts import SampleCounts, SampleShares
 
-__all__ = ["Frame", "PixelBatch", "PixelSample", "WholeView", "whole_views"]
-
 
 @dataclass(frozen=True)
 class PixelSample:
@@ -70,12 +68,10 @@ class WholeView:
 
     @property
     def pixels(self) -> int:
-        """See `Frame.pixels`."""
         height, width = self.problem.renderer.resolutions()[self.problem.views[self.view].sensor]
         return height * width
 
     def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
-        """See `Frame.request`."""
         sensor = self.problem.views[self.view].sensor
         if self.counts is not None:
             return SampleRequest(sensor, 1, seed, 1, self.counts.pixels, emitters=self.emitters)
@@ -108,7 +104,6 @@ class PixelBatch:
 
     @property
     def pixels(self) -> int:
-        """See `Frame.pixels`."""
         return int(arrays.shape(self.sample.weights)[0])
 
     @cached_property
@@ -132,7 +127,6 @@ class PixelBatch:
         return tuple(found)
 
     def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
-        """See `Frame.request`."""
         sensors = [view.sensor for view in self.problem.views]
         table = None
         if len(set(sensors)) > 1:
@@ -141,12 +135,10 @@ class PixelBatch:
         return SampleRequest(sensors[0], spp, seed, groups, pixels, table, positions, self.emitters)
 
     def loss_value(self, image: Array) -> Array:
-        """See `Frame.loss_value`."""
         reference, factor = self.targets
         return arrays.total(self.problem.loss.value(image, reference) * (factor * self.sample.weights))
 
     def loss_derivative(self, image: Array) -> Array:
-        """See `Frame.loss_derivative`."""
         reference, factor = self.targets
         return self.problem.loss.derivative(image, reference) * (factor * self.sample.weights)
 

@@ -14,8 +14,6 @@ from unrender.core.errors import InputError
 from unrender.parameterisations.base import Bounds
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["MARGIN", "check_bounds", "clip_to_bounds", "project"]
-
 MARGIN = 1e-4
 """Distance from a bound at which parameters are clamped, as a fraction of their range (of 1 where it is open). At a reflectance of
 exactly 0 no light arrives through a surface and its gradient is 0 for ever; a lobe of probability exactly 0 is never sampled again."""

@@ -12,8 +12,6 @@ from unrender.core import checks, tables
 from unrender.core.errors import InputError
 from unrender.io import resampling
 
-__all__ = ["NEVER", "CoarseToFine", "checked_steps", "of"]
-
 NEVER = 1 << 40
 """A step that no run comes to: `CoarseToFine((NEVER,), 4)` is four times as coarse throughout."""
 

@@ -10,8 +10,6 @@ from unrender.core.trees import Tree
 from unrender.parameterisations.base import Transform
 from unrender.preconditioners.base import Preconditioner
 
-__all__ = ["Coordinates"]
-
 
 @dataclass(frozen=True)
 class Coordinates:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from unrender.core.errors import InputError
 from unrender.io.toml_lines import Place, dotted
 
-__all__ = ["FieldError"]
-
 
 class FieldError(InputError):
     """What is wrong with one field of a problem.

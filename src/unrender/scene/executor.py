@@ -6,8 +6,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-__all__ = ["LOCAL", "Executor", "LocalExecutor"]
-
 
 class Executor(Protocol):
     """Carries out the requests of an estimator.

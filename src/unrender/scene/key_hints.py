@@ -9,8 +9,6 @@ from collections.abc import Mapping
 from unrender.core.suggestions import did_you_mean
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = ["instead_of", "near_key"]
-
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")
 """Ids that Mitsuba makes up for objects that were given none."""
 _TRANSFORM = "to_world"

@@ -12,8 +12,6 @@ from unrender.core import checks, tables
 from unrender.core.errors import InputError
 from unrender.preconditioners.mesh import MeshTopology
 
-__all__ = ["MeshRegularizer", "of"]
-
 
 @dataclass(frozen=True)
 class MeshRegularizer:

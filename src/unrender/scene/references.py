@@ -13,8 +13,6 @@ from unrender.core.arrays import Array
 from unrender.io.stored_pictures import StoredPicture
 from unrender.scene.view import View
 
-__all__ = ["ON_DEVICE", "References"]
-
 ON_DEVICE = 1 << 29
 """Bytes of references up to which they are copied to the device; larger sets stay in host memory."""
 

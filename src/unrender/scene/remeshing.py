@@ -13,8 +13,6 @@ from unrender.core.errors import InputError
 from unrender.rendering.renderer import ReplacedMesh
 from unrender.scene.coarse_to_fine import checked_steps
 
-__all__ = ["Remeshing", "of"]
-
 _ITERATIONS = 6
 _MOST_FACES = 1 << 21
 

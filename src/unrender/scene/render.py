@@ -14,8 +14,6 @@ from unrender.core.trees import Tree
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.problem import Problem
 
-__all__ = ["as_tree", "render", "render_pair", "view_request"]
-
 _PATHS_PER_PASS = 1 << 21
 """Paths per pass, within the memory of a small machine."""
 _MANY_SENSORS = 4

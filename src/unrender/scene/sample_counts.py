@@ -10,8 +10,6 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 
-__all__ = ["SampleCounts", "SampleShares"]
-
 
 @dataclass(frozen=True)
 class SampleCounts:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["crossing_triangles"]
-
 _CELLS_PER_TRIANGLE = 8
 """At most, on average: cells are made larger until that is so."""
 

@@ -30,8 +30,6 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.scene.problem import Problem
 
-__all__ = ["SQUARES", "NotCarried", "Restartable", "Upsamplable", "Upsampler", "restarted", "upsampled"]
-
 SQUARES = 2.0
 """The power of 1/n with which mean squares of gradients are carried."""
 

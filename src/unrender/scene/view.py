@@ -9,8 +9,6 @@ import numpy as np
 
 from unrender.io.stored_pictures import StoredPicture
 
-__all__ = ["View"]
-
 
 @dataclass(frozen=True)
 class View:

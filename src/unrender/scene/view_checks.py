@@ -21,9 +21,6 @@ from unrender.scene.references import ON_DEVICE
 from unrender.scene.validation import is_number
 from unrender.scene.view import View
 
-__all__ = ["Reference", "check_views", "read_reference"]
-
-
 _DARKEST = -1e-4
 """Share of the largest value down to which negative values are rounding."""
 

@@ -13,8 +13,6 @@ from unrender.rendering.renderer import Renderer
 from unrender.scene.references import References
 from unrender.scene.view import View
 
-__all__ = ["ViewLosses"]
-
 
 class ViewLosses:
     """What `Problem` is to estimators: a loss per view. The attributes are the problem's."""

@@ -10,8 +10,6 @@ from __future__ import annotations
 from unrender.core import arrays
 from unrender.core.arrays import Array
 
-__all__ = ["control_variate_variance", "control_weight"]
-
 
 def control_weight(cov: Array, var_previous: Array, var_cv: Array) -> Array:
     """w = Cov[F, H] / (Var[H] + Var[⟨F_{n-1}⟩_CV]), clamped to [0, 1]: Eq. 8, the w of least variance.

@@ -9,8 +9,6 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
-__all__ = ["mean", "rmse"]
-
 
 def rmse(
     first: np.ndarray, second: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None

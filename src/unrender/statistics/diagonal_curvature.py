@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["LEAST", "RIDGE", "corrected", "isotropic", "positive"]
-
 LEAST = 0.15
 """The least element of a diagonal that is used, as a share of their mean magnitude."""
 RIDGE = 0.01

@@ -8,16 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-__all__ = [
-    "Difference",
-    "SystematicDifference",
-    "difference",
-    "leave_one_out",
-    "mean_and_error",
-    "pseudo_values",
-    "systematic",
-]
-
 _TILES, _ROBUST = 48, 1.8
 """Most tiles of a picture; most that the sharp score may exceed the robust one by."""
 

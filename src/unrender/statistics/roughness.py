@@ -14,8 +14,6 @@ from abc import ABC, abstractmethod
 from unrender.core import arrays
 from unrender.core.arrays import Array
 
-__all__ = ["GGX", "Beckmann", "NormalDistribution"]
-
 
 class NormalDistribution(ABC):
     """One family of isotropic distributions. Arrays of any kind, per element; α > 0, t >= 0."""
@@ -46,13 +44,11 @@ class GGX(NormalDistribution):
     """D = 1 / (π α² cos⁴θ (1 + t)²)."""
 
     def density(self, alpha: Array, t: Array) -> Array:
-        """See `NormalDistribution.density`."""
         squared = alpha * alpha
         over = (1.0 + squared * t) / (1.0 + t)
         return over * over / (math.pi * squared)
 
     def log_derivative(self, alpha: Array, t: Array) -> Array:
-        """See `NormalDistribution.log_derivative`."""
         return 2.0 * (t - 1.0) / ((t + 1.0) * alpha)
 
     def mass(self, alpha: Array) -> Array:
@@ -69,13 +65,11 @@ class Beckmann(NormalDistribution):
     """D = exp(-t) / (π α² cos⁴θ)."""
 
     def density(self, alpha: Array, t: Array) -> Array:
-        """See `NormalDistribution.density`."""
         squared = alpha * alpha
         over = 1.0 + squared * t
         return over * over * arrays.exp(-t) / (math.pi * squared)
 
     def log_derivative(self, alpha: Array, t: Array) -> Array:
-        """See `NormalDistribution.log_derivative`."""
         return 2.0 * (t - 1.0) / alpha
 
     def mass(self, alpha: Array) -> Array:

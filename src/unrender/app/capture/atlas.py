@@ -17,8 +17,6 @@ import numpy as np
 from unrender.app.capture.mesh import Mesh, normals
 from unrender.core.errors import InputError
 
-__all__ = ["SECONDS", "check_installed", "unwrap"]
-
 SECONDS = 120.0
 """Time limit; 10 000 faces take 2 seconds, 20 000 15."""
 _PADDING = 3

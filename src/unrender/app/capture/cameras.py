@@ -16,8 +16,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
-__all__ = ["FISHEYE", "MODELS", "RADIAL_TANGENTIAL", "Lens", "opencv", "project", "rigid"]
-
 RADIAL_TANGENTIAL, FISHEYE = "radial-tangential", "fisheye"
 MODELS = (RADIAL_TANGENTIAL, FISHEYE)
 _MOST_COEFFICIENTS = {RADIAL_TANGENTIAL: 8, FISHEYE: 4}

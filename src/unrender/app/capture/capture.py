@@ -11,8 +11,6 @@ import numpy as np
 
 from unrender.app.capture.cameras import Lens
 
-__all__ = ["Capture", "CapturedView", "CapturedViews", "Photograph"]
-
 
 @dataclass(frozen=True)
 class CapturedView:

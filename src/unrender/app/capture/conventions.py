@@ -17,8 +17,6 @@ from unrender.app.capture.cameras import rigid
 from unrender.app.capture.capture import Capture
 from unrender.core.errors import InputError
 
-__all__ = ["AXES", "pose", "reinterpreted"]
-
 AXES = {
     "opengl": np.eye(3),
     "opencv": np.diag([1.0, -1.0, -1.0]),

@@ -10,8 +10,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.io import images
 
-__all__ = ["FIT", "LINEAR", "SRGB", "check", "linear"]
-
 SRGB, LINEAR, FIT = "srgb", "linear", "fit"
 _LEAST, _MOST = 1.0, 4.0
 """Exponents of cameras and screens lie between 1 and 2.6."""

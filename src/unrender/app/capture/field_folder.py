@@ -25,8 +25,6 @@ from unrender.io import volumes
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 
-__all__ = ["NAMES", "OWN", "cube_of", "write"]
-
 NAMES = ("field", "light", "exposure")
 """The unknowns that such a problem may have; the field always is."""
 GRIDS, EXTINCTION, LIGHT = "grids", "grids/extinction.vol", "grids/light.exr"

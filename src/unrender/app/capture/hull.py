@@ -21,9 +21,6 @@ from unrender.app.capture.silhouettes import Silhouettes, overlap
 from unrender.app.capture.stored import StoredArrays
 from unrender.core.errors import InputError
 
-__all__ = ["EMPTY", "SUFFICIENT", "Trial", "explain", "field", "shape", "trials", "visual_hull"]
-
-
 _COARSE = 32
 _REFINED = 4
 """Voxels of the fine grid to one of the coarse one, along each axis."""

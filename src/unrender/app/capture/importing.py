@@ -39,8 +39,6 @@ from unrender.core.exclusive import exclusive
 from unrender.core.text import printable
 from unrender.io import files
 
-__all__ = ["CHECK", "MOST_VOXELS", "PROBLEM", "SHEET", "STAGES", "ImportOptions", "Imported", "check", "import_capture"]
-
 CHECK, SHEET = "check", "check.png"
 PROBLEM, STAGES = writing.PROBLEM, stages_file.FILE
 MOST_VOXELS = 256

@@ -14,8 +14,6 @@ from unrender.app.capture.silhouettes import Silhouettes
 from unrender.core.text import printable
 from unrender.losses.metrics import srgb
 
-__all__ = ["LEGEND", "chosen", "contact_sheet", "overlay", "png", "thumbnail"]
-
 LEGEND = "orange: the mesh and its edges; blue: the outline of the mask; dimmed: outside the mesh"
 _MESH, _MASK = np.array([1.0, 0.55, 0.05]), np.array([0.1, 0.55, 1.0])
 _SMALLEST = 320

@@ -44,9 +44,6 @@ from unrender.losses.metrics import srgb
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba import turntable_light
 
-__all__ = ["NAMES", "OWN", "LitViews", "least_squares", "lit", "prepare", "write"]
-
-
 _SHADOW = 0.1
 """Of the brightest a pixel becomes: what is darker may lie in a shadow."""
 _WHITE = 0.97

@@ -18,8 +18,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import bounded_files, image_size, images, tiff_header
 
-__all__ = ["Pixels", "read", "read_mask", "upright"]
-
 _PILLOW_KINDS = {
     "JPEG": ("JPEG", "MPO"),
     "PNG": ("PNG",),

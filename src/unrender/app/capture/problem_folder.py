@@ -36,8 +36,6 @@ from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.photographs import OF_PHOTOGRAPHS
 
-__all__ = ["OWN", "sensor_element", "to_world", "write"]
-
 MESH = "asset.ply"
 LIGHT = "textures/light.exr"
 _FOLDERS = (REFERENCES, MASKS, TEXTURES)

@@ -11,8 +11,6 @@ import numpy as np
 
 from unrender.app.capture.capture import CapturedView
 
-__all__ = ["StoredArrays", "StoredViews"]
-
 _NONE = np.zeros(0, np.float32)
 
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from unrender.app.capture.capture import CapturedViews
 
-__all__ = ["axis", "light_turns", "stands_still"]
-
 _LIKENESS = 0.4
 _BLUR = 1 / 32
 """Of the picture's longer side: tripods and crops move a little."""

@@ -15,8 +15,6 @@ import numpy as np
 from unrender.app.capture.cameras import FISHEYE, Lens, opencv
 from unrender.core.errors import InputError
 
-__all__ = ["Resampling", "pinhole"]
-
 _MARGIN = 0.5
 """In pixels of the photograph: how far a position may lie outside the middle of its outermost pixels."""
 _SAMPLES = 4096

@@ -18,8 +18,6 @@ from unrender.rendering.photographs import check_response
 from unrender.rendering.response import RESPONSE
 from unrender.rendering.vignetting import VIGNETTING
 
-__all__ = ["DEFAULT", "NAMES", "OF_HULL", "keys", "parameters", "parse", "stages", "textures"]
-
 NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure", "vignetting", "response", "poses")
 DEFAULT = ("colour", "roughness", "metallic", "light")
 OF_HULL = ("colour", "roughness", "metallic", "normal", "light")

@@ -15,8 +15,6 @@ from unrender.app.capture.undistortion import Resampling, pinhole
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
-__all__ = ["prepare"]
-
 _EMPTY = 1e-4
 _FULL_BORDER = 0.5
 

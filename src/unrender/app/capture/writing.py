@@ -13,18 +13,6 @@ import tomli_w
 from unrender.backend import variant
 from unrender.io import toml_lines
 
-__all__ = [
-    "MASKS",
-    "PROBLEM",
-    "REFERENCES",
-    "SCENE",
-    "TEXTURES",
-    "add_texture",
-    "add_value",
-    "problem_text",
-    "write_exr",
-]
-
 PROBLEM, SCENE = "problem.toml", "scene.xml"
 REFERENCES, MASKS, TEXTURES = "references", "masks", "textures"
 """Folders of an import."""

@@ -20,8 +20,6 @@ from unrender.app.cli.sweep import sweep_command
 from unrender.app.cli.turntable import turntable
 from unrender.app.cli.watch import watch
 
-__all__ = ["app"]
-
 app = typer.Typer(
     help="Recover what a scene is made of (textures, materials, light) from images of it.",
     add_completion=False,

@@ -24,36 +24,6 @@ if TYPE_CHECKING:
     from unrender.app.distributed.cluster import Workers
     from unrender.scene.problem import Problem
 
-__all__ = [
-    "DEFAULT_STEPS",
-    "AllowOutside",
-    "CheckpointEvery",
-    "FinalSpp",
-    "Insecure",
-    "NoCache",
-    "Overwrite",
-    "ProblemName",
-    "ProblemSettings",
-    "Seed",
-    "Threads",
-    "Variant",
-    "WorkersOption",
-    "absolute",
-    "budget",
-    "check_problem",
-    "check_variant",
-    "finished_run",
-    "folder",
-    "literal",
-    "open_problem",
-    "refuse_stages",
-    "remove_if_empty",
-    "settings",
-    "short_name",
-    "use_variant",
-    "workers",
-]
-
 DEFAULT_STEPS = 300
 
 ProblemName = Annotated[

@@ -46,9 +46,6 @@ if TYPE_CHECKING:
     from unrender.scene.problem import Problem
 
 
-__all__ = ["DEFAULT_SECONDS", "compare", "plain", "show"]
-
-
 def show(console: Console, comparison: Comparison) -> None:
     """The median over each method's runs, and the range: of every metric, and of the last pictures."""
     parameters = [metric for metric in comparison.metrics if metric.name != "loss"]

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from unrender.runs.folder.schema import RunRecord
     from unrender.scene.problem import Problem
 
-__all__ = ["Compress", "check", "dealt", "variant_again"]
-
 Compress = Annotated[
     bool,
     typer.Option(

@@ -18,8 +18,6 @@ from unrender.backend import cache, limits, llvm, variant
 from unrender.core.errors import VariantError
 from unrender.display.terminal import Console
 
-__all__ = ["TOLERANCE", "doctor", "gradient_error"]
-
 TOLERANCE = 1e-3
 """The largest relative error of the trial gradient: both sides use the same paths, so what is left is rounding."""
 

@@ -12,8 +12,6 @@ from unrender.app.cli.arguments import AllowOutside, Variant
 from unrender.core.errors import InputError
 from unrender.display.terminal import Console
 
-__all__ = ["export"]
-
 
 def export(
     directory: Annotated[

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from unrender.app.capture.importing import Imported
     from unrender.display.terminal import Console
 
-__all__ = ["import_"]
-
 
 _Folder = Annotated[
     Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model, poses_bounds.npy or lights.txt.")

@@ -14,8 +14,6 @@ from unrender.app.cli.arguments import AllowOutside, Variant
 if TYPE_CHECKING:
     from unrender.app.evaluation.judge import Judgement
 
-__all__ = ["judge"]
-
 
 def judge(
     directory: Annotated[

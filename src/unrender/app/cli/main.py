@@ -20,8 +20,6 @@ from unrender.core.checks import encode_text
 from unrender.core.errors import UnrenderError, VariantError
 from unrender.core.text import one_line
 
-__all__ = ["main"]
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit status."""

@@ -20,8 +20,6 @@ from unrender.backend import limits
 from unrender.core.errors import VariantError
 from unrender.core.text import one_line
 
-__all__ = ["check", "drop_errors", "exhausted", "exhaustion", "is_limited", "says_so", "supervised"]
-
 _BASE, _PER_CORE = 800 << 20, 64 << 20
 """Bytes of addresses that the smallest problem with a renderer takes: libraries, then a thread's stack and heap for each core."""
 _MARGIN = 64 << 20

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from unrender.methods import Method
 
-__all__ = ["methods"]
-
 
 def methods(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None,

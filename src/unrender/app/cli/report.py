@@ -12,9 +12,6 @@ from unrender.app.sweeps import folders
 from unrender.app.sweeps.record import SweepRecord
 from unrender.core.errors import InputError
 
-__all__ = ["report", "write_page"]
-
-
 _MOST = 6
 
 

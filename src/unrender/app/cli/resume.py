@@ -14,8 +14,6 @@ from unrender.app.cli.run import conclude
 from unrender.core import phases
 from unrender.core.errors import InputError
 
-__all__ = ["resume"]
-
 
 def resume(
     context: typer.Context,

@@ -18,8 +18,6 @@ from typing import Any
 
 from unrender.core.signals import GRACEFUL
 
-__all__ = ["DOUBTFUL", "ENVIRONMENT", "FAILED", "INPUT", "INTERRUPTED", "TERMINATED", "WORDS", "Signals"]
-
 INPUT, ENVIRONMENT, FAILED, DOUBTFUL = 2, 3, 4, 5
 """Invalid input; the machine lacks something; the run was given up; the check by fresh pictures failed."""
 INTERRUPTED, TERMINATED = 130, 143

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.scene.problem import Problem
 
-__all__ = ["StagesRun", "begin", "is_stages", "refuse_settings", "refuse_workers", "reopen", "run_remaining"]
-
 _SCENES = "scenes"
 
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from unrender.app.sweeps.search import Search
     from unrender.display.terminal import Console
 
-__all__ = ["sweep", "sweep_command"]
-
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
 MARK = "sweep.json"

@@ -36,9 +36,6 @@ from unrender.runs.folder.schema import DOUBTFUL
 from unrender.runs.result import TERMINATED as TOLD_TO_TERMINATE
 from unrender.scene.problem import Problem
 
-__all__ = ["Session", "best_so_far", "line", "run_command", "run_trials", "show"]
-
-
 _SHOWN, _SHOWN_LIVE = 10, 5
 
 

@@ -21,8 +21,6 @@ from unrender.io import bounded_files
 from unrender.runs.folder import schema
 from unrender.runs.folder.schema import LIVE, LIVE_STATUS, LiveStatus
 
-__all__ = ["TaskDisplay"]
-
 _PER_SECOND = 2.0
 _MOST_ROWS = 20
 

@@ -32,8 +32,6 @@ from unrender.runs.result import PRUNED
 from unrender.runs.resume import load_run, resume_run
 from unrender.scene.problem import Problem
 
-__all__ = ["Job", "RunTask", "carry_out", "discard_earlier", "in_turn", "on_worker", "open_job", "quiet", "receive"]
-
 _PATIENCE_SECONDS = 30.0
 """For a run folder that a dying process still holds."""
 _MARK = ".unrender-folder"

@@ -11,8 +11,6 @@ from unrender.app.cli import arguments
 from unrender.app.cli.arguments import AllowOutside, Variant
 from unrender.core.errors import InputError
 
-__all__ = ["turntable"]
-
 
 def turntable(
     directory: Annotated[

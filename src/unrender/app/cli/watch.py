@@ -17,8 +17,6 @@ from unrender.core.suggestions import did_you_mean
 if TYPE_CHECKING:
     from unrender.app.watch import server
 
-__all__ = ["watch"]
-
 _NICE = 10
 
 

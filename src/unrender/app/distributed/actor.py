@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from unrender.app.distributed.share import ViewShare
     from unrender.runs.folder.state import Packed
 
-__all__ = ["Place", "ViewWorker"]
-
 
 @dataclass(frozen=True)
 class Place:
@@ -80,11 +78,9 @@ class ViewWorker:
         return self._shares[share].run(replace(call, arrays=arrays))
 
     def store(self, share: int, number: int, packed: Packed) -> None:
-        """See `ViewShare.store`."""
         self._shares[share].store(number, packed)
 
     def fetch(self, share: int, number: int) -> Packed:
-        """See `ViewShare.fetch`."""
         return self._shares[share].fetch(number)
 
 

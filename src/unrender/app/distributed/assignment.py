@@ -14,8 +14,6 @@ from unrender.pixels.base import DrawStatistics
 from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
 
-__all__ = ["assign", "check", "joined", "needed", "split", "total"]
-
 
 def assign(pixels: Sequence[int], workers: int) -> tuple[tuple[int, ...], ...]:
     """The views of each worker, ascending: the largest view that is left goes to who has the fewest pixels so far, the first of these.

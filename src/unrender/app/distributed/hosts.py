@@ -9,8 +9,6 @@ from unrender.app.distributed.messages import Call, Reply
 from unrender.app.distributed.share import ViewShare
 from unrender.runs.folder.state import Packed
 
-__all__ = ["Hosts", "LocalHosts"]
-
 
 class Hosts(Protocol):
     """Holds shares, and may lose them."""
@@ -62,7 +60,6 @@ class LocalHosts:
 
     @property
     def count(self) -> int:
-        """See `Hosts.count`."""
         return len(self._shares)
 
     def room(self) -> list[tuple[str, int]]:
@@ -70,7 +67,6 @@ class LocalHosts:
         return [("this machine", 0)] * self.count
 
     def run(self, calls: Mapping[int, Call]) -> dict[int, Reply]:
-        """See `Hosts.run`."""
         return {index: self._shares[index].run(call) for index, call in calls.items()}
 
     def emptied(self) -> set[int]:
@@ -78,12 +74,10 @@ class LocalHosts:
         return set()
 
     def store(self, share: int, number: int, packed: Packed) -> bool:
-        """See `Hosts.store`."""
         self._shares[share].store(number, packed)
         return True
 
     def fetch(self, number: int) -> dict[int, Packed]:
-        """See `Hosts.fetch`."""
         return {index: share.fetch(number) for index, share in enumerate(self._shares)}
 
     def movable(self) -> list[int]:
@@ -91,5 +85,4 @@ class LocalHosts:
         return []
 
     def move(self, share: int) -> None:
-        """See `Hosts.move`."""
         del share

@@ -11,8 +11,6 @@ from unrender.app.distributed.messages import Call
 from unrender.app.distributed.outbox import Sent
 from unrender.runs.folder.state import Packed
 
-__all__ = ["Memories", "Memory", "Recipe"]
-
 _MOST_STEPS = 512
 _MOST_BYTES = 1 << 28
 """Steps, and bytes of their parameters, that a share that was lost repeats at most; or as many bytes as a collection has, where these are

@@ -11,8 +11,6 @@ from unrender.core.random import Key
 from unrender.pixels.base import DrawStatistics
 from unrender.rendering.renderer import Space
 
-__all__ = ["Batch", "Call", "Difference", "ImageState", "Pair", "Pilot", "Reply", "payload_bytes"]
-
 References = dict[str, int]
 """{parameter: number of the array that it is}."""
 

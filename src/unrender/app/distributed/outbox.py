@@ -13,8 +13,6 @@ from unrender.app.distributed.messages import Difference, References
 from unrender.core import arrays
 from unrender.core.trees import Tree
 
-__all__ = ["Outbox", "Sent"]
-
 _RECENT = 4
 """Arrays of each parameter that are known again: the current one, and those that states of earlier steps hold."""
 _MOST = 65504.0

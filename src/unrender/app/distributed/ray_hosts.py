@@ -17,8 +17,6 @@ from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line
 from unrender.runs.folder.state import Packed
 
-__all__ = ["RayHosts"]
-
 _POLL, _PATIENCE, _ANSWER = 1.0, 4.0, 8.0
 """Seconds between looks; without a reply until a worker is asked whether it is there; and until it has to have said so."""
 _START = 60.0
@@ -105,7 +103,6 @@ class RayHosts:
 
     @property
     def count(self) -> int:
-        """See `Hosts.count`."""
         return len(self._views)
 
     def room(self) -> list[tuple[str, int]]:
@@ -123,7 +120,6 @@ class RayHosts:
     # ------------------------------------------------------------------ Hosts
 
     def run(self, calls: Mapping[int, Call]) -> dict[int, Reply]:
-        """See `Hosts.run`."""
         common = self._put({share: call.arrays for share, call in calls.items()})
         references = {
             share: self._called(share, "run", share, replace(call, arrays={}), common[share])
@@ -134,16 +130,13 @@ class RayHosts:
         return replies
 
     def emptied(self) -> set[int]:
-        """See `Hosts.emptied`."""
         found, self._emptied = self._emptied, set()
         return found
 
     def store(self, share: int, number: int, packed: Packed) -> bool:
-        """See `Hosts.store`."""
         return share in self._collected({share: self._called(share, "store", share, number, packed)})
 
     def fetch(self, number: int) -> dict[int, Packed]:
-        """See `Hosts.fetch`."""
         return self._collected({share: self._called(share, "fetch", share, number) for share in range(self.count)})
 
     def movable(self) -> list[int]:

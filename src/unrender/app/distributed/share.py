@@ -21,8 +21,6 @@ from unrender.runs.folder.state import Packed, pack, unpack
 from unrender.scene.batches import Frame, PixelBatch, PixelSample, WholeView
 from unrender.scene.problem import Problem
 
-__all__ = ["ViewShare"]
-
 
 class ViewShare:
     """Some views of a problem, as a worker holds them. Mutable: it keeps what the driver numbers and has not told it to drop.

@@ -11,8 +11,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.losses import metrics
 
-__all__ = ["Albedo", "Measures", "best_factors", "compare_albedo", "mean", "measure", "shown"]
-
 _WINDOW = 7
 
 

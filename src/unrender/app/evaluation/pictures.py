@@ -17,9 +17,6 @@ from unrender.losses.metrics import exposure, srgb
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["FOLDER", "MOST_ROWS", "SHEET", "environment_picture", "mask_of", "names_of", "plain", "sheet", "write"]
-
-
 MOST_ROWS = 48
 _CELL, _LABEL, _GAP = 240, 14, 4
 _BACKGROUND, _INK = (20, 20, 20), (220, 220, 220)

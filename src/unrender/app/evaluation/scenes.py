@@ -18,9 +18,6 @@ from unrender.io import images
 from unrender.rendering.mitsuba.description import load
 from unrender.scene.problem import Problem
 
-__all__ = ["HELD_OUT", "export_scene", "find", "load_scene", "read_light", "render", "sensors", "turned_up", "up_axis"]
-
-
 HELD_OUT = "held-out.toml"
 
 

@@ -22,8 +22,6 @@ from unrender.rendering.mitsuba import turntable_light
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 
-__all__ = ["BACKGROUNDS", "turntable"]
-
 BACKGROUNDS = {"light": None, "black": 0.0, "grey": 0.18, "white": 1.0}
 """Behind the object: what lights it, or a linear value."""
 _ANGLE = 35.0

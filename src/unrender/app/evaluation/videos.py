@@ -15,8 +15,6 @@ from PIL import Image
 from unrender.core.errors import InputError
 from unrender.io import files
 
-__all__ = ["ENDINGS", "check", "has_ffmpeg", "write"]
-
 ENDINGS = (".mp4", ".gif", "")
 """The last is a folder."""
 _QUALITY = 8

@@ -12,8 +12,6 @@ import numpy as np
 from unrender.app.exporting.asset import Asset, Camera
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 
-__all__ = ["SCRIPT", "write"]
-
 SCRIPT = "open_in_blender.py"
 _TEMPLATE, _PLACE = "open_in_blender.py.txt", '"SETTINGS"'
 # glTF's and Mitsuba's y is up, Blender's z is: its importer takes (x, y, z) to (x, -z, y).

@@ -14,8 +14,6 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.io import mesh_files
 
-__all__ = ["FORMATS", "MITSUBA", "OWN", "Format", "check", "write", "write_obj", "write_ply"]
-
 
 def write_obj(asset: Asset, folder: Path) -> None:
     """asset.obj, asset.mtl and their maps.

@@ -18,8 +18,6 @@ from unrender.core.errors import InputError
 if TYPE_CHECKING:
     import pygltflib
 
-__all__ = ["check_installed", "glb"]
-
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
 _LINEAR, _MIPMAPS, _CLAMP, _REPEAT = 9729, 9987, 33071, 10497

@@ -20,8 +20,6 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.description import parse
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
-__all__ = ["Place", "SceneGraph"]
-
 _LABEL = re.compile(r"n(\d+)")
 _MARK = "unrender_node"
 _NAMELESS = re.compile(r"|object_\d+|_.*|elm__\d+")

@@ -17,8 +17,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.io.images import luminance
 
-__all__ = ["MOST_TEXELS", "Material", "check_size", "read_material"]
-
 MOST_TEXELS = 8192
 """Along a side of a map: what graphics cards and browsers take."""
 _WRAPPERS = {"TwoSidedBRDF": "brdf_0.", "NormalMap": "nested_bsdf."}

@@ -18,9 +18,6 @@ from unrender.io.resampling import upsample
 from unrender.io.volumes import write_grid
 from unrender.losses.metrics import srgb
 
-__all__ = ["base_colour", "grey", "metallic_roughness", "mirrored_texels", "normal_map", "png", "write"]
-
-
 FOLDER, RECORD, TABLE = "maps", "parameters.json", "parameters.csv"
 _LARGEST = 64
 """Numbers of a parameter that are written out as text."""

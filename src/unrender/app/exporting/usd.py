@@ -14,8 +14,6 @@ from unrender.app.exporting import textures
 from unrender.app.exporting.asset import Asset, Part
 from unrender.core.errors import InputError
 
-__all__ = ["FILE", "check_installed", "write"]
-
 FILE = "asset.usdz"
 
 

@@ -19,8 +19,6 @@ from unrender.display.plots import Chart, Line
 from unrender.io.files import write
 from unrender.runs.folder.reader import RunFolder, read
 
-__all__ = ["compare", "load_comparison", "write_comparison"]
-
 _VIEWS = 4
 _MAPS = 8
 

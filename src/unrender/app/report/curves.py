@@ -9,8 +9,6 @@ import numpy as np
 
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 
-__all__ = ["Band", "Series", "band", "binned", "image_error", "parameter_error", "relative_error", "smoothed_loss"]
-
 _BINS = 200
 _SMOOTHED_POINTS = 500
 _TIMES = 2000

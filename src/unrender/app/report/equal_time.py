@@ -18,18 +18,6 @@ from unrender.display.plots import AXES
 from unrender.rendering import parameter_errors
 from unrender.runs.folder.reader import RunFolder
 
-__all__ = [
-    "LOSS_WINDOW",
-    "SHARES",
-    "Comparison",
-    "ErrorAtBudget",
-    "MethodResult",
-    "Metric",
-    "Spread",
-    "TimeToTarget",
-    "compare_groups",
-]
-
 SHARES = (0.25, 0.5, 1.0)
 """Of the shortest run's time, or of the fewest samples: where methods are compared."""
 LOSS_WINDOW = 0.05

@@ -15,8 +15,6 @@ from unrender.core.text import printable
 from unrender.runs.folder.reader import RunFolder
 from unrender.runs.folder.schema import DOUBTFUL
 
-__all__ = ["Group", "check_comparable", "group"]
-
 _NOT_THE_METHOD = {"seed", "seconds", "steps", "out", "run_directory"}
 _TOLERANCE = 0.01
 _ARGUMENT = re.compile(r"(\w+)=([^=(),]+)(?=[,)])")

@@ -16,8 +16,6 @@ from unrender.core.text import visible
 from unrender.display import formatting
 from unrender.runs.folder.schema import RunRecord
 
-__all__ = ["environment", "facts", "flatten", "loader", "render", "source"]
-
 _SCRIPT = "viewer.js"
 
 

@@ -10,8 +10,6 @@ import numpy as np
 from unrender.losses import metrics
 from unrender.runs.folder.reader import RunFolder
 
-__all__ = ["MOST_PIXELS", "ImageMetric", "available", "measure_run", "measure_views"]
-
 MOST_PIXELS = 1 << 21
 """Of all views' pictures that are measured. FLIP takes a second or two for a megapixel."""
 

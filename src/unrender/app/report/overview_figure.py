@@ -15,8 +15,6 @@ from unrender.app.report.curves import Band
 from unrender.app.report.equal_time import Comparison, Metric
 from unrender.display import formatting, pictures, plots
 
-__all__ = ["overview_figure"]
-
 _COLOURS = ("#2a6fdb", "#d9622b", "#1a9a6c", "#8a4fc4", "#b8860b", "#c2407f")
 _COLUMNS = 6
 _WIDTH = 10.0

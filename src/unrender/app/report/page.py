@@ -10,8 +10,6 @@ from unrender.display import plots
 from unrender.io.files import write
 from unrender.runs.folder.reader import read
 
-__all__ = ["page"]
-
 _VIEWS = 8
 _MAPS = 24
 _SHAPES = 6

@@ -12,8 +12,6 @@ from unrender.display import formatting
 from unrender.runs.folder.reader import RunFolder
 from unrender.scene.surfaces import area_normals
 
-__all__ = ["MOST_FACES", "ShapePanel", "Solid", "panel"]
-
 MOST_FACES = 200_000
 """Of the meshes of a panel together; more are not shown."""
 _STEPS = (1 << 16) - 1

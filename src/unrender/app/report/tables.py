@@ -17,19 +17,6 @@ from unrender.runs.folder.schema import DOUBTFUL, RunRecord
 from unrender.runs.sensitivity import seen_cells
 from unrender.statistics import debiased
 
-__all__ = [
-    "STOP_REASONS",
-    "ParameterRow",
-    "Tile",
-    "ViewRow",
-    "charts",
-    "charts_of_runs",
-    "ending",
-    "parameter_row",
-    "tiles",
-    "view_rows",
-]
-
 
 def charts(run: RunFolder, axis: str) -> list[Chart]:
     """Parameter errors, loss, and gradient noise of one run, along "seconds" or "samples"."""

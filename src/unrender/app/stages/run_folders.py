@@ -8,8 +8,6 @@ from unrender.app.stages import stages_file
 from unrender.app.stages.stages_file import Stages
 from unrender.runs.folder import schema
 
-__all__ = ["last_result", "listed", "stage_of"]
-
 
 def listed(directory: Path) -> list[Path]:
     """The run folders of a folder of stages, also of those that have not begun; of any other, itself. Raises `InputError`."""

@@ -35,20 +35,6 @@ from unrender.io import bounded_files, files, toml_lines, toml_models
 from unrender.io.toml_lines import Place
 from unrender.io.toml_models import Table
 
-__all__ = [
-    "FILE",
-    "RunOptions",
-    "Stage",
-    "Stages",
-    "folder_of",
-    "is_of_run",
-    "is_stages",
-    "read",
-    "split",
-    "text",
-    "write",
-]
-
 FILE = "stages.toml"
 """In an import's folder, and in that of a run in stages."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")

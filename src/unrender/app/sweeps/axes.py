@@ -10,8 +10,6 @@ from typing import Any
 from unrender.core.errors import InputError
 from unrender.methods.base import Method
 
-__all__ = ["Axis", "as_text", "parse_axes"]
-
 _DIGITS = 4
 """Significant digits of numbers from a range, so that they can be typed again."""
 _MOST_POINTS = 10_000

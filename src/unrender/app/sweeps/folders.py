@@ -7,8 +7,6 @@ from pathlib import Path
 from unrender.app.sweeps.record import SWEEP, SweepRecord, read_sweep
 from unrender.core.errors import InputError
 
-__all__ = ["PATTERN", "best", "name", "watched"]
-
 PATTERN = "trial-*-seed*"
 _MOST_WATCHED = 64
 

@@ -24,8 +24,6 @@ from unrender.statistics import debiased
 if TYPE_CHECKING:
     from unrender.runs.run import Run
 
-__all__ = ["RUNGS", "RUNG_FILE", "Pruning", "is_hopeless", "medians", "read_rungs", "stated_error"]
-
 RUNGS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8)
 """Shares of the budget at which a run's error is looked at; none is pruned at the first."""
 RUNG_FILE = "rungs.json"
@@ -107,7 +105,6 @@ class Pruning(Callback):
         self._initial: dict[str, float] = {}
 
     def on_start(self, run: Run) -> None:
-        """See `Callback.on_start`."""
         problem = run.problem
         self._initial = problem.parameter_error(problem.start(0)) if problem.has_truth else {}
         self._errors = {}
@@ -117,7 +114,6 @@ class Pruning(Callback):
             self._path.unlink(missing_ok=True)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
         passed = [share for share in RUNGS if max(self._errors, default=0.0) < share <= run.progress()]
         if not passed or run.stopped:
             return

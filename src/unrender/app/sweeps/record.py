@@ -11,8 +11,6 @@ from unrender.core.errors import InputError
 from unrender.io import bounded_files, files
 from unrender.runs.folder import schema
 
-__all__ = ["SWEEP", "RunOutcome", "SweepPlan", "SweepRecord", "TrialRecord", "read_sweep", "write_sweep"]
-
 SWEEP = "sweep.json"
 _Count = Annotated[StrictInt, Field(ge=0, lt=2**63)]
 _Positive = Annotated[StrictInt, Field(ge=1, lt=2**31)]

@@ -12,9 +12,6 @@ from unrender.app.sweeps.axes import Axis
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 
-__all__ = ["TPE", "Grid", "Random", "Search", "TrialOutcome"]
-
-
 _MOST_TRIALS = 100_000
 
 
@@ -71,16 +68,13 @@ class Grid:
 
     @property
     def trials(self) -> int:
-        """See `Search.trials`."""
         return math.prod(len(axis.points()) for axis in self.axes)
 
     @property
     def learns(self) -> bool:
-        """See `Search.learns`."""
         return False
 
     def ask(self, number: int) -> dict[str, str]:
-        """See `Search.ask`."""
         found: dict[str, str] = {}
         for axis in reversed(self.axes):
             points = axis.points()
@@ -102,11 +96,9 @@ class Random:
 
     @property
     def learns(self) -> bool:
-        """See `Search.learns`."""
         return False
 
     def ask(self, number: int) -> dict[str, str]:
-        """See `Search.ask`."""
         key = Key(self.seed, number)
         return {axis.name: axis.at(key.fold(i).uint32() / 2**32) for i, axis in enumerate(self.axes)}
 
@@ -146,11 +138,9 @@ class TPE:
 
     @property
     def learns(self) -> bool:
-        """See `Search.learns`."""
         return True
 
     def ask(self, number: int) -> dict[str, str]:
-        """See `Search.ask`."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             trial = self._study.ask(_distributions(self.axes))
@@ -158,7 +148,6 @@ class TPE:
         return {axis.name: _text(axis, trial.params[axis.name]) for axis in self.axes}
 
     def tell(self, number: int, outcome: TrialOutcome) -> None:
-        """See `Search.tell`."""
         from optuna.trial import TrialState
 
         trial = self._asked.pop(number)

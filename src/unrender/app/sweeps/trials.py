@@ -12,8 +12,6 @@ from unrender.app.sweeps.record import RunOutcome, TrialRecord
 from unrender.app.sweeps.search import Search, TrialOutcome
 from unrender.core.errors import InputError
 
-__all__ = ["Started", "Trials", "trial_record"]
-
 
 @dataclass(frozen=True)
 class Started:

@@ -20,9 +20,6 @@ from typing import Any
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-__all__ = ["BACKLOG", "Connection", "Redirect", "admit", "enough_files"]
-
-
 BACKLOG = 1024
 """Connections that may wait to be accepted; accepting them all at once must not use up the process's files."""
 

@@ -20,8 +20,6 @@ from unrender.app.watch.monitor import Snapshot
 from unrender.display import formatting, plots
 from unrender.runs.folder.reader import RunFolder
 
-__all__ = ["PictureCache", "RunRow", "environment", "render", "source"]
-
 _COLOURS = 6
 _MAPS = 8
 _CACHED_PAGES = 8

@@ -18,8 +18,6 @@ from unrender.runs.folder.history import History, HistoryReader
 from unrender.runs.folder.reader import RunFolder, ViewPictures, pictures_by_view, read, read_record
 from unrender.runs.folder.schema import HISTORY, LIVE, LIVE_STATUS, RECORD, LiveStatus
 
-__all__ = ["RunMonitor", "Snapshot"]
-
 _FILES = (
     RECORD,
     HISTORY,

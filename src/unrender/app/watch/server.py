@@ -29,8 +29,6 @@ from unrender.core.errors import InputError
 from unrender.io import files
 from unrender.runs.folder.schema import COMMANDS, CONTROL
 
-__all__ = ["HOST", "Address", "application", "listen", "serve"]
-
 HOST = "127.0.0.1"
 _NAMES = {HOST, "localhost"}
 _LONGEST_COMMAND = 1024

@@ -20,17 +20,6 @@ from unrender.estimators.smoothing.options import SamplingOptions
 from unrender.estimators.smoothing.sampling import Function, SmoothedFunction
 from unrender.statistics import gaussian
 
-__all__ = [
-    "GradientAndProduct",
-    "estimate_gradient",
-    "estimate_gradient_and_product",
-    "estimate_hessian",
-    "estimate_hvp",
-    "gradient",
-    "hessian",
-    "hvp",
-]
-
 
 def gradient(
     f: Function,

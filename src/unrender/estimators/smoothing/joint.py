@@ -10,8 +10,6 @@ from unrender.estimators.smoothing.options import SamplingOptions
 from unrender.estimators.smoothing.sampling import Function, SmoothedFunction
 from unrender.statistics import gaussian
 
-__all__ = ["JointDerivatives", "joint"]
-
 
 def joint(
     f: Function,

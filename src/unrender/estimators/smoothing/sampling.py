@@ -13,8 +13,6 @@ from unrender.core.dropped import DropReport
 from unrender.core.errors import InputError
 from unrender.estimators.smoothing.options import SamplingOptions
 
-__all__ = ["Function", "SmoothedFunction"]
-
 Function = Callable[[np.ndarray], np.ndarray]
 """(B, n) to (B,)."""
 

@@ -13,8 +13,6 @@ from unrender.methods.rules.traits import Traits
 from unrender.pixels.base import PixelSampler
 from unrender.scene.problem import Problem
 
-__all__ = ["image", "renders_half", "sampler", "samples_per_pixel", "within"]
-
 
 def sampler(traits: Traits) -> tuple[PixelSampler, str]:
     """Return the pixels of a step, and why they are not all."""

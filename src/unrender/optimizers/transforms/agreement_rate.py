@@ -20,8 +20,6 @@ from unrender.optimizers.transforms.base import (
     checked_keys,
 )
 
-__all__ = ["Agreement", "AgreementRate"]
-
 _DELAY = 10.0
 """τ of the docstring, in steps."""
 _STEEPEST = 0.6
@@ -79,7 +77,6 @@ class AgreementRate(StepTransform):
         object.__setattr__(self, "unsized", checked_keys("AgreementRate: unsized", self.unsized))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Agreement:
-        """See `StepTransform.init`."""
         sizes = {
             key: max(_root_mean_square(x, arrays.number(arrays.total(x * x))) or 1.0, learning_rates[key])
             for key, x in parameters.items()

@@ -14,19 +14,6 @@ from unrender.estimators.capabilities import Capability
 from unrender.preconditioners.base import Preconditioner
 from unrender.scene.upsampling import SQUARES, Upsampler
 
-__all__ = [
-    "GRADIENTS",
-    "MEAN_SQUARES",
-    "SMOOTHING_UNCHANGED",
-    "VALUES",
-    "SmoothingChange",
-    "StepTransform",
-    "StepUpdate",
-    "TransformState",
-    "checked_keys",
-    "checked_transforms",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class SmoothingChange:

@@ -29,8 +29,6 @@ from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditi
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["STEPS", "ApplyPreconditioner", "FittedSobolev", "FittedSobolevState", "StrengthFit"]
-
 STEPS = 10
 """The pairs of gradients that the strength is fitted to at first: later ones tell more of noise than of what is still to do."""
 _FACTOR, _WEAKEST = 4.0, 1 / 16
@@ -212,7 +210,6 @@ class _Pair:
     second: np.ndarray | None
 
     def descents(self, smooth: Sobolev, shares: np.ndarray) -> np.ndarray:
-        """See `Sobolev.descents`."""
         if self.second is None:
             return smooth.descents(self.previous, self.gradient, shares)
         return smooth.descents_of_summaries(arrays.shape(self.gradient), self.first, self.second, shares)
@@ -304,7 +301,6 @@ class FittedSobolev(StepTransform):
     def on_meshes(
         self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
     ) -> FittedSobolev:
-        """See `OnMeshes.on_meshes`."""
         smooth, bound = self.preconditioner, {}
         for key in self.preconditioned:
             if isinstance(smooth, MeshPreconditioner) and (mesh := topology(key)) is not None:
@@ -383,11 +379,9 @@ class ApplyPreconditioner(StepTransform):
     """
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
-        """See `StepTransform.init`."""
         del parameters, learning_rates
 
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
-        """See `StepTransform.update`."""
         del state
         direction = dict(update.direction)
         for key, change in update.smoothing.items():

@@ -10,8 +10,6 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.optimizers.transforms.base import GRADIENTS, StepTransform, StepUpdate, TransformState
 
-__all__ = ["DecayingSum", "GradientMean", "MeanDirection", "Velocity"]
-
 
 @dataclass(frozen=True)
 class MeanDirection(TransformState):
@@ -41,12 +39,10 @@ class GradientMean(StepTransform):
         checks.number("GradientMean", "decay", self.decay, above=0.0, below=1.0, inclusive=True)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> MeanDirection:
-        """See `StepTransform.init`."""
         del learning_rates
         return MeanDirection(trees.zeros_like(parameters))
 
     def update(self, update: StepUpdate, state: MeanDirection) -> tuple[StepUpdate, MeanDirection]:
-        """See `StepTransform.update`."""
         mean = trees.map(lambda m, g: self.decay * m + (1.0 - self.decay) * g, state.first_moment, update.direction)
         divisor = update.divisor * (1.0 - self.decay ** (update.made + 1))
         return replace(update, direction=mean, divisor=divisor), MeanDirection(mean)
@@ -80,11 +76,9 @@ class DecayingSum(StepTransform):
         checks.number("DecayingSum", "momentum", self.momentum, above=0.0, below=1.0, inclusive=True)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Velocity:
-        """See `StepTransform.init`."""
         del learning_rates
         return Velocity(trees.zeros_like(parameters))
 
     def update(self, update: StepUpdate, state: Velocity) -> tuple[StepUpdate, Velocity]:
-        """See `StepTransform.update`."""
         velocity = trees.map(lambda u, g: self.momentum * u + g, state.velocity, update.direction)
         return replace(update, direction=velocity), Velocity(velocity)

@@ -15,8 +15,6 @@ from unrender.optimizers.transforms.base import StepTransform, StepUpdate, check
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
-__all__ = ["PerParameter", "PerParameterState"]
-
 _TREES = ("learning_rates", "parameters", "gradient", "direction", "factors", "smoothing", "steps")
 
 
@@ -71,7 +69,6 @@ class PerParameter(StepTransform):
     def on_meshes(
         self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
     ) -> PerParameter:
-        """See `OnMeshes.on_meshes`."""
         own, others = (
             tuple(part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part for part in parts)
             for parts in (self.transforms, self.others)
@@ -89,7 +86,6 @@ class PerParameter(StepTransform):
         return PerParameterState(*states)
 
     def update(self, update: StepUpdate, state: PerParameterState) -> tuple[StepUpdate, PerParameterState]:
-        """See `StepTransform.update`."""
         results, following = [], []
         for parts, before, own in ((self.transforms, state.own, True), (self.others, state.others, False)):
             found, states = self._restricted(update, own), []
@@ -109,7 +105,6 @@ class PerParameter(StepTransform):
         return following_update, PerParameterState(*following)
 
     def choices(self, state: PerParameterState, made: int) -> tuple[str, ...]:
-        """See `StepTransform.choices`."""
         pairs = zip((*self.transforms, *self.others), (*state.own, *state.others), strict=True)
         return tuple(line for part, own in pairs for line in part.choices(own, made))
 

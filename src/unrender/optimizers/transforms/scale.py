@@ -20,8 +20,6 @@ from unrender.optimizers.transforms.base import (
     TransformState,
 )
 
-__all__ = ["ClipDirection", "MeanSquare", "ScaleByDeviation", "ScaleByRms"]
-
 
 @dataclass(frozen=True)
 class MeanSquare(TransformState):
@@ -59,7 +57,6 @@ class ScaleByRms(StepTransform):
         checks.number("ScaleByRms", "epsilon", self.epsilon, above=0.0)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> MeanSquare:
-        """See `StepTransform.init`."""
         del learning_rates
         return MeanSquare(trees.zeros_like(parameters))
 
@@ -119,11 +116,9 @@ class ScaleByDeviation(StepTransform):
         return (Variance, PastWeight) if self.rule == "walk" else (Variance,)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
-        """See `StepTransform.init`."""
         del parameters, learning_rates
 
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
-        """See `StepTransform.update`."""
         del state
         variance = update.estimate.require("ScaleByDeviation", Variance).values
         direction = {key: x / arrays.sqrt(variance[key] + self.epsilon) for key, x in update.direction.items()}
@@ -148,11 +143,9 @@ class ClipDirection(StepTransform):
         checks.number("ClipDirection", "longest", self.longest, above=0.0)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
-        """See `StepTransform.init`."""
         del parameters, learning_rates
 
     def update(self, update: StepUpdate, state: None) -> tuple[StepUpdate, None]:
-        """See `StepTransform.update`."""
         del state
         most = self.longest * update.divisor
 

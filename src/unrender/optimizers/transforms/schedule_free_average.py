@@ -11,8 +11,6 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.optimizers.transforms.base import SMOOTHING_UNCHANGED, VALUES, StepTransform, StepUpdate, TransformState
 
-__all__ = ["Iterates", "ScheduleFreeAverage"]
-
 _WARMUP = 2
 """Steps over which the rate rises."""
 _PROJECTED = 1e-5
@@ -55,12 +53,10 @@ class ScheduleFreeAverage(StepTransform):
         checks.number("ScheduleFreeAverage", "averaging", self.averaging, above=0.0, inclusive=True)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Iterates:
-        """See `StepTransform.init`."""
         del learning_rates
         return Iterates(dict(parameters), dict(parameters))
 
     def update(self, update: StepUpdate, state: Iterates) -> tuple[StepUpdate, Iterates]:
-        """See `StepTransform.update`."""
         weight = (1.0 + self.averaging) / (update.made + 1.0 + self.averaging)
         warm = replace(update, factor=update.factor * min(1.0, (update.made + 1) / _WARMUP))
         steps: Tree = {}

@@ -17,8 +17,6 @@ from unrender.optimizers.transforms.base import MEAN_SQUARES, StepTransform, Ste
 from unrender.preconditioners import Sobolev
 from unrender.preconditioners.base import Preconditioner
 
-__all__ = ["GradientProducts", "WienerShrinkage", "signal_share"]
-
 _MEMORY = 0.8
 """Decay of the sums over steps."""
 

@@ -16,8 +16,6 @@ import numpy as np
 from unrender.rendering.mitsuba.scene_graph import all_shapes
 from unrender.rendering.mitsuba.scene_loading import media
 
-__all__ = ["camera_media", "medium_id"]
-
 _log = logging.getLogger("unrender")
 
 _RAYS = 8

@@ -16,8 +16,6 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import views_of
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
 
-__all__ = ["CameraTerm", "lens_parameters", "moved_sensor", "no_tangents", "sensor_obstacle", "translation_obstacle"]
-
 _STREAM = 4
 """Of the key of a request: numbers that neither its paths nor boundaries have."""
 _LENSES = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")

@@ -13,8 +13,6 @@ from typing import Any
 
 import mitsuba as mi
 
-__all__ = ["load_described", "recorded_descriptions"]
-
 Recorded = list[tuple[Any, dict[str, Any]]]
 
 _recorded: ContextVar[Recorded | None] = ContextVar("recorded", default=None)

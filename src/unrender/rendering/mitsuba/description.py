@@ -22,8 +22,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import one_line, shorten
 from unrender.io import scene_assets, scene_files, spectrum_files
 
-__all__ = ["Parsed", "load", "parse"]
-
 _DEEPEST = 128
 _MOST_PATHS = 1 << 20
 _FILE = "filename"

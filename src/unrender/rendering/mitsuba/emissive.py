@@ -27,8 +27,6 @@ import mitsuba as mi
 
 from unrender.core.errors import InputError
 
-__all__ = ["COEFFICIENT", "FUNCTIONS", "emits", "harmonics", "is_positive", "register"]
-
 COEFFICIENT = "emission_"
 """What the names of the volumes beyond `emission` begin with."""
 FUNCTIONS = (1, 4, 9)

@@ -16,8 +16,6 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import EmitterMoments
 
-__all__ = ["connection_moments", "emitter_tables", "own_probabilities"]
-
 
 def own_probabilities(scene: mi.Scene) -> np.ndarray:
     """Mitsuba's, in the order of the scene's emitters, (E,): by their sampling weights."""

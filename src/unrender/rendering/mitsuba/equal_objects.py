@@ -11,8 +11,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["equal_objects", "merge_notices"]
-
 _MERGED = ("BSDF", "Texture", "Volume", "Medium", "PhaseFunction")
 _NUMBERS = ("Float", "Integer", "Bool", "Vector", "Color")
 

@@ -15,21 +15,6 @@ import mitsuba as mi
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 
-__all__ = [
-    "CameraSamples",
-    "Films",
-    "RepeatingSampler",
-    "camera_samples",
-    "camera_samples_of_many",
-    "develop",
-    "film_adjoint",
-    "independent",
-    "open_at_different_times",
-    "per_sample",
-    "rays",
-    "sampler_at",
-]
-
 
 @dataclass
 class RepeatingSampler:

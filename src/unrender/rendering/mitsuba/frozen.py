@@ -13,8 +13,6 @@ import drjit as dr
 
 from unrender.core.errors import InputError
 
-__all__ = ["FrozenFunction", "naming"]
-
 _log = logging.getLogger("unrender")
 _ATTEMPTS = 3
 """Failures in a row after which a function is traced at every call."""

@@ -14,8 +14,6 @@ import mitsuba as mi
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, scene_files
 
-__all__ = ["DEFAULT_DEPTH", "LONGEST_DEPTH", "LightPaths"]
-
 DEFAULT_DEPTH = 6
 """Segments of the longest path where neither the user nor the scene gives a number."""
 LONGEST_DEPTH = 64

@@ -34,8 +34,6 @@ from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 from unrender.rendering.renderer import ReplacedMesh
 
-__all__ = ["LoadedScene", "detach_all", "loaded_scenes", "share_addresses"]
-
 
 class _Registry:
     """All loaded scenes of this process, held weakly, in the order of loading.

@@ -19,20 +19,6 @@ from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
-__all__ = [
-    "AdjointPairPass",
-    "AdjointPass",
-    "ConnectionsPass",
-    "ImagePairPass",
-    "ImagePass",
-    "LaunchSize",
-    "MovedPairPass",
-    "Pass",
-    "PosesPass",
-    "TangentPass",
-    "VerticesPass",
-]
-
 Rays = list[tuple[Any, Any]]
 """(`mi.Ray3f`, `mi.Spectrum`): camera rays and their weights, of each state that is traced."""
 

@@ -19,8 +19,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["FilterSlopes", "FilterStencil", "PixelFilters", "has_negative_lobes", "is_box"]
-
 _BINS = 4096
 """Of equal probability, for each distance from the borders of the crop window."""
 _CELLS = 1 << 14

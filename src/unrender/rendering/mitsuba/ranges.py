@@ -11,8 +11,6 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.scene_objects import Holders, children, class_name
 
-__all__ = ["CLASSES", "KINDS", "UNKNOWN", "Range", "SlotReaders", "entry"]
-
 
 @dataclass(frozen=True)
 class Range:

@@ -12,8 +12,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-__all__ = ["are_recordable"]
-
 _COMPLETE = frozenset({"PerspectiveCamera", "DistantSensor", "DistantSensorImpl", "RadianceMeter", "IrradianceMeter"})
 """Classes that name all members, in Mitsuba 3.9."""
 _LONGEST_GAP = 32

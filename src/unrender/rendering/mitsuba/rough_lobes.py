@@ -15,8 +15,6 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.integrators.differential_bsdf import DISTRIBUTIONS, DifferentialBsdf
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
-__all__ = ["RoughLobes"]
-
 _ROLES = ("alpha", "alpha_u", "alpha_v", "roughness")
 
 

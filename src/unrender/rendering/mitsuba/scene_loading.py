@@ -24,20 +24,6 @@ from unrender.rendering.mitsuba.description import parse
 from unrender.rendering.mitsuba.equal_objects import equal_objects
 from unrender.rendering.mitsuba.scene_graph import all_shapes
 
-__all__ = [
-    "MediumKey",
-    "SceneDescription",
-    "attached_media",
-    "conversion",
-    "extinction_transforms",
-    "is_loaded",
-    "load",
-    "load_resolved",
-    "media",
-    "read_vertices",
-]
-
-
 SceneDescription = str | Path | dict | Callable[[], Any] | Any
 """An XML file, a Mitsuba dictionary, or a function that returns one (called twice, so that ready-made objects such as
 meshes are made twice); or a loaded `mi.Scene`, of which there is one state only."""

@@ -12,9 +12,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import ReplacedMesh
 
-__all__ = ["Holders", "children", "class_name", "refusal", "replace_meshes"]
-
-
 Holders = Mapping[Any, list[tuple[Any, str]]]
 """{object: (object that holds it, name of the slot)}, a pair for every way to it."""
 

@@ -10,8 +10,6 @@ import numpy as np
 
 from unrender.core import arrays
 
-__all__ = ["from_tensor", "is_broadcast", "native_shape", "tensor", "to_tensor"]
-
 
 def tensor(values: np.ndarray) -> mi.TensorXf:
     """A tensor with these values, in memory of its own."""

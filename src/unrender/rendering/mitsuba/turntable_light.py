@@ -19,8 +19,6 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
-__all__ = ["PLUGIN", "is_turntable", "register", "text", "turns"]
-
 PLUGIN = "turntable"
 _MAP, _TURNS = "map", "turns"
 _MOST = 1 << 16

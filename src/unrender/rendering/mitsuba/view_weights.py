@@ -12,8 +12,6 @@ import numpy as np
 
 from unrender.rendering.renderer import SampleRequest
 
-__all__ = ["ViewWeights", "views_of"]
-
 
 @dataclass(frozen=True)
 class ViewWeights:

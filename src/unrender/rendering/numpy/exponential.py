@@ -16,8 +16,6 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
 
-__all__ = ["RATE", "ExponentialPaths", "ExponentialRenderer"]
-
 RATE = "rate"
 """The key of its one parameter, λ."""
 
@@ -41,15 +39,12 @@ class ExponentialRenderer:
         self.rate, self.lowest = rate, lowest
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`."""
         return {RATE: ParameterInfo((), lowest=self.lowest)}
 
     def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`."""
         return {key: np.array(self.rate) for key in keys}
 
     def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
         return [(1, 1)]
 
     def array(self, values: np.ndarray) -> np.ndarray:
@@ -67,14 +62,12 @@ class ExponentialRenderer:
         return self
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
         shape = (1, 1) if request.pixels is None else (len(request.pixels),)
         numbers = np.random.default_rng(request.seed).random((request.groups, *shape, request.spp // request.groups))
         paths = ExponentialPaths(-np.log1p(-numbers))
         return Rendering(self._images(parameters, paths), None, paths)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
-        """See `RenderSession.image_batch`."""
         rendering = self.image(parameters={RATE: 1.0}, request=replace(request, groups=1))
         means = rendering.images[0, 0, 0] / np.reshape(parameters[RATE], (-1, 1))
         return means[:, None, None, :]
@@ -86,18 +79,15 @@ class ExponentialRenderer:
         return Rendering(rendering.images, self._images(previous, rendering.paths), rendering.paths)
 
     def adjoint(self, parameters: Tree, paths: ExponentialPaths, weights: np.ndarray) -> Tree:
-        """See `RenderSession.adjoint`."""
         slopes = -self._images(parameters, paths) / float(parameters[RATE])
         return {RATE: np.array((weights * slopes).sum() / len(slopes))}
 
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: ExponentialPaths, weights: np.ndarray, weights_previous: np.ndarray
     ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
         return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
 
     def tangent_moment(self, parameters: Tree, paths: ExponentialPaths, tangents: Tree) -> np.ndarray:
-        """See `RenderSession.tangent_moment`."""
         slopes = paths.unit * float(tangents[RATE]) / float(parameters[RATE]) ** 2
         found = np.repeat(np.mean(slopes**2, axis=-1)[..., None], 3, axis=-1)
         return found if len(found) > 1 else found[0]

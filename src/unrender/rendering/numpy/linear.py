@@ -22,8 +22,6 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
 
-__all__ = ["AnalyticPaths", "AnalyticRenderer"]
-
 
 @dataclass(frozen=True)
 class AnalyticPaths:
@@ -76,15 +74,12 @@ class AnalyticRenderer:
             raise InputError(f"matrix: expected shape {(shape[0] * shape[1] * 3, size)}, got {self.matrix.shape}")
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`."""
         return {key: ParameterInfo(value.shape, shares_paths=self.shares_paths) for key, value in self._values.items()}
 
     def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`."""
         return {key: self._values[key].copy() for key in keys}
 
     def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
         return [self.shape] * self.sensors
 
     def array(self, values: np.ndarray) -> np.ndarray:
@@ -108,12 +103,10 @@ class AnalyticRenderer:
         return (self.offset + self.matrix @ self._flat(parameters)).reshape(*self.shape, 3)
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
         paths = self._paths(request)
         return Rendering(self._images(parameters, paths), None, paths)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
-        """See `RenderSession.image_batch`."""
         paths = replace(self._paths(request), groups=1)
         count = len(next(iter(parameters.values())))
         states = [{key: value[index] for key, value in parameters.items()} for index in range(count)]
@@ -126,7 +119,6 @@ class AnalyticRenderer:
         return Rendering(self._images(current, paths), self._images(previous, paths), paths)
 
     def adjoint(self, parameters: Tree, paths: AnalyticPaths, weights: np.ndarray) -> Tree:
-        """See `RenderSession.adjoint`."""
         rows = self._rows(paths.pixels)
         factors = 1 + self.noise * paths.centred[0]
         flat = (np.asarray(weights).reshape(paths.groups, -1) * factors).mean(axis=0) @ self.matrix[rows]
@@ -141,11 +133,9 @@ class AnalyticRenderer:
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: AnalyticPaths, weights: np.ndarray, weights_previous: np.ndarray
     ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
         return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
 
     def tangent_moment(self, parameters: Tree, paths: AnalyticPaths, tangents: Tree) -> np.ndarray:
-        """See `RenderSession.tangent_moment`."""
         del parameters
         along = {key: tangents.get(key, np.zeros_like(value)) for key, value in self._values.items()}
         slopes = (self.matrix @ self._flat(along))[self._rows(paths.pixels)].reshape(-1, 3, 1)

@@ -16,8 +16,6 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
 
-__all__ = ["POINT", "QuadraticRenderer"]
-
 POINT = "x"
 """The key of its one parameter."""
 
@@ -47,15 +45,12 @@ class QuadraticRenderer:
         self._jacobian = np.concatenate([root, np.zeros((3 - n, n))])
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`."""
         return {POINT: ParameterInfo(self._point.shape)}
 
     def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`."""
         return {key: self._point.copy() for key in keys}
 
     def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
         return [(1, 1)]
 
     def array(self, values: np.ndarray) -> np.ndarray:

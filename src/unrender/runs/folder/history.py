@@ -21,20 +21,6 @@ from unrender.core.text import printable
 from unrender.io import bounded_files, files
 from unrender.runs.folder.schema import HISTORY_AXES, HISTORY_COLUMNS
 
-__all__ = [
-    "LARGEST",
-    "LARGEST_LINE",
-    "MOST_KEPT",
-    "ErrorHistory",
-    "History",
-    "HistoryFile",
-    "HistoryReader",
-    "lines",
-    "read_records",
-    "steps_in",
-    "thinned",
-]
-
 LARGEST_LINE = 1 << 20
 """In bytes."""
 LARGEST = 1 << 30

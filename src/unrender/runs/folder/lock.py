@@ -22,7 +22,6 @@ from unrender.core.errors import InputError
 from unrender.io import bounded_files
 from unrender.runs.folder.schema import LOCK
 
-__all__ = ["Holder", "Lock", "holder"]
 _LARGEST = 1 << 12
 _MOUNTS = Path("/proc/self/mountinfo")
 _SERVER = re.compile(r"nfs4?$|cifs$|smb3$")

@@ -15,8 +15,6 @@ from unrender.core.errors import InputError
 from unrender.io import bounded_files, toml_lines
 from unrender.runs.run import Run
 
-__all__ = ["Method", "encode", "read", "serialize"]
-
 _LONGEST = 1 << 20
 _Positive = Annotated[StrictInt, Field(ge=1)]
 _Seconds = Annotated[StrictFloat | StrictInt, Field(gt=0, allow_inf_nan=False)]

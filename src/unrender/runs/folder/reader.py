@@ -22,16 +22,6 @@ from unrender.runs.folder.meshes import RunMesh, meshes_in
 from unrender.runs.folder.schema import RunRecord
 from unrender.scene.surfaces import Surface, surface_error
 
-__all__ = [
-    "RunFolder",
-    "ViewPictures",
-    "pictures_by_view",
-    "read",
-    "read_record",
-    "read_run_record",
-    "root_mean_square",
-]
-
 _MOST_LISTED = 1000
 """Of the files in a folder that is no run folder, looked through for a hint."""
 

@@ -35,27 +35,6 @@ from unrender.io import bounded_files
 from unrender.rendering import parameter_errors
 from unrender.rendering.parameter_errors import ErrorMeasure
 
-__all__ = [
-    "COMMANDS",
-    "DOUBTFUL",
-    "ENDED",
-    "HISTORY_AXES",
-    "HISTORY_COLUMNS",
-    "MEMORY_DISAGREES",
-    "NOT_VERIFIED",
-    "PICTURE_NAME",
-    "REPORT",
-    "WORSE",
-    "LiveStatus",
-    "Manifest",
-    "Model",
-    "ProblemRecord",
-    "RunRecord",
-    "encode",
-    "serialize",
-    "validate",
-]
-
 # ---------------------------------------------------------------------- names of files
 
 RECORD, METHOD, HISTORY, LOCK, CONTROL = "run.json", "method.toml", "history.jsonl", "lock", "control.json"

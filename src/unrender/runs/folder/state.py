@@ -20,8 +20,6 @@ import numpy as np
 from unrender.core import arrays, registry
 from unrender.core.errors import InputError
 
-__all__ = ["Packed", "check_alike", "not_finite", "pack", "unpack"]
-
 _PACKAGE = __name__.partition(".")[0]
 _DEEPEST = 64
 _HOST, _SCALAR = "numpy", "scalar"

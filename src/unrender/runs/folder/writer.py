@@ -51,8 +51,6 @@ from unrender.scene.problem import Problem
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent
 
-__all__ = ["RunWriter"]
-
 _FILES = (
     *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES, SENSITIVITY, MESHES, LAST),
     *(REPORT, CONTROL),

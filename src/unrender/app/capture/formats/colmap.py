@@ -22,8 +22,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.io import bounded_files
 
-__all__ = ["MODELS", "read", "recognise"]
-
 AXES = "opencv"
 _PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0", "colmap")
 _LARGEST = 1 << 31

@@ -8,18 +8,6 @@ from pathlib import Path
 from unrender.core.errors import InputError
 from unrender.core.text import printable, shorten
 
-__all__ = [
-    "MOST",
-    "PICTURES",
-    "check_count",
-    "find_mask",
-    "find_picture",
-    "is_file",
-    "left_out",
-    "pictures",
-    "without_pose",
-]
-
 PICTURES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".tga", ".bmp", ".hdr", ".ppm", ".pfm")
 """Endings of photographs."""
 MOST = 10_000

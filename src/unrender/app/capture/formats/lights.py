@@ -18,8 +18,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.io import bounded_files, confinement
 
-__all__ = ["FILE", "LitCapture", "read", "recognise"]
-
 FILE = "lights.txt"
 _LARGEST = 1 << 20
 _FEWEST = 4

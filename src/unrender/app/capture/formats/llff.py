@@ -18,8 +18,6 @@ from unrender.app.capture.formats import files
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
 
-__all__ = ["read", "recognise"]
-
 FILE = "poses_bounds.npy"
 AXES = "llff"
 _LARGEST = 64 << 20

@@ -22,8 +22,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.io import bounded_files
 
-__all__ = ["read", "recognise"]
-
 ONE, TRAINING, TEST = "transforms.json", "transforms_train.json", "transforms_test.json"
 AXES = "opengl"
 _LARGEST = 64 << 20

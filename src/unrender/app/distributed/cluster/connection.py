@@ -22,9 +22,6 @@ from unrender.backend import limits, variant
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line, reason_of
 
-__all__ = ["Cluster", "HeadNode", "connect", "load_ray", "reach"]
-
-
 _LOOK, _ANSWER, _PATIENCE = 3.0, 2.0, 15.0
 """Seconds between looks, that an answer may take, and without one until the head counts as lost. Ray itself would end the process, without
 a word to its program, after 60."""

@@ -18,8 +18,6 @@ from typing import Any
 from unrender.backend.access import can_change
 from unrender.core.errors import InputError
 
-__all__ = ["check_private", "private_cluster", "private_folder"]
-
 _PREFIX, _LOCK = "unrender-ray-", "lock"
 _LONGEST = 107 - len("/unrender-ray-12345678/r/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store")
 """Characters of the folder that holds the cluster's, at most: a socket's path has 107 bytes."""

@@ -12,8 +12,6 @@ from unrender.app.distributed.cluster.connection import Cluster
 from unrender.core.errors import UnrenderError
 from unrender.core.text import one_line
 
-__all__ = ["Ended", "Executor", "InProcess", "OnWorkers"]
-
 _ATTEMPTS = 3
 _GRACE_SECONDS = 4.0
 """After an interrupt, for tasks to save what they have reached."""
@@ -75,11 +73,9 @@ class InProcess:
 
     @property
     def pending(self) -> int:
-        """See `Executor.pending`."""
         return len(self._next)
 
     def start(self, key: Any, *arguments: Any) -> None:
-        """See `Executor.start`."""
         self._next.append((key, arguments))
 
     def wait(self, seconds: float) -> list[Ended]:
@@ -122,11 +118,9 @@ class OnWorkers:
 
     @property
     def pending(self) -> int:
-        """See `Executor.pending`."""
         return len(self._begun)
 
     def start(self, key: Any, *arguments: Any) -> None:
-        """See `Executor.start`."""
         self._start(_Begun(key, arguments, 1))
 
     def wait(self, seconds: float) -> list[Ended]:

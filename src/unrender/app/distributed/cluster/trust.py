@@ -11,8 +11,6 @@ from unrender.backend.access import can_change, can_read
 from unrender.core.errors import InputError
 from unrender.core.text import one_line, reason_of
 
-__all__ = ["check_cluster", "check_token", "has_token"]
-
 _HOW = "; or give --insecure where no other user can reach this machine"
 _SECONDS = 10.0
 

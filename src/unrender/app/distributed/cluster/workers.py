@@ -9,9 +9,6 @@ from dataclasses import dataclass
 from unrender.backend import variant
 from unrender.core.errors import InputError
 
-__all__ = ["Share", "Workers", "prepare_worker", "share"]
-
-
 _prepared: list[tuple[str, int]] = []
 
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
-__all__ = ["Bool", "Float", "Spectrum", "UInt32"]
-
 Float: TypeAlias = Any
 Bool: TypeAlias = Any
 UInt32: TypeAlias = Any

@@ -18,20 +18,6 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.pointer_tables import StatePointers
 
-__all__ = [
-    "KEEP",
-    "ConnectionRecord",
-    "PathContext",
-    "PathKernel",
-    "ReplayState",
-    "ScatteringVertex",
-    "carries_light",
-    "largest",
-    "relative",
-    "total",
-]
-
-
 KEEP = dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior
 """Two passes go the way from what the scene makes of its parameters (such as padded texels) back to them: the first must not use it up."""
 

@@ -42,8 +42,6 @@ from unrender.rendering.mitsuba.integrators.boundary_sampling import (
     lane_sampler,
 )
 
-__all__ = ["BoundaryIntegrator"]
-
 _NEAR = 1e-3
 """Share of a distance within which nothing occludes."""
 _EMITTER_POINTS, _PAIRS = 256, 1 << 20

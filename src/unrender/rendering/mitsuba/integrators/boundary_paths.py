@@ -11,8 +11,6 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.edges import EdgePoints
 from unrender.rendering.mitsuba.pixel_filter import FilterStencil
 
-__all__ = ["OFFSET", "BoundarySegment", "EyePath", "Picture", "TangentPicture", "WeightedPicture"]
-
 OFFSET = 1e-4
 """To the two sides of an edge: of the picture's side or, in space, of 1 + the largest coordinate."""
 

@@ -11,8 +11,6 @@ import mitsuba as mi
 from unrender.rendering.mitsuba.edges import EdgePoints
 from unrender.rendering.mitsuba.film import RepeatingSampler
 
-__all__ = ["EmitterPoints", "SilhouetteWedge", "WeightedChoice", "coplanar", "lane_sampler"]
-
 _AREA, _POINT, _DISTANT = 0, 1, 2
 """Kinds of emitters: with a surface, at a point, and those that only have a direction."""
 

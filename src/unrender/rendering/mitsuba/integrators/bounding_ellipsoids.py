@@ -10,8 +10,6 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float
 
-__all__ = ["BoundingEllipsoids", "bounding_ellipsoids"]
-
 _NUMBERS = 6
 """Of each ellipsoid."""
 

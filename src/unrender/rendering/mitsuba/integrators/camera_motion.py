@@ -29,9 +29,6 @@ from unrender.rendering.mitsuba.integrators.flat_mirrors import FlatMirrors, Mir
 from unrender.rendering.mitsuba.pixel_filter import FilterSlopes, PixelFilters, is_box
 from unrender.rendering.mitsuba.view_weights import ViewWeights
 
-__all__ = ["CameraMotion", "SilhouetteCurves"]
-
-
 _ARCS = 16
 """That a curve is cut into, to be chosen by their lengths on the picture."""
 _SPHERE, _CIRCLE, _TOP, _LEFT, _RIGHT = range(5)

@@ -24,8 +24,6 @@ from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringV
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 from unrender.statistics.roughness import GGX, Beckmann, NormalDistribution
 
-__all__ = ["DISTRIBUTIONS", "BranchVertex", "DifferentialBsdf", "RoughLobe"]
-
 DISTRIBUTIONS: dict[str, tuple[int, NormalDistribution]] = {"ggx": (1, GGX()), "beckmann": (2, Beckmann())}
 """By Mitsuba's names: the entry of `tables["rough"]`, by registry ids of BSDFs, and the distribution. 0 stands for BSDFs that are not
 sampled so."""

@@ -21,16 +21,6 @@ import numpy as np
 
 from unrender.rendering.mitsuba import emissive
 
-__all__ = [
-    "DdaState",
-    "HomogeneousMajorant",
-    "MajorantSupergrid",
-    "MajorantSupergrids",
-    "SupergridTraversal",
-    "cell_size",
-    "to_local",
-]
-
 _CELLS = 16
 """SupergridTraversal along an axis, at most."""
 

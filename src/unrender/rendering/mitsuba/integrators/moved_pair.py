@@ -38,8 +38,6 @@ from unrender.rendering.mitsuba.integrators.moved_vertices import (
 )
 from unrender.rendering.mitsuba.integrators.pointer_tables import remap
 
-__all__ = ["CARRIED_SHARE", "MovedPair"]
-
 CARRIED_SHARE = 0.75
 """Of the connections that may be carried along, the share that is: 1 would leave out what the current state's path cannot see."""
 

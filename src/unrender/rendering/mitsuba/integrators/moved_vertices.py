@@ -18,11 +18,6 @@ from unrender.rendering.mitsuba.integrators.base import ScatteringVertex
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id, remap
 
-__all__ = [
-    "Continuation", "Direction", "Link", "PairState", "PathState", "Vertex", "emission", "follow", "goes_on", "is_clear", "is_diffuse",
-    "moves",
-]  # fmt: skip
-
 
 @dataclass
 class PathState:

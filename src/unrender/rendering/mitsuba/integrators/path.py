@@ -28,8 +28,6 @@ from unrender.rendering.mitsuba.integrators.base import (
 )
 from unrender.rendering.mitsuba.integrators.differential_bsdf import BranchVertex, DifferentialBsdf, RoughLobe
 
-__all__ = ["ROULETTE_FLOOR", "BsdfDirection", "PathPair", "PathState"]
-
 ROULETTE_FLOOR = 0.25
 """Roulette looks at the current throughput alone, so that the adjoint can replay it without the previous state. This floor
 keeps paths alive that only the previous state still uses: both images stay unbiased whatever the ratio of throughputs."""
@@ -141,7 +139,6 @@ class PathPair:
         ray: mi.RayDifferential3f,
         geometry: Any = None,
     ) -> Float:
-        """See `PathKernel.vertices`."""
         context = PathContext(dr.ADMode.Primal, scene, tables, (), False, geometry)
         return mi.Float(self._trace(context, self._begin(context, ray), sampler).depth)
 

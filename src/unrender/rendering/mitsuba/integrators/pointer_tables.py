@@ -12,8 +12,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.integrators.array_types import UInt32
 
-__all__ = ["Pointer", "StatePointers", "pointer_table", "registry_id", "remap"]
-
 Pointer = TypeVar("Pointer", "mi.BSDFPtr", "mi.EmitterPtr", "mi.ShapePtr", "mi.MediumPtr")
 
 

@@ -12,8 +12,6 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import ReplayState
 from unrender.rendering.mitsuba.integrators.path import PathPair
 
-__all__ = ["PrbKernel"]
-
 
 class PrbKernel:
     """Mitsuba's `prb` as a `PathKernel`, for parameters that move geometry: its adjoint carries the continuous part of their derivative.

@@ -12,8 +12,6 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import PathContext
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
-__all__ = ["DeltaLobes", "sampling_weights"]
-
 DELTA_EQUAL, DELTA_SIMPLE, DELTA_MASK = 0, 1, 2
 """Entries of `tables["delta"]`, by registry id of BSDFs: how perfectly specular lobes follow a change of the BSDF's parameters. Not at
 all; by their value alone (conductor, dielectric, plastic); by the opacity of a mask."""

@@ -21,23 +21,6 @@ from unrender.rendering.mitsuba.integrators.majorant_supergrid import (
     SupergridTraversal,
 )
 
-__all__ = [
-    "DifferentialRatioTracking",
-    "FreeFlight",
-    "MediumSegment",
-    "RatioTracking",
-    "Reservoir",
-    "clip_segment",
-    "estimate_transmittance",
-    "medium_interaction",
-    "mis_complement",
-    "mis_constant",
-    "relative_derivatives",
-    "sample_free_flight",
-    "sample_optical_depth",
-    "update_reservoir",
-]
-
 _FAINT = 0.1
 """Below this transmittance, roulette decides whether a walk through a medium goes on."""
 

@@ -36,8 +36,6 @@ from unrender.rendering.mitsuba.integrators.volume_path import (
     connect,
 )
 
-__all__ = ["VolumePair"]
-
 
 class VolumePair:
     """Settings of the volumetric path tracer.

@@ -14,18 +14,6 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex, carries_light
 from unrender.rendering.mitsuba.integrators.tracking import MediumSegment, Reservoir
 
-__all__ = [
-    "Connection",
-    "ConnectionSample",
-    "Flight",
-    "PathStart",
-    "SampledDirection",
-    "Vertex",
-    "VolumeContext",
-    "VolumePathState",
-    "connect",
-]
-
 
 class PathStart:
     """Where paths begin: on rays, or in a medium at distance `t` along rays, where they scatter first.
