@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 from unrender.core.errors import InputError
@@ -11,10 +12,17 @@ from unrender.runs.result import NON_FINITE
 
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent
+    from unrender.runs.run import Run
 
-__all__ = ["Budget", "check_budget"]
+__all__ = ["Budget", "check_budget", "last_step"]
 
 _MOST_SKIPPED = 20
+_FEW_STEPS, _MEASURED = 20, 3
+"""Number of steps below which a warning says so, and the steps whose time tells it."""
+_END_SHARE, _END_SECONDS = 0.1, 1.0
+"""Time of verification and final pictures: a share of the budget, and seconds besides."""
+_LEAST_SHARE = 0.5
+"""Share of the budget that steps have, however long kernels take to compile."""
 _MOST_STEPS = 1 << 63
 """Exclusive: what the files of a run folder hold."""
 
@@ -24,6 +32,9 @@ class Budget(Hook):
 
     def on_start(self, descent: Descent) -> None:
         """See `Hook.on_start`."""
+        run = descent.run
+        if run.last_step is not None and run.seconds is not None:
+            run.last_step = max(run.last_step, time.perf_counter() + _LEAST_SHARE * run.seconds)
         self._check(descent)
 
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
@@ -37,11 +48,32 @@ class Budget(Hook):
             run.stop("steps")
         if run.seconds is not None and run.clock >= run.seconds:
             run.stop("seconds")
+        if run.last_step is not None and run.step and time.perf_counter() + 0.5 * run.clock / run.step >= run.last_step:
+            run.stop("seconds")
+        if run.step == _MEASURED and not run.stopped:
+            _warn_of_few_steps(run)
         if descent.state.skipped_in_a_row >= _MOST_SKIPPED:
             run.stop(NON_FINITE)
             line = f"{_MOST_SKIPPED} steps in a row were not finite: the run was given up; kept are the last values that were finite"
             if line not in run.warnings:
                 run.warnings.append(line)
+
+
+def last_step(seconds: float) -> float:
+    """Return when the steps of a run that begins now should end, so that its final pictures are done within these seconds."""
+    return time.perf_counter() + seconds - min(_END_SHARE * seconds + _END_SECONDS, 0.5 * seconds)
+
+
+def _warn_of_few_steps(run: Run) -> None:
+    """Warn where the time of the first steps tells that the budget allows few."""
+    if run.seconds is None or run.clock <= 0.0:
+        return
+    steps = int(run.allowed_seconds() * run.step / run.clock)
+    if steps < min(_FEW_STEPS, run.steps or _FEW_STEPS):
+        run.warnings.append(
+            f"the budget of {run.seconds:g} s allows about {steps} steps; fewer pixels a step (--set pixels=4096), fewer samples "
+            "(--set spp=1), a smaller picture (resolution), or more seconds make them enough"
+        )
 
 
 def check_budget(steps: int | None, seconds: float | None) -> None:

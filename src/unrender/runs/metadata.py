@@ -43,6 +43,7 @@ class RunAnnotations:
         command: what was typed.
         final_spp: samples per pixel of the final pictures; None chooses.
         phases: {phase: seconds} of what came before, such as loading.
+        within_seconds: Whether the budget in seconds covers compilation and final pictures too, not the steps alone.
     """
 
     method: str = ""
@@ -51,6 +52,7 @@ class RunAnnotations:
     command: str = ""
     final_spp: int | None = None
     phases: Mapping[str, float] = field(default_factory=dict)
+    within_seconds: bool = False
 
 
 def first_values(run: Run) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.runs import advice, components
-from unrender.runs.budget import Budget, check_budget
+from unrender.runs.budget import Budget, check_budget, last_step
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import method_file
 from unrender.runs.folder.writer import RunWriter
@@ -104,6 +104,8 @@ def optimize(
     if isinstance(named, str) and not annotations.method:
         annotations = replace(annotations, method=named, choices=plan.reasons)
     run, state = prepare(plan, steps, seconds, seed)
+    if annotations.within_seconds and seconds is not None:
+        run.last_step = last_step(seconds)
     run.warnings += advice.remarks(problem, plan.optimizer)
     log = RunMetadata(describe_run(run, annotations), first_values(run))
     with _progress(progress) as shown:

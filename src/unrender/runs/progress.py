@@ -46,6 +46,7 @@ class Progress(Callback):
         self._started = self._shown = self._before = 0.0
         self._loss: float | None = None
         self._error: dict[str, float] = {}
+        self._told = 0
 
     def __enter__(self) -> Progress:
         self._listening = phases.listening(self)
@@ -101,7 +102,7 @@ class Progress(Callback):
     def on_start(self, run: Run) -> None:
         """See `Callback.on_start`."""
         self._started, self._before, self._shown = time.perf_counter(), run.progress(), 0.0
-        self._loss, self._error = None, {}
+        self._loss, self._error, self._told = None, {}, len(run.warnings)
         if self._console.is_terminal:
             self._open("", 1.0)
 
@@ -111,6 +112,9 @@ class Progress(Callback):
         if math.isfinite(loss):
             self._loss = loss if self._loss is None else self._loss + _SMOOTHING * (loss - self._loss)
         self._error = record.get("parameter_error") or self._error
+        for line in run.warnings[self._told :]:
+            self._console.print(f"note: {line}", markup=False, highlight=False, soft_wrap=True)
+        self._told = len(run.warnings)
         now = time.perf_counter()
         last = bool(run.stopped)
         if self._bar is not None:

@@ -32,7 +32,7 @@ def hurry(run: Run) -> None:
     ways = run.problem.coarse_to_fine
     if run.step != _MEASURED or not run.seconds or not ways or run.plan.problem.coarse_to_fine:
         return
-    allowed = _COARSE_SHARE * run.seconds * run.step / max(run.clock, 1e-9)
+    allowed = _COARSE_SHARE * run.allowed_seconds() * run.step / max(run.clock, 1e-9)
     last = max(way.steps[-1] for way in ways.values())
     run.ahead = max(0, last - max(int(allowed), run.step)) if last < NEVER else 0
 

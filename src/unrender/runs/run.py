@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -52,6 +54,8 @@ class Run:
         ahead: steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `multiresolution.hurry`.
         warnings: one line each.
         stopped: why it ends after the present step; "" while it goes on.
+        last_step: when the steps should end, on the clock of `time.perf_counter`, so that all is done within the budget; None where the
+            budget is of the steps alone.
     """
 
     plan: Plan
@@ -70,6 +74,7 @@ class Run:
     ahead: int = 0
     warnings: list[str] = field(default_factory=list)
     stopped: str = ""
+    last_step: float | None = None
 
     def stop(self, reason: str = "callback") -> None:
         """End the run after the present step."""
@@ -96,9 +101,18 @@ class Run:
             if self.parameters is seen:
                 self.parameters = present
 
+    def allowed_seconds(self) -> float:
+        """The seconds of steps that the budget allows in all, on the run's clock; infinity without one."""
+        if self.seconds is None:
+            return math.inf
+        left = math.inf if self.last_step is None else self.last_step - time.perf_counter()
+        return min(self.seconds, self.clock + left)
+
     def progress(self) -> float:
         """The share of the budget used, in [0, 1]."""
         shares = [self.step / self.steps if self.steps else 0.0, self.clock / self.seconds if self.seconds else 0.0]
+        if self.seconds and self.last_step is not None:
+            shares.append(1.0 - (self.last_step - time.perf_counter()) / self.seconds)
         return min(max(shares), 1.0)
 
 

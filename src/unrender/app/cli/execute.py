@@ -44,6 +44,7 @@ class RunOrder:
         command: what was typed, to be saved with the results.
         problem_settings: of a gallery problem, to be saved with the results.
         checkpoint_every: see `optimize`.
+        within_seconds: whether `seconds` covers compilation and final pictures too; where methods are compared it is for steps alone.
     """
 
     problem: Problem
@@ -56,6 +57,7 @@ class RunOrder:
     command: str
     problem_settings: Mapping[str, Any]
     checkpoint_every: int | None = None
+    within_seconds: bool = False
 
 
 def execute(
@@ -71,7 +73,9 @@ def execute(
     for line in advice.remarks(order.problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
-    annotations = RunAnnotations(order.method.name, settings, plan.reasons, order.command, order.final_spp, earlier)
+    annotations = RunAnnotations(
+        order.method.name, settings, plan.reasons, order.command, order.final_spp, earlier, order.within_seconds
+    )
     live = Live(directory, order.problem.name, order.method.name, order.command)
     result = optimize(
         order.problem,

@@ -47,7 +47,9 @@ _Settings = Annotated[
     typer.Option("--set", "-s", metavar="NAME=VALUE", help="An option of the method, such as spp=4. Repeatable."),
 ]
 _Steps = Annotated[int | None, typer.Option(help="Stop after that many steps. [default: 300, or --seconds]")]
-_Seconds = Annotated[float | None, typer.Option(help="Stop after that much time, without compilation.")]
+_Seconds = Annotated[
+    float | None, typer.Option(help="Time for compilation, steps and final pictures; steps have half of it at least.")
+]
 _Out = Annotated[Path | None, typer.Option(help="The run folder. Default: a new one in out/.")]
 
 
@@ -102,7 +104,7 @@ def run(
             introduce(console, opened, running)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
                 task = RunOrder(
-                    dealt, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every
+                    dealt, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every, True
                 )
                 result = execute(task, folder, console, progress)
         finally:

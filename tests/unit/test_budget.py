@@ -1,0 +1,76 @@
+"""How long a run may go on."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.protocols import Callback
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs import budget, loop
+from unrender.runs.metadata import RunAnnotations
+
+TRUTH = {"gain": np.full(2, 0.5)}
+
+
+def problem() -> ur.Problem:
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (48, 2))
+    renderer = AnalyticRenderer(TRUTH, matrix, 0.1, 0.3)
+    return ur.Problem(renderer, [ur.Parameter("gain", initial=0.2)], [ur.View(renderer.exact(TRUTH))], truth=TRUTH)
+
+
+class SlowGradient(ur.PathGradient):
+    """Path gradients that take a while."""
+
+    pause = 0.0
+
+    def estimate(self, *arguments: Any) -> Any:
+        time.sleep(self.pause)
+        return super().estimate(*arguments)
+
+
+def slow(pause: float) -> ur.PathGradient:
+    estimator = SlowGradient()
+    object.__setattr__(estimator, "pause", pause)
+    return estimator
+
+
+@pytest.mark.parametrize(("within", "compiling", "steps"), [(False, 12.0, 21), (True, 0.0, 18), (True, 12.0, 11)])
+def test_a_budget_may_cover_more_than_the_steps(
+    within: bool, compiling: float, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps alone have all 20 seconds. Otherwise 3 are for the final pictures, and a warm-up of 12 leaves half of them. Each step takes a
+    second, which the next one sees."""
+    now, warm_up = [100.0], loop.Descent.warm_up
+
+    def compiled(descent: loop.Descent) -> Any:
+        now[0] += compiling
+        return warm_up(descent)
+
+    monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
+
+    class Seconds(Callback):
+        def on_step(self, run: Any, record: Any) -> None:
+            now[0] += 1.0
+            run.clock = float(run.step)
+
+    monkeypatch.setattr(loop.Descent, "warm_up", compiled)
+    annotations = RunAnnotations(within_seconds=within)
+    result = ur.optimize(problem(), "plain", seconds=20, callbacks=[Seconds()], annotations=annotations)
+    assert result.stopped == "seconds"
+    assert result.steps == steps
+
+
+def test_a_budget_of_few_steps_is_told_after_the_first() -> None:
+    found = ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), seconds=0.4)
+    assert any("allows about" in line and "--set spp=1" in line for line in found.warnings)
+    assert not ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), steps=5).warnings
+
+
+def test_steps_have_half_of_the_budget_however_long_kernels_take() -> None:
+    assert budget.last_step(10.0) - time.perf_counter() == pytest.approx(8.0, abs=0.1)
+    assert budget.last_step(1.0) - time.perf_counter() == pytest.approx(0.5, abs=0.1)
