@@ -59,8 +59,11 @@ class Budget(Hook):
                 run.warnings.append(line)
 
 
-def last_step(seconds: float) -> float:
-    """Return when the steps of a run that begins now should end, so that its final pictures are done within these seconds."""
+def last_step(seconds: float | None) -> float | None:
+    """Return when the steps of a run that begins now should end, so that its final pictures are done within these seconds; None for no
+    limit."""
+    if seconds is None:
+        return None
     return time.perf_counter() + seconds - min(_END_SHARE * seconds + _END_SECONDS, 0.5 * seconds)
 
 

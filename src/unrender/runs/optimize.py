@@ -104,8 +104,7 @@ def optimize(
     if isinstance(named, str) and not annotations.method:
         annotations = replace(annotations, method=named, choices=plan.reasons)
     run, state = prepare(plan, steps, seconds, seed)
-    if annotations.within_seconds and seconds is not None:
-        run.last_step = last_step(seconds)
+    run.last_step = last_step(seconds) if annotations.within_seconds else None
     run.warnings += advice.remarks(problem, plan.optimizer)
     log = RunMetadata(describe_run(run, annotations), first_values(run))
     with _progress(progress) as shown:
