@@ -37,7 +37,7 @@ class Log:
 
     For what is positive and known to its order of magnitude alone: the radiance of a lamp, the extinction of a medium. Steps are alike
     whatever the unit: with every value, and the rest of the problem, times c, the descent is that times c. Values near the bound move
-    slowly; at the bound itself, where φ' is 0, none is: the loop keeps a margin (`problem.bounds`). An upper bound is met by projection.
+    slowly; at the bound itself, where φ' is 0, none is: the loop keeps a margin (`scene.bounds`). An upper bound is met by projection.
     """
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform:

@@ -107,6 +107,6 @@ def _merged(traits: Traits, settings: list[Mapping[str, ParameterSettings]]) -> 
     merged: dict[str, ParameterSettings] = {}
     for key in traits.infos:
         chosen = [vars(part[key]) for part in settings if key in part and key not in traits.block]
-        if values := {name: value for own in chosen for name, value in own.items() if value is not None}:
-            merged[key] = ParameterSettings(**values)
+        values = {name: value for own in chosen for name, value in own.items() if value is not None}
+        merged[key] = ParameterSettings(**values)
     return merged
