@@ -23,10 +23,10 @@ _MOST_RUNS = 4 * RUNS
 """Runs of a comparison of gradients that is weak, or differs by `_DOUBTFUL` standard errors, after `RUNS`."""
 _DOUBTFUL = 2.5
 STEPS, DESCENT_SPP = 40, 16
-"""Steps of a descent, and samples per pixel of its pictures."""
-_SEEN, _LEAST = 10.0, 1e-10
+"""Steps of a descent, and samples per pixel of each."""
+_SEEN, _LEAST = 10.0, 1e-8
 """Standard errors, and square error of the picture, from which on a start is seen to differ from the truth."""
-_ONE_OF_MANY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "control_points")
+_ONE_OF_MANY = ("vertex_positions", "vertex_normals", "vertex_texcoords", "control_points", "phase_function.values")
 """Parameters of which many values give nearly the same picture: their descents are judged by the picture alone."""
 _INSTANCED = 1
 """Parameters of a plugin in instances that are measured."""
@@ -63,8 +63,12 @@ def _measure(plugin: Plugin, folder: Path, known: dict[str, Any] | None) -> dict
         prefix = next((p for p in plugin.prefixes if key.startswith(f"{p}.")), None)
         if prefix is None or key.endswith(_AXES) or not (info.perturbable or info.differentiable):
             continue
-        if plugin.instanced and len(found["parameters"]) == _INSTANCED and known is None:
-            break
+        if (
+            plugin.instanced
+            and len(found["parameters"]) == _INSTANCED
+            and key.removeprefix(f"{prefix}.") not in found["parameters"]
+        ):
+            continue
         entry = found["parameters"].setdefault(key.removeprefix(f"{prefix}."), {})
         if known is None:
             try:
@@ -151,9 +155,9 @@ class Effort:
     """How much a descent may take.
 
     Attributes:
-        spp: samples per pixel of a step.
+        spp: samples per pixel of a step, and of a picture.
         rate: learning rate over the start's distance from the truth.
-        pictures: how many pictures of `DESCENT_SPP` make one half of the reference, and of a picture whose error counts.
+        pictures: how many pictures make one half of the reference, and of a picture whose error counts.
         widths: distances of the start, in `_scale`; the first one that the pictures show is taken.
     """
 
@@ -165,7 +169,7 @@ class Effort:
 
 _EFFORTS = (
     Effort(DESCENT_SPP, 0.15, 32, (2.0, 4.0, 8.0)),
-    Effort(8 * DESCENT_SPP, 0.08, 256, (8.0,)),
+    Effort(8 * DESCENT_SPP, 0.08, 32, (8.0,)),
 )
 """The second one where the first one does not suffice."""
 
@@ -192,7 +196,7 @@ def _descend(renderer: Any, key: str, info: Any, effort: Effort) -> dict[str, An
     def picture(value: Any, half: int) -> np.ndarray:
         tree = {key: renderer.array(np.asarray(value, np.float32))}
         seeds = range(5000 + 1000 * half, 5000 + 1000 * half + effort.pictures)
-        requests = [SampleRequest(0, DESCENT_SPP, seed, groups=groups) for seed in seeds]
+        requests = [SampleRequest(0, effort.spp, seed, groups=groups) for seed in seeds]
         return np.mean([np.array(session.image(tree, request).images).mean(0) for request in requests], axis=0)
 
     references = [picture(truth, half) for half in (0, 1)]
