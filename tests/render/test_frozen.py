@@ -179,6 +179,7 @@ def test_kernels_of_a_textured_area_light_are_recorded(warned: list[str]) -> Non
 
 def test_later_steps_replay_what_two_have_recorded() -> None:
     """Whatever the seed, and although two scenes share what their replays let them share."""
+    from unrender.rendering.mitsuba.path_cache.session import CachingSession
     from unrender.rendering.mitsuba.renderer import MitsubaRenderer
     from unrender.rendering.renderer import SampleRequest
 
@@ -186,6 +187,7 @@ def test_later_steps_replay_what_two_have_recorded() -> None:
     scene = above({"bsdf": grey}) | {"lamp": {"type": "constant"}}
     key = "floor.bsdf.reflectance.value"
     session = MitsubaRenderer(scene).prepare([key], "path")
+    assert isinstance(session, CachingSession)
 
     def value(x: float) -> dict[str, Any]:
         return {key: mi.TensorXf(np.full(3, x, np.float32))}
@@ -195,5 +197,6 @@ def test_later_steps_replay_what_two_have_recorded() -> None:
     # Two steps as a run's warm-up takes them, and then others.
     for seed, now, before in [(7, 0, 0), (7, 1, 0), (1, 0, 0), (2, 1, 0), (3, 2, 1), (4, 3, 2)]:
         session.image_pair(states[now], states[before], SampleRequest(0, 4, seed, 1), "path")
-        recordings.append(sum(getattr(once._frozen, "n_recordings", 0) for once in session._functions.values()))
+        functions = [*session._functions.values(), *session._inner._functions.values()]
+        recordings.append(sum(getattr(once._frozen, "n_recordings", 0) for once in functions))
     assert recordings[1:] == recordings[1:2] * 5

@@ -79,7 +79,7 @@ def own_loop(described: dict[str, Any]) -> tuple[Any, ...]:
     parameters = mi.traverse(scene)
     optimizer = mi.ad.Adam(lr=0.02)
     for key in [key for key, _ in parameters if key.endswith(".data") and key != "sky.data"]:
-        optimizer[key] = parameters[key]
+        optimizer[key] = parameters[key]  # pyright: ignore[reportArgumentType]
     for seed in range(3):
         parameters.update(optimizer)
         image = mi.render(scene, parameters, spp=1, seed=seed)  # pyright: ignore[reportArgumentType]

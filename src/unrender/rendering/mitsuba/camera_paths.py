@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -82,6 +83,11 @@ class CameraPaths:
     def vertices(self) -> Any:
         """The number of vertices of each lane's path."""
         return self._kernel.vertices(self._scene, self._tables, self._sampler, self._ray, self._geometry)
+
+    def recorded(self, tracer: Callable[..., Any]) -> Any:
+        """What another tracer makes of the same rays: a function of scene, tables, sampler, rays and their weights."""
+        with dr.suspend_grad():
+            return tracer(self._scene, self._tables, self._sampler, self._ray, self._weight)
 
     def _replayed(self, radiance: Any) -> Any:
         """The radiance as the kernel returned it: what is still ahead at the first vertex of a replay. 0 for dropped samples."""

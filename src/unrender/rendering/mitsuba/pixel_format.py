@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_filter import has_negative_lobes
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.renderer import PictureFormat, Rendering, SampleRequest
@@ -43,7 +44,7 @@ class LuminanceSession(SessionWrapper):
         inner: renders RGB.
     """
 
-    _inner: MitsubaSession
+    _inner: MitsubaSession | CachingSession
 
     def _shown(self, found: Rendering, request: SampleRequest) -> Rendering:
         previous = None if found.previous is None else _luminance(found.previous)

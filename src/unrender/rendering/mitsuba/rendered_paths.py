@@ -27,6 +27,7 @@ class Paths:
         radiance_previous: likewise of the previous state; None unless a pair was rendered.
         space: where the pair shares its samples.
         previous: parameters of the previous state; None unless a pair was rendered.
+        vertices: what `TracePass` returned, where paths are kept; else None.
     """
 
     request: SampleRequest
@@ -34,6 +35,7 @@ class Paths:
     radiance_previous: mi.Spectrum | None = None
     space: Space = "path"
     previous: Tree | None = None
+    vertices: dict[str, Any] | None = None
 
 
 class DroppedSamples:

@@ -20,6 +20,7 @@ from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor
 from unrender.rendering.mitsuba.equal_objects import merge_notices
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
@@ -90,7 +91,9 @@ class MitsubaRenderer:
             for key, pose in self._poses.items()
         }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
-        self._sessions: dict[tuple[tuple[str, ...], frozenset[str]], MitsubaSession | LuminanceSession] = {}
+        self._sessions: dict[
+            tuple[tuple[str, ...], frozenset[str]], MitsubaSession | CachingSession | LuminanceSession
+        ] = {}
         self._stock: StockSession | None = None
         self._differential_bsdf, self._differential = False, None
         self._checked: set[tuple[tuple[str, ...], frozenset[str], Space | None]] = set()
@@ -130,7 +133,7 @@ class MitsubaRenderer:
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> MitsubaSession | LuminanceSession:
+    ) -> MitsubaSession | CachingSession | LuminanceSession:
         """The session for these parameters: see `Renderer.prepare`. Sessions are kept, so that asking again costs nothing.
 
         Poses and other parameters that move geometry cannot be prepared together: the scenes that posed shapes live in are not rebuilt.
@@ -149,9 +152,21 @@ class MitsubaRenderer:
             session = MitsubaSession(
                 self.pair, rest, chosen, wanted, self.light_paths, self._sampler, self._differential_bsdf
             )
+            session = self._caching(session, keys, wanted)
             grey = self._formats[0].colour == "luminance"
             self._sessions[names, wanted] = LuminanceSession(session) if grey else session
         return self._sessions[names, wanted]
+
+    def _caching(
+        self, session: MitsubaSession, keys: list[str], derivatives: AbstractSet[str]
+    ) -> MitsubaSession | CachingSession:
+        """The session that keeps its paths where it can."""
+        if self._differential_bsdf:
+            return session
+        try:
+            return CachingSession(self.pair, session, keys, sorted(derivatives), self.light_paths)
+        except InputError:
+            return session
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
         """See `Remeshable`."""

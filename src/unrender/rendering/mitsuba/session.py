@@ -173,10 +173,10 @@ class MitsubaSession:
         if self._posed is not None and not self._attached and request.groups == 1 and request.pixels is None:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
             return Rendering(self.image_batch(stacked, request), None, None)
-        self._set_parameters(parameters)
-        radiance = self._run(ImagePass(), request)
+        self.set_parameters(parameters)
+        radiance = self.run(ImagePass(), request)
         dr.eval(radiance)
-        return Rendering(self._develop(radiance, request), None, Paths(request, radiance))
+        return Rendering(self.develop(radiance, request), None, Paths(request, radiance))
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         """Render many states with the same random numbers. See `RenderSession.image_batch`.
@@ -187,7 +187,7 @@ class MitsubaSession:
         shape = (*self._pair.resolutions[request.sensor], 3)
         shared = all(is_broadcast(parameters[key]) for key in self._keys if key in parameters)
         together = self._posed is not None and shared
-        size = max(1, _LANES // (self._count(request) * request.spp)) if together else 1
+        size = max(1, _LANES // (self.count(request) * request.spp)) if together else 1
         images = []
         for start in range(0, count, size):
             part = {key: value[start : start + size] for key, value in parameters.items()}
@@ -200,32 +200,32 @@ class MitsubaSession:
         count = len(next(iter(parameters.values())))
         at = {key: tensor(values[0]) for key, values in parameters.items()}
         if self._posed is None or self._attached:
-            self._set_parameters(at)
-            radiance = self._run(ImagePass(), request)
+            self.set_parameters(at)
+            radiance = self.run(ImagePass(), request)
         else:
             detach_all()  # where scenes have tangents now and then, Dr.Jit would record many a step anew
             self._pair.loaded().set_parameters({key: at[key] for key in self._keys if key in at})
             numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
-            radiance = self._run(PosesPass(self._posed, count), request, tensor(numbers).array)
+            radiance = self.run(PosesPass(self._posed, count), request, tensor(numbers).array)
         dr.eval(radiance)
-        return self.dropped.develop(radiance, request.spp, 1, (count, self._count(request), 3)).array
+        return self.dropped.develop(radiance, request.spp, 1, (count, self.count(request), 3)).array
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased."""
-        self._set_parameters(current)
+        self.set_parameters(current)
         # A call through a pointer reaches both scenes' objects, and its adjoint would accumulate gradients in all that are attached.
-        self._set_parameters(previous, previous=True, attach=request.both_gradients)
+        self.set_parameters(previous, previous=True, attach=request.both_gradients)
         if space == "primary" and not (self._geometric and self._related):
-            radiance = self._run(ImagePass(), request)
-            radiance_previous = self._run(ImagePass(previous=True), request)
+            radiance = self.run(ImagePass(), request)
+            radiance_previous = self.run(ImagePass(previous=True), request)
         else:
             task: Pass = ImagePairPass()
             if self._geometric:
                 tracer = self._moved_kernel if space == "path" else self._unrelated_kernel
                 task = MovedPairPass(self._moving, tracer, self._still_sensors and self._only_meshes)
-            radiance, radiance_previous = self._run(task, request)
+            radiance, radiance_previous = self.run(task, request)
         dr.eval(radiance, radiance_previous)
-        images = self._develop(radiance, request), self._develop(radiance_previous, request)
+        images = self.develop(radiance, request), self.develop(radiance_previous, request)
         return Rendering(*images, Paths(request, radiance, radiance_previous, space, previous))
 
     # ------------------------------------------------------------------ derivatives
@@ -234,13 +234,13 @@ class MitsubaSession:
         """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `RenderSession.adjoint`."""
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
             # Where a pair collides in a medium depends on both states: so does its replay.
-            self._set_parameters(parameters)
-            self._set_parameters(paths.previous, previous=True, attach=paths.request.both_gradients)
-            self._run(AdjointPairPass(both=False), paths.request, paths.radiance, weights, paths.radiance_previous)
+            self.set_parameters(parameters)
+            self.set_parameters(paths.previous, previous=True, attach=paths.request.both_gradients)
+            self.run(AdjointPairPass(both=False), paths.request, paths.radiance, weights, paths.radiance_previous)
             return self._pair.loaded().take_gradients()
-        self._set_parameters(parameters)
+        self.set_parameters(parameters)
         if self._replays:
-            self._run(AdjointPass(), paths.request, paths.radiance, weights)
+            self.run(AdjointPass(), paths.request, paths.radiance, weights)
         else:
             self._pair.clear_gradients()
         return self._gradients(paths.request, weights)
@@ -250,22 +250,22 @@ class MitsubaSession:
     ) -> tuple[Tree, Tree]:
         """Path replay of both states of a pair: in path space on one set of paths, in one pass; in primary space, and where shapes move,
         each on its own, from the same random numbers. See `RenderSession.adjoint_pair`."""
-        self._set_parameters(current)
-        self._set_parameters(previous, previous=True)
+        self.set_parameters(current)
+        self.set_parameters(previous, previous=True)
         request = paths.request
         if paths.space == "primary" or self._geometric:
             gradient = self.adjoint(current, Paths(request, paths.radiance), weights)
             if self._replays:
                 radiance = paths.radiance_previous
                 if paths.space == "path":  # of other paths than `prb` would replay
-                    radiance = self._run(ImagePass(previous=True), request)
+                    radiance = self.run(ImagePass(previous=True), request)
                     dr.eval(radiance)
-                self._run(AdjointPass(previous=True), request, radiance, weights_previous)
+                self.run(AdjointPass(previous=True), request, radiance, weights_previous)
             else:
                 self._pair.clear_gradients()
             return gradient, self._gradients(request, weights_previous, previous=True)
         states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
-        self._run(AdjointPairPass(), request, *states)
+        self.run(AdjointPairPass(), request, *states)
         self.dropped.read()
         return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
 
@@ -282,9 +282,9 @@ class MitsubaSession:
         rest = {key: value for key, value in parameters.items() if key not in self._poses}
         self._pair.loaded().set_tangents(rest, tangents, self._attached)
         self._set_poses(parameters)
-        squares = self._run(TangentPass(combined), paths.request, paths.radiance)
+        squares = self.run(TangentPass(combined), paths.request, paths.radiance)
         dr.eval(squares)
-        moments = self._develop(squares, paths.request)
+        moments = self.develop(squares, paths.request)
         if self._boundary is not None:
             edges = self._boundary.tangent_moment(self._pair.loaded(), paths.request, combined)
             moments += mi.TensorXf(edges.array, moments.shape[1:])
@@ -307,17 +307,17 @@ class MitsubaSession:
         self._check_keys(parameters)
         scene.set_tangents(parameters, tangents, self._attached)
         task = ConnectionsPass(max(1, self._light.max_depth - 1))
-        found = self._run(task, paths.request, paths.radiance, weights, noise)
+        found = self.run(task, paths.request, paths.radiance, weights, noise)
         dr.eval(found)
         return connection_moments(scene.scene, *found)
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         """See `CountingSession.vertices`."""
-        self._set_parameters(parameters)
+        self.set_parameters(parameters)
         request = replace(request, groups=1)
-        found = self._run(VerticesPass(), request)
+        found = self.run(VerticesPass(), request)
         dr.eval(found)
-        return self._develop(found, request)[0]
+        return self.develop(found, request)[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
         """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""
@@ -331,7 +331,7 @@ class MitsubaSession:
 
     # ------------------------------------------------------------------ launches
 
-    def _set_parameters(self, parameters: Tree, previous: bool = False, attach: bool = True) -> None:
+    def set_parameters(self, parameters: Tree, previous: bool = False, attach: bool = True) -> None:
         self._check_keys(parameters)
         rest = {key: value for key, value in parameters.items() if key not in self._poses}
         self._pair.loaded(previous).set_parameters(rest, self._attached if attach else frozenset())
@@ -359,20 +359,20 @@ class MitsubaSession:
             if key not in self._keys and key not in self._poses:
                 raise InputError(f"parameter {key}: the renderer was not prepared for it")
 
-    def _count(self, request: SampleRequest) -> int:
+    def count(self, request: SampleRequest) -> int:
         if request.pixels is not None:
             return dr.width(request.pixels)
         height, width = self._pair.resolutions[request.sensor]
         return height * width
 
-    def _develop(self, radiance: mi.Spectrum, request: SampleRequest) -> mi.TensorXf:
-        size = self._pair.resolutions[request.sensor] if request.pixels is None else (self._count(request),)
+    def develop(self, radiance: mi.Spectrum, request: SampleRequest) -> mi.TensorXf:
+        size = self._pair.resolutions[request.sensor] if request.pixels is None else (self.count(request),)
         return self.dropped.develop(radiance, request.spp, request.groups, (*size, 3))
 
-    def _run(self, task: Pass, request: SampleRequest, *own: Any) -> Any:
+    def run(self, task: Pass, request: SampleRequest, *own: Any) -> Any:
         """Launch the kernel for requests of this form: traced once, replayed at each step."""
         pair = self._pair
-        size = LaunchSize(request.sensor, request.spp, self._count(request), self._light.hide_emitters)
+        size = LaunchSize(request.sensor, request.spp, self.count(request), self._light.hide_emitters)
         several = request.sensors is not None
         outside = not are_recordable(pair.current.sensors()[request.sensor], several)
         # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.

@@ -16,7 +16,7 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
-__all__ = ["EmitterConnection", "direct_emission", "mis_weight"]
+__all__ = ["EmitterConnection", "direct_emission", "met_emitter", "mis_weight"]
 
 _LARGEST = 1e18
 """Solid angle density whose square, and twice that, is a finite single-precision number."""
@@ -58,6 +58,14 @@ def _pdf_direction(context: PathContext, vertex: mi.Interaction3f, ds: mi.Direct
     return emitter.pdf_direction(vertex, ds, active) * pmf
 
 
+def met_emitter(
+    context: PathContext, last: ScatteringVertex, si: mi.SurfaceInteraction3f, active: Bool
+) -> tuple[mi.EmitterPtr, Float]:
+    """The emitter at a surface (or the environment) and the MIS weight of meeting it. Arguments: see `direct_emission`."""
+    ds = mi.DirectionSample3f(context.scene, si=si, ref=last.interaction)
+    return ds.emitter, mis_weight(last.pdf, _pdf_direction(context, last.interaction, ds, active & ~last.delta))
+
+
 def direct_emission(
     context: PathContext,
     last: ScatteringVertex,
@@ -73,10 +81,8 @@ def direct_emission(
         β: throughput of each state.
         active: lanes that meet a surface or leave the scene.
     """
-    scene, si = context.scene, surfaces[0]
-    ds = mi.DirectionSample3f(scene, si=si, ref=last.interaction)
-    mis = mis_weight(last.pdf, _pdf_direction(context, last.interaction, ds, active & ~last.delta))
-    emitters = context.states.emitters(ds.emitter)
+    emitter, mis = met_emitter(context, last, surfaces[0], active)
+    emitters = context.states.emitters(emitter)
     with context.resume_grad():
         return [
             throughput * mis * emitter.eval(surface, active)
@@ -101,6 +107,11 @@ class EmitterConnection:
     def emitter(self) -> UInt32:
         """The registry id of the emitter, 0 for none."""
         return registry_id(self.ds.emitter)
+
+    def weight(self, pdf: Float) -> Float:
+        """The MIS weight over the density. Arguments: see `contributions`."""
+        mis = dr.select(self.ds.delta, 1, mis_weight(self.ds.pdf, pdf))
+        return dr.select(self.active, mis * dr.rcp(self.ds.pdf), 0)
 
     def contributions(self, β: Sequence[Spectrum], values: Sequence[Spectrum], pdf: Float) -> list[Spectrum]:
         """Ld of each state: throughput, scattering, emitted radiance and MIS weight. Attached where the caller resumes gradients.

@@ -1,0 +1,1 @@
+"""Paths that stay in memory, to be evaluated at other values of the parameters."""

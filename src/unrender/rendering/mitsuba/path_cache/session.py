@@ -1,0 +1,154 @@
+"""A session that traces paths once: images of a pair, and every adjoint on its paths, are evaluated from memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.rendering.mitsuba.frozen import FrozenFunction, naming
+from unrender.rendering.mitsuba.light_paths import LightPaths
+from unrender.rendering.mitsuba.path_cache.evaluation import Evaluation
+from unrender.rendering.mitsuba.path_cache.lookups import Lookups
+from unrender.rendering.mitsuba.path_cache.tracing import TracePass
+from unrender.rendering.mitsuba.rendered_paths import DroppedSamples, Paths
+from unrender.rendering.mitsuba.scene_pair import ScenePair
+from unrender.rendering.mitsuba.session import MitsubaSession
+from unrender.rendering.renderer import Rendering, SampleRequest, Space
+from unrender.rendering.wrapper import SessionWrapper
+
+__all__ = ["CachingSession"]
+
+_DEEPEST = 16
+"""Segments of the longest paths that are kept: kernels have a stage for each."""
+_MOST_BYTES = 1 << 28
+"""Memory that the paths of one rendering may take. Larger renderings trace their adjoints."""
+
+
+class CachingSession(SessionWrapper):
+    """A `MitsubaSession` whose paths are traced once and kept for their adjoints.
+
+    Neither rays nor densities depend on the parameters of `Lookups`. So a pair's previous image, and each adjoint, cost a tenth of a traced
+    one. Samples and results are the inner session's, but for rounding. Renderings whose paths would take more than 256 MB, and
+    pairs that share random numbers alone, are the inner session's.
+
+    Args:
+        pair: both loads of the scene.
+        inner: traces the paths, and whatever is not kept.
+        keys: all parameters of the session.
+        derivatives: those that have gradients.
+        paths: settings of the light paths.
+
+    Raises `InputError` for parameters that are not served (`Lookups`), and for paths of more than 16 segments.
+    """
+
+    _inner: MitsubaSession
+
+    def __init__(
+        self, pair: ScenePair, inner: MitsubaSession, keys: Sequence[str], derivatives: Sequence[str], paths: LightPaths
+    ):
+        if not derivatives or pair.single or paths.max_depth > _DEEPEST:
+            raise InputError("paths are not kept: no derivatives, one state, or too many segments")
+        lookups = Lookups(pair, keys)
+        self._pair, self._inner, self._derivatives, self._depth = pair, inner, tuple(derivatives), paths.max_depth
+        self._keys = tuple(keys)
+        self._objects = {False: (lookups.textures, lookups.emitters)}
+        self._task = TracePass(lookups, paths.max_depth, paths.rr_depth)
+        self._evaluation = Evaluation(lookups, paths.max_depth)
+        self._functions: dict[tuple[Any, ...], FrozenFunction] = {}
+
+    @property
+    def dropped(self) -> DroppedSamples:
+        """The samples that were not finite."""
+        return self._inner.dropped
+
+    def path_bytes(self, request: SampleRequest) -> int:
+        """Memory that the paths of a rendering take."""
+        return self._task.bytes_per_row * self._depth * self._inner.count(request) * request.spp
+
+    # ------------------------------------------------------------------ rendering
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        if self.path_bytes(request) > _MOST_BYTES:
+            return self._inner.image(parameters, request)
+        self._inner.set_parameters(parameters)
+        vertices = self._inner.run(self._task, request)
+        (radiance,) = self._radiance(vertices, (False,), request)
+        return Rendering(self._inner.develop(radiance, request), None, Paths(request, radiance, vertices=vertices))
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        if space != "path" or self.path_bytes(request) > _MOST_BYTES:
+            return self._inner.image_pair(current, previous, request, space)
+        self._inner.set_parameters(current)
+        self._inner.set_parameters(previous, previous=True, attach=request.both_gradients)
+        vertices = self._inner.run(self._task, request)
+        radiances = self._radiance(vertices, (False, True), request)
+        images, before = (self._inner.develop(radiance, request) for radiance in radiances)
+        return Rendering(images, before, Paths(request, radiances[0], radiances[1], space, previous, vertices))
+
+    # ------------------------------------------------------------------ derivatives
+
+    def adjoint(self, parameters: Tree, paths: Paths, weights: mi.TensorXf) -> Tree:
+        if paths.vertices is None:
+            return self._inner.adjoint(parameters, paths, weights)
+        self._inner.set_parameters(parameters)
+        self._backward(paths, {False: (weights, paths.radiance)})
+        return self._pair.loaded().take_gradients()
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: Paths, weights: mi.TensorXf, weights_previous: mi.TensorXf
+    ) -> tuple[Tree, Tree]:
+        if paths.vertices is None:
+            return self._inner.adjoint_pair(current, previous, paths, weights, weights_previous)
+        self._inner.set_parameters(current)
+        self._inner.set_parameters(previous, previous=True)
+        replay = {False: (weights, paths.radiance), True: (weights_previous, paths.radiance_previous)}
+        self._backward(paths, replay)
+        return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
+
+    def tangent_moment(
+        self, parameters: Tree, paths: Paths, tangents: Tree, combined: tuple[float, ...] | None = None
+    ) -> mi.TensorXf:
+        return self._inner.tangent_moment(parameters, paths, tangents, combined)
+
+    # ------------------------------------------------------------------ launches
+
+    def _radiance(
+        self, vertices: dict[str, Any], states: tuple[bool, ...], request: SampleRequest
+    ) -> tuple[mi.Spectrum, ...]:
+        lanes = self._inner.count(request) * request.spp
+        function = self._function(("radiance", states, lanes), self._evaluation.radiance)
+        radiances = function(self._pair.clear_gradients, vertices, [self._objects_of(state) for state in states])
+        dr.eval(radiances)
+        return radiances
+
+    def _backward(self, paths: Paths, replay: dict[bool, tuple[Any, Any]]) -> None:
+        request = paths.request
+        spp, pixels = request.spp, self._inner.count(request)
+
+        def backward(vertices: Any, states: Any, replayed: Any) -> None:
+            self._evaluation.backward(vertices, states, replayed, spp, pixels)
+
+        function = self._function(("backward", tuple(replay), spp, pixels, request.groups), backward)
+        states = [self._objects_of(state) for state in replay]
+        with naming(self._derivatives):
+            function(self._pair.clear_gradients, paths.vertices, states, list(replay.values()))
+        self.dropped.read()
+
+    def _function(self, kind: tuple[Any, ...], traced: Any) -> FrozenFunction:
+        # Of its own for each resolution of a texture, as in `MitsubaSession.run`.
+        key = *kind, self._pair.loaded().shapes()
+        if key not in self._functions:
+            self._functions[key] = FrozenFunction(traced)
+        return self._functions[key]
+
+    def _objects_of(self, previous: bool) -> tuple[list[Any], list[Any]]:
+        if previous not in self._objects:
+            lookups = Lookups(self._pair, self._keys, previous)
+            self._objects[previous] = lookups.textures, lookups.emitters
+        return self._objects[previous]

@@ -1,0 +1,203 @@
+"""Tracing of paths that are kept: what each vertex adds, without the factors that depend on the parameters.
+
+With the lookup t_j at vertex j (1 where that is of no parameter), the lookup l_r at the emitter and fixed factors e_r, a path carries
+
+    L = Σ_r e_r l_r Π_{j < r} t_j.
+
+Row r holds the light that its segment r meets and the connection at its vertex r - 1, so row 0 is what the camera sees of emitters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.camera_paths import CameraPaths
+from unrender.rendering.mitsuba.integrators import emitters
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
+from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex, carries_light
+from unrender.rendering.mitsuba.integrators.path import ROULETTE_FLOOR
+from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
+from unrender.rendering.mitsuba.integrators.specular import sampling_weights
+from unrender.rendering.mitsuba.passes import LaunchSize, Pass
+from unrender.rendering.mitsuba.path_cache.lookups import Lookups
+from unrender.rendering.mitsuba.scene_pair import ScenePair
+
+__all__ = ["SOURCES", "TracePass"]
+
+SOURCES = ("met", "connected")
+"""Kinds of light in a row, kept apart where emitters are looked up."""
+
+_LIGHT, _LOOKED_UP, _SURFACE = 12, 12 + 4 + 12, 4 + 8
+"""Bytes of a row: of light, of light whose emitter is looked up, of a surface that is."""
+
+
+@dataclass
+class _State:
+    """A path's loop state: see `PathState`. β includes the lookups at tracing and decides on roulette; W leaves them out."""
+
+    ray: mi.Ray3f
+    depth: UInt32
+    β: Spectrum
+    W: Spectrum
+    η: Float
+    last: ScatteringVertex
+    active: Bool
+
+
+class _Record:
+    """Where vertices are written. No dataclass: Dr.Jit would take it for state of the loop."""
+
+    def __init__(self, arrays: dict[str, Any], lanes: int, weight: Any):
+        self.arrays, self.lanes, self.weight = arrays, lanes, weight
+
+
+class TracePass(Pass):
+    """Paths to be kept: {name: flat array of `depth` rows, one behind the other}.
+
+    "surface" and "uv": the texture that vertex r looks up, counted from 1, 0 for none, and where. "light": e_r, of emitters that no
+    parameter changes. Otherwise e_r of both `SOURCES`, "met" and "connected", each with the emitter that is looked up, and with its
+    texture coordinates or the direction to it.
+
+    Args:
+        lookups: what depends on parameters.
+        depth: longest path in segments.
+        rr_depth: depth from which roulette may end a path.
+    """
+
+    def __init__(self, lookups: Lookups, depth: int, rr_depth: int):
+        # No dataclass: Dr.Jit would take it for state of the loop below.
+        self.lookups, self.depth, self.rr_depth = lookups, depth, rr_depth
+
+    @property
+    def bytes_per_row(self) -> int:
+        """Memory of a path's row."""
+        of_lights = len(SOURCES) * _LOOKED_UP if self.lookups.emitters else _LIGHT
+        return of_lights + (_SURFACE if self.lookups.textures else 0)
+
+    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> dict[str, Any]:
+        return self.lookups.tables
+
+    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
+        """See the class."""
+        return paths.recorded(self._trace)
+
+    def _trace(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: Any, weight: Any) -> dict[str, Any]:
+        context = PathContext(dr.ADMode.Primal, scene, tables, (), False)
+        record = _Record(self._empty(dr.width(ray)), dr.width(ray), mi.Color3f(weight))
+        state = _State(
+            ray=mi.Ray3f(dr.detach(ray)),
+            depth=mi.UInt32(0),
+            β=mi.Spectrum(1),
+            W=mi.Spectrum(1),
+            η=mi.Float(1),
+            last=ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True)),
+            active=mi.Bool(True),
+        )
+        self._loop(context, record, state, sampler)
+        return record.arrays
+
+    def _empty(self, lanes: int) -> dict[str, Any]:
+        size, record = lanes * self.depth, {}
+        if self.lookups.textures:
+            record = {"surface": dr.zeros(mi.UInt32, size), "uv": dr.zeros(mi.Point2f, size)}
+        if not self.lookups.emitters:
+            record["light"] = dr.zeros(mi.Color3f, size)
+        else:
+            for source in SOURCES:
+                record[source] = dr.zeros(mi.Color3f, size)
+                record[f"{source}_emitter"] = dr.zeros(mi.UInt32, size)
+                record[f"{source}_place"] = dr.zeros(mi.Point3f, size)
+        dr.make_opaque(record)
+        return record
+
+    @dr.syntax
+    def _loop(self, context: PathContext, record: _Record, state: _State, sampler: Any) -> None:
+        while dr.hint(state.active, max_iterations=self.depth, label="kept paths"):
+            state = self._bounce(context, record, state, sampler)
+
+    def _bounce(self, context: PathContext, record: _Record, path: _State, sampler: Any) -> _State:
+        """One segment and the vertex at its end. Takes the random numbers of `PathPair`: the same seed has the same paths."""
+        scene, tables, ctx = context.scene, context.tables, context.bsdf_ctx
+        si = scene.ray_intersect(path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active)
+        bsdf: Any = si.bsdf(path.ray)  # pyright: ignore[reportArgumentType]
+        row = path.depth * record.lanes + dr.arange(mi.UInt32, record.lanes)
+
+        # ---------------------- Direct emission ----------------------
+        emitter, mis = emitters.met_emitter(context, path.last, si, path.active)
+        number = self._number(tables, "cached_emitter", emitter, path.active)
+        front = (number > self.lookups.areas) | (mi.Frame3f.cos_theta(si.wi) > 0)
+        known = emitter.eval(si, path.active & (number == 0))
+        light = path.W * mis * dr.select(number == 0, known, dr.select(front, 1, 0))
+        place = dr.select(number > self.lookups.areas, -si.wi, mi.Vector3f(si.uv.x, si.uv.y, 0))
+        self._write(record, "met", row, light, number, place, path.active)
+
+        # ---------------------- Emitter sampling ----------------------
+        active_next = path.active & (path.depth + 1 < self.depth) & si.is_valid()
+        surface = self._number(tables, "cached_bsdf", bsdf, active_next) if self.lookups.textures else mi.UInt32(0)
+        active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em)
+        ds = connection.ds
+        connection.active &= ~scene.ray_test(si.spawn_ray_to(ds.p), connection.active)
+        wo = si.to_local(ds.d)
+        f, pdf = bsdf.eval_pdf(ctx, si, wo, connection.active)
+        number = self._number(tables, "cached_emitter", ds.emitter, connection.active)
+        front = (number > self.lookups.areas) | (dr.dot(ds.d, ds.n) < 0)
+        known = ds.emitter.eval_direction(si, ds, connection.active & (number == 0))
+        # A diffuse surface has the value t pdf, with the reflectance t.
+        light = path.W * connection.weight(pdf) * dr.select(surface == 0, f, pdf)
+        light *= dr.select(number == 0, known, dr.select(front, 1, 0))
+        place = dr.select(number > self.lookups.areas, ds.d, mi.Vector3f(ds.uv.x, ds.uv.y, 0))
+        self._write(record, "connected", row + record.lanes, light, number, place, connection.active)
+
+        # ----------------------- BSDF sampling -----------------------
+        bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active_next)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        smooth = active_next & ~delta
+        f, pdf = bsdf.eval_pdf(ctx, si, bs.wo, smooth)
+        (weight,) = sampling_weights([f], pdf, weight, smooth, delta)
+        fixed = dr.select(surface == 0, weight, dr.select(pdf > 0, 1, 0))
+        if self.lookups.textures:
+            dr.scatter(record.arrays["surface"], surface, row, active_next)
+            dr.scatter(record.arrays["uv"], si.uv, row, active_next & (surface != 0))
+
+        # ---- Update loop variables based on current interaction -----
+        path.ray = si.spawn_ray(si.to_world(bs.wo))
+        path.η *= bs.eta
+        path.β *= weight
+        path.W *= fixed
+        path.last = ScatteringVertex(si, dr.select(delta, 1, pdf), delta)
+
+        # -------------------- Stopping criterion ---------------------
+        active_next &= carries_light([path.W])
+        q = dr.clip(dr.max(path.β) * dr.square(path.η), ROULETTE_FLOOR, 0.95)
+        roulette = path.depth >= self.rr_depth
+        rr_weight = dr.select(roulette, dr.rcp(q), 1)
+        path.β *= rr_weight
+        path.W *= rr_weight
+        active_next &= ~roulette | (sampler.next_1d() < q)
+        path.depth[si.is_valid()] += 1
+        path.active = active_next
+        return path
+
+    def _number(self, tables: Mapping[str, Any], table: str, pointer: Any, active: Bool) -> UInt32:
+        if table == "cached_emitter" and not self.lookups.emitters:
+            return mi.UInt32(0)
+        return dr.gather(mi.UInt32, tables[table], registry_id(pointer), active & (registry_id(pointer) != 0))
+
+    def _write(
+        self, record: _Record, source: str, row: UInt32, light: Spectrum, number: UInt32, place: Any, active: Bool
+    ) -> None:
+        weighted = (
+            mi.Color3f(light) * record.weight
+        )  # negative in some lobes of a film's filter, where paths go on all the same
+        if not self.lookups.emitters:
+            dr.scatter_add(record.arrays["light"], weighted, row, active)
+            return
+        dr.scatter(record.arrays[source], weighted, row, active)
+        dr.scatter(record.arrays[f"{source}_emitter"], number, row, active)
+        dr.scatter(record.arrays[f"{source}_place"], mi.Point3f(place), row, active & (number != 0))

@@ -1,0 +1,227 @@
+"""Paths that are traced once: images and gradients from memory are those of the session that traces them each time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+import zoo
+
+import unrender as ur
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.rendering.mitsuba import frozen
+from unrender.rendering.mitsuba.integrators.emitters import EmitterConnection
+from unrender.rendering.mitsuba.path_cache import session as caching
+from unrender.rendering.mitsuba.path_cache.lookups import Lookups
+from unrender.rendering.mitsuba.path_cache.session import CachingSession
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
+
+FLOOR, BALL, LAMP = "floor.bsdf.reflectance.data", "ball.bsdf.reflectance.data", "lamp.emitter.radiance.value"
+
+
+def diffuse() -> dict[str, Any]:
+    """Two textures that see one another, one of them turned, wrapped by mirroring and not filtered."""
+    described = zoo.scene({"type": "diffuse", "reflectance": zoo.texture(2)})
+    turned = zoo.texture(3) | {"filter_type": "nearest", "wrap_mode": "mirror"}
+    turned["to_uv"] = mi.ScalarTransform4f().rotate([0, 0, 1], 30).scale(2.5)
+    described["floor"]["bsdf"]["reflectance"] = turned
+    described["mirror"] = {"type": "sphere", "center": [1.2, -0.6, 0.5], "radius": 0.4, "bsdf": {"type": "conductor"}}
+    described["glass"] = {
+        "type": "sphere",
+        "center": [-1.2, -0.8, 0.4],
+        "radius": 0.3,
+        "bsdf": {"type": "roughdielectric"},
+    }
+    return described
+
+
+def twosided() -> dict[str, Any]:
+    both = {"type": "twosided", "material": {"type": "diffuse", "reflectance": zoo.texture(2)}}
+    return zoo.scene(both) | {"sensor": zoo.scene(both)["sensor"] | {"film": filtered()}}
+
+
+def filtered() -> dict[str, Any]:
+    return {"type": "hdrfilm", "width": zoo.SIZE, "height": zoo.SIZE, "rfilter": {"type": "mitchell"}}
+
+
+def textured_lamp() -> dict[str, Any]:
+    described = zoo.scene(zoo.rough(), environment=False)
+    described["lamp"]["emitter"]["radiance"] = zoo.texture(4, low=0.0, high=9.0)
+    described["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": [0.3, 0.4, 0.5]}}
+    return described
+
+
+SCENES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...]]] = {
+    "textures": (diffuse, (FLOOR, BALL)),
+    "texture and emitters": (diffuse, (BALL, LAMP, "sky.data")),
+    "emitters": (textured_lamp, ("lamp.emitter.radiance.data", "sky.radiance.value")),
+    "twosided, film filter": (twosided, ("ball.bsdf.brdf_0.reflectance.data", FLOOR)),
+}
+
+
+def prepared(name: str) -> tuple[CachingSession, dict[str, Any], dict[str, Any]]:
+    """The session, and two states."""
+    make, keys = SCENES[name]
+    renderer = MitsubaRenderer(make, zoo.DEPTH)
+    session = renderer.prepare(list(keys), "path")
+    assert isinstance(session, CachingSession)
+    current = renderer.values(list(keys))
+    previous = {key: value * 0.8 + 0.05 for key, value in current.items()}
+    return session, current, previous
+
+
+def requests(session: CachingSession) -> list[SampleRequest]:
+    """Whole views in groups, and a mini-batch."""
+    pixels = mi.UInt32(np.random.default_rng(3).integers(0, zoo.SIZE**2, 40).astype(np.uint32))
+    return [SampleRequest(0, 4, 7, 2), SampleRequest(0, 3, 8, 3, pixels)]
+
+
+def assert_equal(found: Any, expected: Any) -> None:
+    expected = arrays.numpy(expected)
+    np.testing.assert_allclose(arrays.numpy(found), expected, rtol=2e-4, atol=2e-5 * np.abs(expected).max())
+
+
+def compare(session: CachingSession, current: dict[str, Any], previous: dict[str, Any]) -> None:
+    """Everything, on the paths of the current state."""
+    traced, rng = session._inner, np.random.default_rng(0)
+    for request in requests(session):
+        both = [each.image_pair(current, previous, request, "path") for each in (session, traced)]
+        assert both[0].paths.vertices is not None
+        assert_equal(both[0].images, both[1].images)
+        assert_equal(both[0].previous, both[1].previous)
+        weights = [
+            mi.TensorXf(rng.normal(size=both[1].images.shape).astype(np.float32))  # pyright: ignore[reportCallIssue]
+            for _ in range(2)
+        ]
+        gradients = [
+            each.adjoint_pair(current, previous, of.paths, *weights)
+            for each, of in zip((session, traced), both, strict=True)
+        ]
+        for found, expected in zip(*gradients, strict=True):
+            for key, value in expected.items():
+                assert_equal(found[key], value)
+        alone = [each.image(previous, request) for each in (session, traced)]
+        assert_equal(alone[0].images, alone[1].images)
+        one, other = (
+            each.adjoint(previous, of.paths, weights[0]) for each, of in zip((session, traced), alone, strict=True)
+        )
+        for key, value in other.items():
+            assert_equal(one[key], value)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_images_and_gradients_are_those_of_traced_paths(name: str) -> None:
+    compare(*prepared(name))
+
+
+def test_a_weight_that_is_three_percent_off_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    right = EmitterConnection.weight
+    monkeypatch.setattr(EmitterConnection, "weight", lambda self, pdf: right(self, pdf) * 1.03)
+    with pytest.raises(AssertionError, match="Not equal"):
+        compare(*prepared("textures"))
+
+
+def test_a_texture_that_was_black_when_paths_were_traced() -> None:
+    """Paths go on where they carry nothing yet: the other state's image has all of its light."""
+    session, current, previous = prepared("textures")
+    black = {key: value * 0.0 for key, value in current.items()}
+    request = SampleRequest(0, 64, 5)
+    found = arrays.numpy(session.image_pair(black, previous, request, "path").previous)
+    expected = arrays.numpy(session._inner.image(previous, request).images)
+    assert abs(found.mean() / expected.mean() - 1) < 0.03
+
+
+def test_large_renderings_and_random_numbers_alone_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    session, current, previous = prepared("textures")
+    request = SampleRequest(0, 2, 7)
+    assert session.path_bytes(request) == zoo.SIZE**2 * 2 * zoo.DEPTH * 24
+    assert session.image_pair(current, previous, request, "primary").paths.vertices is None
+    monkeypatch.setattr(caching, "_MOST_BYTES", session.path_bytes(request) - 1)
+    for rendering in (
+        session.image(current, request),
+        session.image_pair(current, previous, request, "path"),
+    ):
+        assert rendering.paths.vertices is None
+        weights = mi.TensorXf(np.ones(rendering.images.shape, np.float32))  # pyright: ignore[reportCallIssue]
+        assert set(session.adjoint(current, rendering.paths, weights)) == set(current)
+
+
+def test_kernels_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded: list[int] = []
+    make = frozen._recorder
+
+    def counting(function: Any, tracing: Any) -> Any:
+        def counted(*arguments: Any) -> Any:
+            recorded.append(1)
+            return function(*arguments)
+
+        return make(counted, tracing)
+
+    monkeypatch.setattr(frozen, "_recorder", counting)
+    session, current, previous = prepared("texture and emitters")
+    counts = []
+    for step in range(6):
+        now = {key: value * (1 - 0.01 * step) for key, value in current.items()}
+        rendering = session.image_pair(now, previous, SampleRequest(0, 2, step, 2), "path")
+        session.adjoint(now, rendering.paths, rendering.images)
+        counts.append(len(recorded))
+    assert counts[2:] == counts[2:3] * 4
+
+
+NOT_SERVED = {
+    "rough conductor": ("ball.bsdf.alpha.data", "RoughConductor"),
+    "twosided plastic": ("ball.bsdf.brdf_0.diffuse_reflectance.data", "SmoothPlastic"),
+    "mask": ("ball.bsdf.nested_bsdf.brdf_0.reflectance.data", "MaskBSDF"),
+    "normal map": ("ball.bsdf.nested_bsdf.reflectance.data", "NormalMap"),
+    "blend": ("ball.bsdf.bsdf_0.reflectance.data", "BlendBSDF"),
+}
+
+
+@pytest.mark.parametrize("material", NOT_SERVED)
+def test_what_is_not_served_is_named_and_traced(material: str) -> None:
+    key, named = NOT_SERVED[material]
+    renderer = MitsubaRenderer(lambda: zoo.scene(zoo.MATERIALS[material][0]()), zoo.DEPTH)
+    with pytest.raises(InputError, match=rf"parameter {key}.*{named}"):
+        Lookups(renderer.pair, [key, FLOOR])
+    assert not isinstance(renderer.prepare([key, FLOOR], None), CachingSession)
+    assert isinstance(renderer.prepare([FLOOR], None), CachingSession)
+
+
+def test_two_sides_of_different_materials_and_what_moves_are_not_served() -> None:
+    def sides() -> dict[str, Any]:
+        one, other = ({"type": "diffuse", "reflectance": zoo.texture(seed)} for seed in (2, 3))
+        return zoo.scene({"type": "twosided", "front": one, "rear": other})
+
+    renderer = MitsubaRenderer(sides, zoo.DEPTH)
+    for key, named in (
+        ("ball.bsdf.brdf_0.reflectance.data", "two sides"),
+        ("floor.vertex_positions", "moves"),
+        ("ball.translation", "pose"),
+        ("floor.to_world", "paths go"),
+    ):
+        if key in renderer.parameters():
+            with pytest.raises(InputError, match=named):
+                Lookups(renderer.pair, [key])
+
+
+def test_a_run_is_the_same_with_kept_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Step by step the same numbers, but for rounding."""
+    make, keys = SCENES["textures"]
+    reference = np.full((zoo.SIZE, zoo.SIZE, 3), 0.3, np.float32)
+
+    def run() -> Any:
+        renderer = MitsubaRenderer(make, 3)
+        problem = ur.Problem(renderer, [ur.Parameter(key) for key in keys], [ur.View(reference)])
+        estimator = ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2)
+        return ur.optimize(problem, estimator, ur.optimizers.SGD(0.1), steps=4, seed=3)
+
+    found = run()
+    monkeypatch.setattr(MitsubaRenderer, "_caching", lambda self, session, keys, derivatives: session)
+    expected = run()
+    for key in keys:
+        np.testing.assert_allclose(found.parameters[key], expected.parameters[key], rtol=1e-3, atol=1e-5)
