@@ -14,8 +14,6 @@ from unrender.rendering.mitsuba.integrators.base import total
 from unrender.rendering.mitsuba.path_cache.lookups import Lookups
 from unrender.rendering.mitsuba.path_cache.tracing import SOURCES
 
-__all__ = ["Evaluation"]
-
 Vertices = Mapping[str, Any]
 """What `TracePass` returns."""
 Objects = tuple[list[Any], list[Any]]
@@ -55,7 +53,8 @@ class Evaluation:
             film.film_adjoint(weights, spp, pixels) * self._radiance(vertices, objects, finite)
             for (weights, _), objects in zip(replay, states, strict=True)
         ]
-        dr.backward_from(total(parts))
+        # Paths of one segment meet no surface that is looked up.
+        dr.backward_from(total(parts), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     def _radiance(self, vertices: Vertices, objects: Objects, finite: Any = True) -> mi.Spectrum:
         textures, emitters = objects

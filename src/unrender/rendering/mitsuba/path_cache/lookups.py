@@ -17,8 +17,6 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, object_ids
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
-__all__ = ["Lookups"]
-
 _TEXTURES = ("BitmapTextureImpl", "UniformSpectrum", "SRGBReflectanceSpectrum", "Checkerboard")
 """Beginnings of the class names of textures that read texture coordinates alone."""
 _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")

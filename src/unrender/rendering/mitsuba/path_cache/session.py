@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -11,7 +12,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba.frozen import FrozenFunction, naming
+from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.path_cache.evaluation import Evaluation
 from unrender.rendering.mitsuba.path_cache.lookups import Lookups
@@ -22,11 +23,9 @@ from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.renderer import Rendering, SampleRequest, Space
 from unrender.rendering.wrapper import SessionWrapper
 
-__all__ = ["CachingSession"]
-
 _DEEPEST = 16
 """Segments of the longest paths that are kept: kernels have a stage for each."""
-_MOST_BYTES = 1 << 28
+_MOST_BYTES = 1 << 26
 """Memory that the paths of one rendering may take. Larger renderings trace their adjoints."""
 
 
@@ -34,7 +33,7 @@ class CachingSession(SessionWrapper):
     """A `MitsubaSession` whose paths are traced once and kept for their adjoints.
 
     Neither rays nor densities depend on the parameters of `Lookups`. So a pair's previous image, and each adjoint, cost a tenth of a traced
-    one. Samples and results are the inner session's, but for rounding. Renderings whose paths would take more than 256 MB, and
+    one. Samples and results are the inner session's, but for rounding. Renderings whose paths would take more than 64 MB, and
     pairs that share random numbers alone, are the inner session's.
 
     Args:
@@ -55,7 +54,8 @@ class CachingSession(SessionWrapper):
         if not derivatives or pair.single or paths.max_depth > _DEEPEST:
             raise InputError("paths are not kept: no derivatives, one state, or too many segments")
         lookups = Lookups(pair, keys)
-        self._pair, self._inner, self._derivatives, self._depth = pair, inner, tuple(derivatives), paths.max_depth
+        super().__init__(inner)
+        self._pair, self._depth = pair, paths.max_depth
         self._keys = tuple(keys)
         self._objects = {False: (lookups.textures, lookups.emitters)}
         self._task = TracePass(lookups, paths.max_depth, paths.rr_depth)
@@ -82,8 +82,12 @@ class CachingSession(SessionWrapper):
         return Rendering(self._inner.develop(radiance, request), None, Paths(request, radiance, vertices=vertices))
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        if space != "path" or self.path_bytes(request) > _MOST_BYTES:
+        if self.path_bytes(request) > _MOST_BYTES:
             return self._inner.image_pair(current, previous, request, space)
+        if space != "path":
+            # Of the current state, to the bit the image that it has alone.
+            found = self._inner.image_pair(current, previous, request, space)
+            return replace(found, images=self.image(current, request).images)
         self._inner.set_parameters(current)
         self._inner.set_parameters(previous, previous=True, attach=request.both_gradients)
         vertices = self._inner.run(self._task, request)
@@ -136,8 +140,7 @@ class CachingSession(SessionWrapper):
 
         function = self._function(("backward", tuple(replay), spp, pixels, request.groups), backward)
         states = [self._objects_of(state) for state in replay]
-        with naming(self._derivatives):
-            function(self._pair.clear_gradients, paths.vertices, states, list(replay.values()))
+        function(self._pair.clear_gradients, paths.vertices, states, list(replay.values()))
         self.dropped.read()
 
     def _function(self, kind: tuple[Any, ...], traced: Any) -> FrozenFunction:

@@ -27,8 +27,6 @@ from unrender.rendering.mitsuba.passes import LaunchSize, Pass
 from unrender.rendering.mitsuba.path_cache.lookups import Lookups
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
-__all__ = ["SOURCES", "TracePass"]
-
 SOURCES = ("met", "connected")
 """Kinds of light in a row, kept apart where emitters are looked up."""
 
