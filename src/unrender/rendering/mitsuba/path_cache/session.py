@@ -135,8 +135,10 @@ class CachingSession(SessionWrapper):
         request = paths.request
         spp, pixels = request.spp, self._inner.count(request)
 
+        evaluation = self._evaluation  # a recording that held the session would keep its scenes alive
+
         def backward(vertices: Any, states: Any, replayed: Any) -> None:
-            self._evaluation.backward(vertices, states, replayed, spp, pixels)
+            evaluation.backward(vertices, states, replayed, spp, pixels)
 
         function = self._function(("backward", tuple(replay), spp, pixels, request.groups), backward)
         states = [self._objects_of(state) for state in replay]

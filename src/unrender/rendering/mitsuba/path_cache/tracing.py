@@ -137,20 +137,7 @@ class TracePass(Pass):
         # ---------------------- Emitter sampling ----------------------
         active_next = path.active & (path.depth + 1 < self.depth) & si.is_valid()
         surface = self._number(tables, "cached_bsdf", bsdf, active_next) if self.lookups.textures else mi.UInt32(0)
-        active_em = active_next & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em)
-        ds = connection.ds
-        connection.active &= ~scene.ray_test(si.spawn_ray_to(ds.p), connection.active)
-        wo = si.to_local(ds.d)
-        f, pdf = bsdf.eval_pdf(ctx, si, wo, connection.active)
-        number = self._number(tables, "cached_emitter", ds.emitter, connection.active)
-        front = (number > self.lookups.areas) | (dr.dot(ds.d, ds.n) < 0)
-        known = ds.emitter.eval_direction(si, ds, connection.active & (number == 0))
-        # A diffuse surface has the value t pdf, with the reflectance t.
-        light = path.W * connection.weight(pdf) * dr.select(surface == 0, f, pdf)
-        light *= dr.select(number == 0, known, dr.select(front, 1, 0))
-        place = dr.select(number > self.lookups.areas, ds.d, mi.Vector3f(ds.uv.x, ds.uv.y, 0))
-        self._write(record, "connected", row + record.lanes, light, number, place, connection.active)
+        self._connect(context, record, path, si, bsdf, surface, row + record.lanes, sampler, active_next)
 
         # ----------------------- BSDF sampling -----------------------
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active_next)
@@ -181,6 +168,33 @@ class TracePass(Pass):
         path.depth[si.is_valid()] += 1
         path.active = active_next
         return path
+
+    def _connect(
+        self,
+        context: PathContext,
+        record: _Record,
+        path: _State,
+        si: mi.SurfaceInteraction3f,
+        bsdf: Any,
+        surface: UInt32,
+        row: UInt32,
+        sampler: Any,
+        active: Bool,
+    ) -> None:
+        """Write the connection of a vertex to an emitter."""
+        active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em)
+        ds = connection.ds
+        connection.active &= ~context.scene.ray_test(si.spawn_ray_to(ds.p), connection.active)
+        f, pdf = bsdf.eval_pdf(context.bsdf_ctx, si, si.to_local(ds.d), connection.active)
+        number = self._number(context.tables, "cached_emitter", ds.emitter, connection.active)
+        front = (number > self.lookups.areas) | (dr.dot(ds.d, ds.n) < 0)
+        known = ds.emitter.eval_direction(si, ds, connection.active & (number == 0))
+        # A diffuse surface has the value t pdf, with the reflectance t.
+        light = path.W * connection.weight(pdf) * dr.select(surface == 0, f, pdf)
+        light *= dr.select(number == 0, known, dr.select(front, 1, 0))
+        place = dr.select(number > self.lookups.areas, ds.d, mi.Vector3f(ds.uv.x, ds.uv.y, 0))
+        self._write(record, "connected", row, light, number, place, connection.active)
 
     def _number(self, tables: Mapping[str, Any], table: str, pointer: Any, active: Bool) -> UInt32:
         if table == "cached_emitter" and not self.lookups.emitters:
