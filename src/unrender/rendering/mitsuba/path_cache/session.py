@@ -8,7 +8,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
