@@ -36,7 +36,7 @@ from unrender.rendering.mitsuba.ranges import Range, SlotReaders
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.mitsuba.scene_loading import media
-from unrender.rendering.numpy.exponential import RATE
+from unrender.rendering.numpy.one_pixel import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.runs import loop
 from unrender.runs.budget import Budget

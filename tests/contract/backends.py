@@ -13,9 +13,8 @@ import numpy as np
 import unrender as ur
 from unrender.core import arrays
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.numpy.exponential import ExponentialRenderer
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.rendering.numpy.quadratic import QuadraticRenderer
+from unrender.rendering.numpy.one_pixel import ExponentialRenderer, QuadraticRenderer
 from unrender.rendering.renderer import Renderer, SampleRequest
 
 TEXTURE, LAMP = "back.bsdf.reflectance.data", "light.emitter.radiance.value"

@@ -17,7 +17,7 @@ from unrender.gallery import boxes, mesh_files, meshes, specification, textures
 from unrender.gallery.sunlit_vase import SunlitVase
 from unrender.methods import method
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.numpy.quadratic import QuadraticRenderer
+from unrender.rendering.numpy.one_pixel import QuadraticRenderer
 from unrender.rendering.renderer import SampleRequest
 
 NAMES = ur.gallery.names()

@@ -9,7 +9,7 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields
 from unrender.losses import L2, Loss
-from unrender.rendering.numpy.quadratic import POINT, QuadraticRenderer
+from unrender.rendering.numpy.one_pixel import POINT, QuadraticRenderer
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View

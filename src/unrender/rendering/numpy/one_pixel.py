@@ -1,0 +1,175 @@
+"""Renderers of one pixel in NumPy, with known integrals and derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.rendering.renderer import ParameterInfo, Rendering, RenderSession, SampleRequest, Space
+
+RATE = "rate"
+"""The key of the parameter of `ExponentialRenderer`, λ."""
+POINT = "x"
+"""The key of the parameter of `QuadraticRenderer`."""
+
+
+class _OnePixel:
+    """A renderer of one pixel and one parameter. It holds no state, so it is a session itself."""
+
+    key: ClassVar[str]
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        return [(1, 1)]
+
+    def array(self, values: np.ndarray) -> np.ndarray:
+        """Return a NumPy array in double precision."""
+        return np.array(values, np.float64)
+
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> RenderSession:
+        del space, derivatives
+        for key in keys:
+            if key != self.key:
+                raise InputError(f"parameter {key}: the scene has none of that name; it has {self.key}")
+        return self  # pyright: ignore[reportReturnType]
+
+    def adjoint(self, parameters: Tree, paths: Any, weights: np.ndarray) -> Tree:
+        raise NotImplementedError
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: Any, weights: np.ndarray, weights_previous: np.ndarray
+    ) -> tuple[Tree, Tree]:
+        return self.adjoint(current, paths, weights), self.adjoint(previous, paths, weights_previous)
+
+
+@dataclass(frozen=True)
+class ExponentialPaths:
+    """The samples of a rendering at λ = 1, (groups, *shape of a picture, samples of each)."""
+
+    unit: np.ndarray
+
+
+class ExponentialRenderer(_OnePixel):
+    """The mean of an exponential distribution: the toy problem of Balint et al. 2023, Fig. 2.
+
+    A sample is x(u; λ) = −log(1 − u) / λ for a uniform u, so its mean is 1/λ, its variance 1/λ², its derivative −x/λ. All three channels
+    are equal.
+
+    Args:
+        rate: its own λ, > 0.
+        lowest: the smallest λ that a descent may reach, > 0.
+    """
+
+    key = RATE
+
+    def __init__(self, rate: float = 0.5, lowest: float = 0.05):
+        self.rate, self.lowest = rate, lowest
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        return {RATE: ParameterInfo((), lowest=self.lowest)}
+
+    def values(self, keys: list[str]) -> Tree:
+        return {key: np.array(self.rate) for key in keys}
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        shape = (1, 1) if request.pixels is None else (len(request.pixels),)
+        numbers = np.random.default_rng(request.seed).random((request.groups, *shape, request.spp // request.groups))
+        paths = ExponentialPaths(-np.log1p(-numbers))
+        return Rendering(self._images(parameters, paths), None, paths)
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
+        rendering = self.image(parameters={RATE: 1.0}, request=replace(request, groups=1))
+        means = rendering.images[0, 0, 0] / np.reshape(parameters[RATE], (-1, 1))
+        return means[:, None, None, :]
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """See `RenderSession.image_pair`. Both spaces share the random numbers, which is all there is to share."""
+        del space
+        rendering = self.image(current, request)
+        return Rendering(rendering.images, self._images(previous, rendering.paths), rendering.paths)
+
+    def adjoint(self, parameters: Tree, paths: ExponentialPaths, weights: np.ndarray) -> Tree:
+        slopes = -self._images(parameters, paths) / float(parameters[RATE])
+        return {RATE: np.array((weights * slopes).sum() / len(slopes))}
+
+    def tangent_moment(self, parameters: Tree, paths: ExponentialPaths, tangents: Tree) -> np.ndarray:
+        slopes = paths.unit * float(tangents[RATE]) / float(parameters[RATE]) ** 2
+        found = np.repeat(np.mean(slopes**2, axis=-1)[..., None], 3, axis=-1)
+        return found if len(found) > 1 else found[0]
+
+    def _images(self, parameters: Tree, paths: ExponentialPaths) -> np.ndarray:
+        means = paths.unit.mean(axis=-1) / float(parameters[RATE])
+        return np.repeat(means[..., None], 3, axis=-1)
+
+
+class QuadraticRenderer(_OnePixel):
+    """A quadratic form: with L2 against black, the loss is xᵀ A x, to the last digit.
+
+    The picture is linear, its channels J x with Jᵀ J = 3 A, since the loss is the mean over three channels. No noise: derivatives of
+    the loss are known in closed form, ∇ = 2 A x and ∇² = 2 A, and smoothing by a Gaussian only adds a constant, Σᵢ Aᵢᵢ σᵢ².
+
+    Args:
+        matrix: A, (n, n) for n from 1 to 3, symmetric, no eigenvalue below 0.
+        point: its own x, (n,).
+
+    Raises `InputError` where no picture has this form.
+    """
+
+    key = POINT
+
+    def __init__(self, matrix: np.ndarray, point: np.ndarray):
+        self.matrix, self._point = np.array(matrix, np.float64), np.array(point, np.float64)
+        n = self._point.size
+        if self._point.shape != (n,) or not 1 <= n <= 3 or self.matrix.shape != (n, n):
+            raise InputError(
+                f"matrix: expected (n, n) and a point (n,), n from 1 to 3, got {self.matrix.shape}, {self._point.shape}"
+            )
+        values, vectors = np.linalg.eigh(self.matrix)
+        if not np.array_equal(self.matrix, self.matrix.T) or values[0] < -1e-9 * abs(values[-1]):
+            raise InputError("matrix: must be symmetric and have no eigenvalue below 0")
+        # The symmetric root of 3 A; channels that x does not reach stay black.
+        root = vectors * np.sqrt(3 * np.maximum(values, 0)) @ vectors.T
+        self._jacobian = np.concatenate([root, np.zeros((3 - n, n))])
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        return {POINT: ParameterInfo(self._point.shape)}
+
+    def values(self, keys: list[str]) -> Tree:
+        return {key: self._point.copy() for key in keys}
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        """See `RenderSession.image`. Exact."""
+        return Rendering(self._images(parameters, request), None, request)
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
+        """See `RenderSession.image_batch`. Exact."""
+        del request
+        return (np.asarray(parameters[POINT]) @ self._jacobian.T)[:, None, None, :]
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """See `RenderSession.image_pair`. Exact in both spaces."""
+        del space
+        return Rendering(self._images(current, request), self._images(previous, request), request)
+
+    def adjoint(self, parameters: Tree, paths: Any, weights: np.ndarray) -> Tree:
+        """See `RenderSession.adjoint`. Exact."""
+        del parameters, paths
+        return {POINT: weights.reshape(len(weights), -1, 3).sum(axis=1).mean(axis=0) @ self._jacobian}
+
+    def tangent_moment(self, parameters: Tree, paths: SampleRequest, tangents: Tree) -> np.ndarray:
+        """See `RenderSession.tangent_moment`. Exact."""
+        del parameters
+        found = self._images(tangents, paths) ** 2
+        return found if paths.groups > 1 else found[0]
+
+    def _images(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
+        shape = (1, 1) if request.pixels is None else (len(request.pixels),)
+        pixel = self._jacobian @ np.asarray(parameters[POINT])
+        return np.broadcast_to(pixel, (request.groups, *shape, 3)).copy()
