@@ -11,9 +11,9 @@ import pytest
 
 import unrender as ur
 from tests.contract import analytic
+from tests.local_hosts import LocalHosts
 from unrender.app.distributed.assignment import assign
 from unrender.app.distributed.executor import DistributedExecutor
-from unrender.app.distributed.hosts import LocalHosts
 from unrender.app.distributed.share import ViewShare
 from unrender.scene.executor import Executor, LocalExecutor
 

@@ -18,9 +18,9 @@ from resizable import KEY, FieldRenderer, upsampled
 from scipy import stats
 
 import unrender as ur
+from tests.local_hosts import LocalHosts
 from tiers import quick
 from unrender.app.distributed.executor import DistributedExecutor
-from unrender.app.distributed.hosts import LocalHosts
 from unrender.app.distributed.share import ViewShare
 from unrender.core import arrays
 from unrender.core.errors import InputError

@@ -14,12 +14,12 @@ import pytest
 
 import unrender as ur
 from tests.contract import analytic
+from tests.local_hosts import LocalHosts
 from unrender.app.cli.dealing import variant_again
 from unrender.app.distributed import assignment
 from unrender.app.distributed.assignment import assign, total
 from unrender.app.distributed.cluster import Workers, share
 from unrender.app.distributed.executor import DistributedExecutor
-from unrender.app.distributed.hosts import LocalHosts
 from unrender.app.distributed.messages import Call, Reply
 from unrender.app.distributed.outbox import Outbox
 from unrender.app.distributed.share import ViewShare

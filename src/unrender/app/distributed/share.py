@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -172,3 +173,41 @@ class ViewShare:
     def _remember(self, call: Call, kept: tuple[Any, ...]) -> None:
         if call.result is not None:
             self._memories[call.result] = kept
+
+
+class Hosts(Protocol):
+    """Holds shares, and may lose them."""
+
+    @property
+    def count(self) -> int:
+        """How many shares."""
+        ...
+
+    def room(self) -> list[tuple[str, int]]:
+        """The machine that each share lives on, and bytes of memory that it may have; 0 for unknown."""
+        ...
+
+    def run(self, calls: Mapping[int, Call]) -> dict[int, Reply]:
+        """The replies of shares to their calls, all at once; without those that were lost meanwhile, which hold nothing any more but are
+        there again. Raises `InputError` where they cannot be."""
+        ...
+
+    def emptied(self) -> set[int]:
+        """Shares that have been lost since this was last asked, also those whose reply had come: they hold nothing any more."""
+        ...
+
+    def store(self, share: int, number: int, packed: Packed) -> bool:
+        """See `ViewShare.store`; false where the share was lost."""
+        ...
+
+    def fetch(self, number: int) -> dict[int, Packed]:
+        """See `ViewShare.fetch`, of all shares; without those that were lost."""
+        ...
+
+    def movable(self) -> list[int]:
+        """Shares that had better live elsewhere."""
+        ...
+
+    def move(self, share: int) -> None:
+        """Let a share live elsewhere, where it holds nothing yet."""
+        ...
