@@ -12,7 +12,7 @@ __getattr__, _ = lazy.attach(
     __name__,
     {
         "Live": "live",
-        "TensorBoard": "tensorboard",
+        "TensorBoard": "callbacks",
     },
 )
 __all__ = [
