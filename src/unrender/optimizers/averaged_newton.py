@@ -16,6 +16,9 @@ from unrender.optimizers import rates
 from unrender.optimizers.directions import coordinate_scales
 from unrender.optimizers.newton import trust_region_step
 
+_FEWEST_MODELS = 8.0
+"""Models in the mean from which on their scatter tells a standard error."""
+
 
 @dataclass(frozen=True)
 class AveragedNewtonState:
@@ -29,6 +32,8 @@ class AveragedNewtonState:
         shares: of that, what is left in the mean, (n,): the sum of the squared weights of its models.
         counts: how many models each element's mean is of, (n,); fewer where steps have been long.
         lengths: of the last step, in units of the trust region, of the elements that moved together, (n,).
+        scatter: covariance of `target` by noise, (n, n): the sum over models of their squared weights times the squared difference of
+            each model's gradient from that of the mean before it.
     """
 
     learning_rates: dict[str, float]
@@ -38,6 +43,7 @@ class AveragedNewtonState:
     shares: np.ndarray
     counts: np.ndarray
     lengths: np.ndarray
+    scatter: np.ndarray
 
 
 @register
@@ -90,7 +96,7 @@ class AveragedNewton:
         own = rates.per_parameter("AveragedNewton", parameters, self.learning_rate, learning_rates)
         n = vectors.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
-        return AveragedNewtonState(own, square, row, square, row, row, row)
+        return AveragedNewtonState(own, square, row, square, row, row, row, square)
 
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
@@ -108,10 +114,14 @@ class AveragedNewton:
         scale = coordinate_scales(estimate, state, parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
         noise, shares, counts = state.noise.copy(), state.shares.copy(), state.counts.copy()
-        lengths = np.zeros_like(x)
+        lengths, scatter = np.zeros_like(x), state.scatter.copy()
         for block in _blocks((matrix != 0.0) | (hessian != 0.0)):
             both = np.ix_(block, block)
             weight = self._weight(counts[block].min(), state.lengths[block].max())
+            scatter[both] *= (1.0 - weight) ** 2
+            if counts[block].min() > 0.0:
+                news = gradient[block] - (matrix[both] @ x[block] - target[block])
+                scatter[both] += weight**2 * np.outer(news, news) / (1.0 + shares[block].max())
             counts[block] = (1.0 + self.averaging) * (1.0 / weight - 1.0) + 1.0
             matrix[both] += weight * (hessian[both] - matrix[both])
             noise[both] += weight * (added[both] - noise[both])
@@ -124,8 +134,22 @@ class AveragedNewton:
             lengths[block] = np.linalg.norm(moved)
             step[block] = own * moved
         return vectors.unravel(step, parameters), AveragedNewtonState(
-            state.learning_rates, matrix, target, noise, shares, counts, lengths
+            state.learning_rates, matrix, target, noise, shares, counts, lengths, scatter
         )
+
+    def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:
+        """See `Measuring`: of A⁻¹ b, from the scatter of the models' gradients about those of the mean.
+
+        It is of the run's own noise, not of the references', nor of what differences of a width leave out. It needs some ten models.
+        """
+        inverse = np.linalg.pinv(state.matrix, rcond=1e-12, hermitian=True)
+        errors = vectors.parts(np.sqrt(np.abs(np.diag(inverse @ state.scatter @ inverse)))[None], parameters)
+        counts = vectors.parts(state.counts[None], parameters)
+        return {
+            key: x[0]
+            for key, x in errors.items()
+            if counts[key].min() >= _FEWEST_MODELS and np.isfinite(x).all() and x.all()
+        }
 
     def _weight(self, count: float, length: float) -> float:
         """Of a model in the mean, after so many others and a step of this length."""

@@ -48,6 +48,18 @@ class OnMeshes(Protocol):
 
 
 @runtime_checkable
+class Measuring(Protocol):
+    """An optimizer that measures how far noise moves its result."""
+
+    def standard_errors(self, state: Any, parameters: Tree) -> Tree:
+        """Return the standard error of each element, {key: array} of the shapes of `parameters`, by the coordinates of the descent.
+
+        Parameters without one are left out.
+        """
+        ...
+
+
+@runtime_checkable
 class Choosing(Protocol):
     """An optimizer that finds settings of its own as it goes."""
 

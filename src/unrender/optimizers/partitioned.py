@@ -14,7 +14,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate, Capabilities, FreshGradient, Gradient
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.base import Choosing, OnMeshes, Optimizer
+from unrender.optimizers.base import Choosing, Measuring, OnMeshes, Optimizer
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
@@ -113,6 +113,16 @@ class Partitioned:
             steps |= found
             states.append(after)
         return {key: steps[key] for key in parameters}, PartitionedState(*states)
+
+    def standard_errors(self, state: PartitionedState, parameters: Tree) -> Tree:
+        """See `Measuring`: of the optimizers that measure them."""
+        parts = zip((self.optimizer, self.others), (state.own, state.others), self._parts(parameters), strict=True)
+        return {
+            key: error
+            for part, of, point in parts
+            if isinstance(part, Measuring)
+            for key, error in part.standard_errors(of, point).items()
+        }
 
     def choices(self, state: PartitionedState) -> tuple[str, ...]:
         """See `Choosing`."""

@@ -17,7 +17,7 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.estimators.coordinates import by_coordinates, regularized
 from unrender.methods.plan import Plan
-from unrender.optimizers.base import Choosing, OnMeshes, Optimizer
+from unrender.optimizers.base import Choosing, Measuring, OnMeshes, Optimizer
 from unrender.runs.hooks import Hook
 from unrender.runs.mesh_guard import guarded
 from unrender.runs.metadata import RunMetadata
@@ -55,7 +55,19 @@ class Descent:
         """What the run has reached so far; with `info`, what the last estimate tells besides."""
         optimizer = self.run.optimizer
         adapted = optimizer.choices(self.state.optimizer) if isinstance(optimizer, Choosing) else ()
-        return self.log.result(self.run, [line for hook in self.hooks for line in hook.warnings(self)], info, adapted)
+        found = self.log.result(self.run, [line for hook in self.hooks for line in hook.warnings(self)], info, adapted)
+        return replace(found, standard_error=self._standard_errors())
+
+    def _standard_errors(self) -> dict[str, np.ndarray]:
+        """Return the standard error of the parameters that have one, in their units."""
+        run, optimizer = self.run, self.run.optimizer
+        if not isinstance(optimizer, Measuring):
+            return {}
+        coordinates = run.problem.coordinates
+        found = optimizer.standard_errors(self.state.optimizer, coordinates.of(run.parameters))
+        slopes = coordinates.slopes(run.parameters)
+        by_x = {key: np.abs(arrays.numpy(slopes[key])) * x if key in slopes else x for key, x in found.items()}
+        return {key: x.astype(np.float32) for key, x in by_x.items()}
 
     def snapshot(self) -> dict[str, Any]:
         """All that decides what the next steps do."""

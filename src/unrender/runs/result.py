@@ -61,6 +61,9 @@ class Result:
             root mean square "error" of remembered images, and of the "picture").
         image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the
             reference and what the picture converges to, the noise of its rendering taken out; see `evaluation.debiased`.
+        standard_error: {key: array} of the parameters' shapes: how far the noise of this run's renderings moves each number, one standard
+            deviation; not the noise of the references, nor what other unknowns that are wrong do. Of numbers by `AveragedNewton` after
+            the last step alone; {} for others.
         phases: {phase: seconds}: where the time went, in order: "compiling", "steps", "checkpoints and callbacks", "final pictures",
             and, of the command line, what came before. Of the last session, where the run was resumed.
         sensitivity: {key: array} of the parameters' shapes: by how much the images change per unit of each element, as the root of the sum
@@ -95,6 +98,7 @@ class Result:
     pictures: Mapping[str, np.ndarray] = field(default_factory=dict)
     image_errors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     sensitivity: Mapping[str, np.ndarray] = field(default_factory=dict)
+    standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, float] = field(default_factory=dict)
     meshes: Mapping[str, np.ndarray] = field(default_factory=dict)
     undetermined: Sequence[str] = ()
@@ -209,6 +213,9 @@ class Result:
                 name: list(error) for name, error in self.image_errors.items() if np.isfinite(error).all()
             },
             "undetermined": list(self.undetermined),
+            "standard_error": {
+                key: [float(f"{value:.6g}") for value in np.ravel(error)] for key, error in self.standard_error.items()
+            },
             "verification": dict(self.verification),
             "phases": {name: round(seconds, 3) for name, seconds in self.phases.items()},
         }

@@ -150,6 +150,7 @@ class Verify(Hook):
             result,
             parameters=dict(places[best][1]) if places else result.parameters,
             last=result.parameters,
+            standard_error={} if places else result.standard_error,
             verification=told,
             warnings=[*result.warnings, *lines],
         )

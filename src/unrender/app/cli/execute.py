@@ -165,6 +165,11 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
     for key, error in (last | problem.parameter_error(result.parameters)).items():
         table.add_row(escape(key), _error_line(problem, result, key, start[key], error))
+    for key, error in result.standard_error.items():
+        table.add_row(
+            f"± {escape(key)}",
+            f"{', '.join(map(formatting.number, np.ravel(error)))} (standard error of the run's noise)",
+        )
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
     console.print(table)

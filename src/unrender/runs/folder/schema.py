@@ -113,6 +113,7 @@ class RunRecord(BaseModel):
         problem: what was to be recovered.
         resumed: the steps at which it was resumed.
         image_errors, undetermined, phases: see `Result`.
+        standard_error: of each number, {key: one value per element}; see `Result`.
         verification: see `Result`; empty for runs that were not verified.
         error: the exception by which the run failed; "" for none.
     """
@@ -140,6 +141,7 @@ class RunRecord(BaseModel):
     resumed: list[_Count] = []
     image_errors: dict[StrictStr, tuple[_Seconds, _Seconds]] = {}
     undetermined: list[StrictStr] = []
+    standard_error: dict[StrictStr, list[_Seconds]] = {}
     verification: dict[StrictStr, Any] = {}
     phases: dict[StrictStr, _Seconds] = {}
     error: StrictStr = ""
