@@ -188,7 +188,7 @@ def test_noise_falls_as_the_root_of_the_steps() -> None:
 def test_standard_errors_cover_the_truth_in_68_percent_of_the_seeds(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
-    """Of 100 seeds times 3 numbers, within 8 percent. A planted fault, half the scatter of the gradients, is seen. A run folder has them."""
+    """Of 100 seeds times 3 numbers, within 8 percent. A planted fault, half the scatter, is seen. A run folder has them."""
     monkeypatch.setattr("unrender.runs.verify.Verify.on_result", lambda self, descent, result: result)
     made, scores = problem(), []
     for seed in range(100):
