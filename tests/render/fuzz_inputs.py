@@ -30,6 +30,9 @@ import unrender as ur
 from unrender.app import report
 from unrender.app.capture import formats, pictures
 from unrender.app.capture.formats import lights
+from unrender.app.evaluation.judge import judge
+from unrender.app.evaluation.turntable import turntable
+from unrender.app.exporting.scene_folder import export
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, images, volumes
 from unrender.runs.folder import reader
@@ -241,6 +244,22 @@ def _run_files() -> Files:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def _exportable_files() -> Files:
+    """A problem whose mesh has texture coordinates throughout."""
+    return _problem_files() | {"mesh.obj": _obj().rpartition(b"f ")[0]}
+
+
+@functools.cache
+def _result_files() -> Files:
+    """A problem with a mesh, held-out views and the folder of a run."""
+    place = Path(tempfile.mkdtemp(prefix="fuzz"))
+    for name, data in _exportable_files().items():
+        (place / name).write_bytes(data)
+    problem = ur.Problem.from_file(place / "problem.toml")
+    ur.optimize(problem, ur.PathGradient(spp=1), ur.optimizers.Adam(), steps=2, run_directory=place / "run")
+    return {f"run/{path.name}": path.read_bytes() for path in (place / "run").iterdir() if path.is_file()}
+
+
 # ---------------------------------------------------------------------- what is done with them
 
 
@@ -315,6 +334,22 @@ def _use_run(folder: Path, name: str) -> Any:
         raise InputError(results[0])
 
 
+def _use_result(folder: Path, name: str) -> Any:
+    """Judge it, turn it, export it."""
+    del name
+    run, views = folder / "run", folder / "held-out.toml"
+    for file, data in _exportable_files().items():
+        (folder / file).write_bytes(data)
+    shutil.copy(folder / "problem.toml", views)
+    results = [
+        _refused(lambda: judge(run, views, spp=1, out=folder / "judge")),
+        _refused(lambda: turntable(run, folder / "frames", frames=1, size=16, spp=1)),
+        _refused(lambda: export(run, folder / "export")),
+    ]
+    if all(results):
+        raise InputError(results[0])
+
+
 def _use_problem(folder: Path, name: str) -> Any:
     del name
     return ur.Problem.from_file(folder / "problem.toml")
@@ -328,6 +363,7 @@ TARGETS: dict[str, tuple[Callable[[], Files], Use]] = {
     "capture": (_capture_files, _use_capture),
     "colmap": (_colmap_files, _use_capture),
     "run": (_run_files, _use_run),
+    "result": (_result_files, _use_result),
 }
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from unrender.app.evaluation.measures import best_factors, compare_albedo, mean, measure
+from unrender.app.evaluation.measures import Measures, best_factors, compare_albedo, mean, measure
 from unrender.core.errors import InputError
 from unrender.losses import metrics
 
@@ -83,3 +83,11 @@ def test_the_best_factors_are_those_of_least_squares() -> None:
         for channel in (0, 1):
             other = factors + step * np.eye(3)[channel]
             assert np.sum((found * other - truth) ** 2) > np.sum((found * factors - truth) ** 2)
+
+
+def test_means_have_the_names_of_the_measures() -> None:
+    """The record and the table of a judgement ask for them by these names."""
+    known = Measures(psnr=20.0, ssim=0.5, lpips=0.25, exposure=1.0)
+    unknown = Measures(psnr=30.0, ssim=None, lpips=None, exposure=1.0)
+    assert mean([known]) == {"psnr": 20.0, "ssim": 0.5, "lpips": 0.25}
+    assert mean([known, unknown]) == {"psnr": 25.0, "ssim": None, "lpips": None}

@@ -28,7 +28,7 @@ class Measures:
 
     psnr: float
     ssim: float | None
-    metrics: float | None
+    lpips: float | None
     exposure: float
 
 
