@@ -12,11 +12,13 @@ from unrender.rendering.exposure import EXPOSURE, ExposedRenderer
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import Renderer
 from unrender.rendering.response import RESPONSE, RespondingRenderer
+from unrender.rendering.tied import TiedRenderer
 from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer
 
 __all__ = [
     "OF_PHOTOGRAPHS",
     "check_response",
+    "member_values",
     "scene_renderer",
     "scene_values",
     "sensors_with_rows",
@@ -36,7 +38,18 @@ def check_response(names: Collection[str]) -> None:
 
 
 def scene_renderer(renderer: Renderer) -> Renderer:
-    """What renders the scene alone."""
+    """Return what renders the scene alone, without ties and parameters of photographs."""
+    renderer = _without_photographs(renderer)
+    return renderer.inner if isinstance(renderer, TiedRenderer) else renderer
+
+
+def member_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the values with the members of ties in place of these."""
+    base = _without_photographs(renderer)
+    return base.scene_values(values) if isinstance(base, TiedRenderer) else dict(values)
+
+
+def _without_photographs(renderer: Renderer) -> Renderer:
     while isinstance(renderer, WithParameter):
         renderer = renderer.inner
     return renderer
@@ -70,7 +83,7 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
     rows = sensors_with_rows(renderer)
     if set(wanted) <= renderer.parameters().keys() and (rows is None or set(rows) >= set(sensors)):
         return renderer
-    found = scene_renderer(renderer)
+    found = _without_photographs(renderer)
     if POSES in wanted:
         found = PosedCameras(found, list(sensors))
     if VIGNETTING in wanted:
@@ -81,10 +94,11 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
 
 
 def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The values that a scene can hold: without response, exposures and vignetting, and with the poses of its cameras."""
+    """Return the values that a scene can hold: without response, exposures and vignetting, with the poses of its cameras and all members of
+    ties."""
     found = {key: value for key, value in values.items() if key not in OF_PHOTOGRAPHS}
     while isinstance(renderer, WithParameter):
         if isinstance(renderer, PosedCameras) and POSES in values:
             found |= renderer.corrections.poses(np.asarray(values[POSES]))
         renderer = renderer.inner
-    return found
+    return renderer.scene_values(found) if isinstance(renderer, TiedRenderer) else found

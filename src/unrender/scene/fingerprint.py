@@ -12,6 +12,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.io import scene_files
+from unrender.scene.parameter import ties_of
 from unrender.scene.problem import Problem
 
 __all__ = ["differences", "digest", "fingerprint"]
@@ -67,6 +68,8 @@ def _take(problem: Problem) -> dict[str, str]:
         for name in ("parameterisation", "regularizer", "remeshing", "coarse_to_fine"):
             if (setting := getattr(unknown, name)) is not None:
                 found[f"parameter {key}: {name}"] = repr(setting)
+        if unknown.given.keys is not None:
+            found[f"parameter {key}: keys"] = repr(ties_of([unknown.given])[0].factors)
         if unknown.given.self_intersection == "prevent":
             found[f"parameter {key}: self_intersection"] = "prevent"
     for index, view in enumerate(problem.views):

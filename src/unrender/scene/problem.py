@@ -25,7 +25,7 @@ from unrender.scene.coordinates import Coordinates
 from unrender.scene.errors import FieldError
 from unrender.scene.executor import LOCAL, Executor
 from unrender.scene.mesh_checks import check_surfaces
-from unrender.scene.parameter import Parameter, ParameterSettings
+from unrender.scene.parameter import Parameter, ParameterSettings, tied, ties_of
 from unrender.scene.references import References
 from unrender.scene.surfaces import Surface
 from unrender.scene.unknown import Unknown
@@ -48,7 +48,7 @@ from unrender.scene.view import View
 from unrender.scene.view_checks import check_views
 from unrender.scene.view_losses import ViewLosses
 
-__all__ = ["Bounds", "Problem"]
+__all__ = ["Bounds", "Problem", "open_scene"]
 
 
 @dataclass(frozen=True, init=False, eq=False, repr=False)
@@ -306,7 +306,7 @@ class Problem(ViewLosses):
 def _opened(scene: Any, max_depth: int | None, parameters: Sequence[Parameter], views: Sequence[View]) -> Renderer:
     """Return the renderer of a scene, with unknowns that photographs have. Raises `FieldError`."""
     keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
-    renderer = open_renderer(scene, max_depth, keys)
+    renderer = open_scene(scene, max_depth, parameters)
     sensors = [view.sensor for view in views if isinstance(view.sensor, int)]
     try:
         return with_photographs(renderer, keys, sensors)
@@ -332,3 +332,11 @@ def _unknowns(
         notices = (*found[key].notices, *([f"parameter {key}: truth {notice}"] if notice else []))
         found[key] = replace(found[key], truth=true, notices=notices)
     return found
+
+
+def open_scene(scene: Any, max_depth: int | None, parameters: Sequence[Parameter]) -> Renderer:
+    """Return the renderer of a scene in which the ties of these parameters are unknowns. Raises `FieldError`."""
+    ties = ties_of(parameters)
+    keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
+    members = [member for tie in ties for member in tie.factors]
+    return tied(open_renderer(scene, max_depth, [*keys, *members]), parameters, ties)

@@ -67,6 +67,8 @@ def _described(problem: Problem, folder: Path) -> dict[str, Any]:
 def _parameter(index: int, unknown: Unknown, store: _Arrays) -> dict[str, Any]:
     parameter = unknown.given
     table: dict[str, Any] = {"key": parameter.key}
+    if parameter.keys is not None:
+        table["keys"] = dict(parameter.keys) if isinstance(parameter.keys, Mapping) else list(parameter.keys)
     if parameter.initial is not None:
         table |= store.field("initial", parameter.initial, f"parameter{index}-initial")
     if parameter.bounds is not None:

@@ -6,7 +6,7 @@
     loss = "L1"                                # or { type = "Huber", delta = 0.1 }, { type = "Perceptual", weights = "vgg16.safetensors" }
 
     [[parameters]]
-    key = "wall.bsdf.reflectance.data"
+    key = "wall.bsdf.reflectance.data"         # or keys = [...], several parameters of one value, or { "a" = 1, "b" = 0.5 }, of factors
     initial = 0.5                              # a number, a colour [r, g, b], a picture, a grid (.vol), a mesh, an array (.npy)
     bounds = [0.0, 1.0]                        # inf and -inf are open
     learning_rate = 0.01
@@ -21,7 +21,7 @@
     weight = 1.0
     mask = "mask.png"
 
-Paths are relative to the file. Only `scene`, `key` and `reference` are required.
+Paths are relative to the file. Only `scene`, `key` (or `keys`) and `reference` are required.
 """
 
 from __future__ import annotations
@@ -47,7 +47,13 @@ _Number = StrictFloat | StrictInt
 
 
 class _Parameter(Table):
-    key: StrictStr = Field(description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"')
+    key: StrictStr = Field(
+        "",
+        description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"; beside keys, a name of your own',
+    )
+    keys: list[StrictStr] | dict[str, _Number] | None = Field(
+        None, description='several scene parameters of one value, such as ["a.value", "b.value"], or factors by key'
+    )
     initial: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, mesh, .npy or .npz file"
     )
@@ -112,7 +118,7 @@ def read(path: str | Path) -> Problem:
     except FieldError as error:
         place = error.place
         if place[0] == "truth":  # in a file it stands with the parameter
-            keys = [parameter.key for parameter in model.parameters]
+            keys = [parameter.key or next(iter(parameter.keys or [""])) for parameter in model.parameters]
             place = ("parameters", keys.index(str(place[1])), "truth")
         raise toml_models.error_at(file, text, place, error.what) from error
 
@@ -123,21 +129,27 @@ def _build(model: _Problem, file: Path) -> Problem:
         loss = tables.component(model.loss, "loss", folder=folder)
     except InputError as error:
         raise FieldError(("loss",), str(error)) from error
+    parameters = [_parameter(index, parameter, folder) for index, parameter in enumerate(model.parameters)]
+    truths = zip(parameters, [parameter.truth for parameter in model.parameters], strict=True)
     return Problem(
         folder / model.scene,
-        [_parameter(index, parameter, folder) for index, parameter in enumerate(model.parameters)],
+        parameters,
         [
             View(folder / view.reference, view.sensor, view.weight, None if view.mask is None else folder / view.mask)
             for view in model.views
         ],
         loss,
         model.max_depth,
-        truth={p.key: _value(p.truth, folder) for p in model.parameters if p.truth is not None},
+        truth={p.key: _value(truth, folder) for p, truth in truths if truth is not None},
         name=model.name or file.stem,
     )
 
 
 def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
+    if not model.key and not model.keys:
+        raise FieldError(
+            ("parameters", index, "key"), "expected key, the name of a scene parameter, or keys, several names"
+        )
     preconditioner = None
     if model.preconditioner is not None:
         try:
@@ -152,7 +164,7 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
     given = {"parameterisation": model.parameterisation, "regularizer": model.regularizer, "remeshing": model.remeshing}
-    given["self_intersection"] = model.self_intersection
+    given |= {"self_intersection": model.self_intersection, "keys": model.keys}
     return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, **given)
 
 

@@ -13,8 +13,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.photographs import scene_renderer, sensors_with_rows, with_photographs
 from unrender.scene.parameter import Parameter
-from unrender.scene.problem import Problem
-from unrender.scene.validation import open_renderer
+from unrender.scene.problem import Problem, open_scene
 from unrender.scene.view import View
 
 __all__ = ["packed", "unpacked"]
@@ -69,7 +68,7 @@ def unpacked(blob: bytes, ray: Any) -> Problem:
     scene = parts.scene
     if parts.sensors is not None:
         keys = [parameter.key for parameter in parts.parameters]
-        scene = with_photographs(open_renderer(scene, parts.max_depth, keys), keys, parts.sensors)
+        scene = with_photographs(open_scene(scene, parts.max_depth, parts.parameters), keys, parts.sensors)
     return Problem(scene, parts.parameters, parts.views, parts.loss, parts.max_depth, name=parts.name)
 
 

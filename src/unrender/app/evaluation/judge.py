@@ -28,7 +28,7 @@ from unrender.losses import metrics
 from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.photographs import OF_PHOTOGRAPHS
+from unrender.rendering.photographs import OF_PHOTOGRAPHS, member_values
 from unrender.rendering.response import RESPONSE, curve
 from unrender.rendering.vignetting import VIGNETTING, falloff
 from unrender.runs import reopen
@@ -157,7 +157,7 @@ def _problem(
     problem: Problem, held_out: Path, parameters: Mapping[str, np.ndarray], run: RunFolder
 ) -> tuple[Problem, dict[str, np.ndarray], list[str]]:
     """What was found with the held-out views, and its values."""
-    other = Problem.from_file(held_out)
+    other, parameters = Problem.from_file(held_out), member_values(problem.renderer, parameters)
     known = set(other.renderer.parameters()).difference(OF_PHOTOGRAPHS)
     kept = [key for key in parameters if key in known]
     if not kept:

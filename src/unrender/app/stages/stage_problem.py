@@ -81,7 +81,7 @@ class Whole:
         fixed = {key: value for key, value in values.items() if key not in stage.unknowns}
         if fixed:
             if not (folder / scene_folder.SCENE).is_file():
-                unknowns = [Parameter(key) for key in fixed]
+                unknowns = [Parameter(key, keys=self.parameters[key].keys) for key in fixed]
                 problem = Problem(scene, unknowns, self.views[:1], self.loss, self.max_depth)
                 self._check_names(stage, scene_folder.export((problem, fixed), folder))
             scene = folder / scene_folder.SCENE
