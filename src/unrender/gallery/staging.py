@@ -30,10 +30,10 @@ def sun(towards: parts.Vector, *rgb: float) -> dict[str, Any]:
 def unknown(
     shape: str, part: str, start: dict[str, float], bounds: tuple[float, float] | None = None
 ) -> list[Parameter]:
-    """Coordinates of the pose of a shape, which are 0 in the true scene.
+    """Coordinates of the pose of a shape or light, which are 0 in the true scene.
 
     Args:
-        shape: its id.
+        shape: the id of the shape or light.
         part: "translation" or "rotation".
         start: {"x" | "y" | "z": where the descent starts}; what is not named stays as it is.
         bounds: of each.

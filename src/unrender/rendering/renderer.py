@@ -35,12 +35,12 @@ class ParameterInfo:
         differentiable: whether `adjoint` can return its gradient.
         shares_paths: whether one set of paths serves two values of it (path space). A renderer may relate those of a moving mesh.
         reason: why it is not differentiable or cannot share paths; else "".
-        lowest: the smallest value that makes physical sense, or None.
-        highest: the largest, or None.
+        lowest, highest: the limits of what makes physical sense, or None.
         singular: value between these at which images are singular, such as 1 for an index of refraction, and which is not crossed.
         perturbable: whether it can be rendered at other values, all that `image_batch` needs.
         compiled: whether it is a plain number, which kernels are compiled with: neither differentiable nor perturbable.
-        rigid: whether it moves a shape or sensor as a whole: few numbers, with plateaus and many minima of the loss.
+        rigid: whether it moves a shape, light or sensor as a whole: few numbers, with plateaus and many minima of the loss.
+        light: whether what it moves as a whole is a light.
         viewpoint: whether it is a sensor's pose or lens.
         sensor: index of the only sensor whose images it changes; None where it may change others'.
         mesh: of values at the V vertices of a mesh, (n V,), what gives the mesh as loaded: positions (V, 3) and faces (F, 3); else None.
@@ -63,6 +63,7 @@ class ParameterInfo:
     compiled: bool = False
     resizable: bool = False
     rigid: bool = False
+    light: bool = False
     viewpoint: bool = False
     sensor: int | None = None
     mesh: Callable[[], tuple[np.ndarray, np.ndarray]] | None = field(default=None, compare=False, repr=False)
@@ -303,8 +304,7 @@ class ReplacedMesh:
     """What a shape is to be.
 
     Attributes:
-        vertices: (V, 3).
-        faces: (F, 3), numbers of vertices.
+        vertices, faces: (V, 3), and (F, 3) of numbers of vertices.
         uv: (V, 2) texture coordinates; None where the shape has none.
     """
 

@@ -113,6 +113,8 @@ class Constants:
     explained: float = 0.1
     """Share of the loss that derivative images at the start must explain. Source: 0.22 to 0.34 for a block that overlaps, at most 0.003
     on the plateaus of `box2`, `mug` and `shadow` (7c39b33)."""
+    explained_light: float = 0.005
+    """The same share where lights alone move. Source: 0.016 for `stage-lights`, which arrives; 0 for a light that misses the view."""
 
     pose_shift: float = 1.0 / 12.0
     """First shift of the differences of poses, as a share of the smallest picture's side. Source: a block in a room .25 away."""

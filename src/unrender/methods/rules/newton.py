@@ -56,18 +56,21 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
 def few_numbers(traits: Traits) -> Plan | None:
     """Return Gauss-Newton steps where few numbers are unknown and the image changes its form with one of them; else None.
 
-    Poses of shapes take them where derivative images at the start explain the residual: on a plateau a smoothed loss is needed.
+    Poses take them where derivative images at the start explain the residual: on a plateau a smoothed loss is needed. Poses of lights may
+    stand beside other numbers, such as intensities.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear]
-    mixed = 0 < len(traits.poses) < len(keys)
+    shapes = any(not traits.infos[key].light for key in traits.poses)
+    mixed = shapes and len(traits.poses) < len(keys)
     if not nonlinear or mixed or not traits.newton_suits or not _few(traits, keys):
         return None
     estimator = _estimator(traits, keys, constants.pose_images)
     if traits.poses:
         trial = replace(estimator, derivative_spp=constants.trial_spp, coarse=None)
         trial = replace(trial, largest=widths_of(traits.options.sigma, traits.poses))
-        if not problem.loss.linear or not explained(problem, trial) > constants.explained:
+        least = constants.explained if shapes else constants.explained_light
+        if not problem.loss.linear or not explained(problem, trial) > least:
             return None
     reason = f"{_reason(traits, keys, estimator)}: pictures change their form with {listed(nonlinear)}"
     return Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
@@ -114,7 +117,8 @@ def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
 def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNewton:
     """Return the estimator of these unknowns; `images`: paths of the images of poses over those of the derivative images."""
     constants, problem, elements = traits.constants, traits.problem, _elements(traits, keys)
-    poses = [key for key in keys if key in traits.poses]
+    moved = [key for key in keys if key in traits.poses]
+    poses = [key for key in moved if not traits.infos[key].light]
     differences = sampling.within(
         constants.difference_spp, constants.difference_paths // (2 * elements * problem.pixels)
     )
@@ -122,17 +126,18 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
     paths = max(paths, round(2 * elements * differences * images)) if poses else paths
     spp = traits.options.spp or sampling.within(constants.number_spp, paths)
     side = min(min(size) for size in problem.sizes)
+    reach = constants.pose_reach if poses else 1.0
     return GaussNewton(
         max(spp, 2),
         differences,
         tolerance=_damping(traits),
         coarse=max(constants.pose_shift * side, 1.0) if poses else None,
-        largest={key: constants.pose_reach * width for key, width in widths_of(traits.options.sigma, poses).items()},
+        largest={key: reach * width for key, width in widths_of(traits.options.sigma, moved).items()},
     )
 
 
 def _optimizer(traits: Traits, keys: tuple[str, ...]) -> AveragedNewton:
-    poses = any(key in traits.poses for key in keys)
+    poses = any(key in traits.poses and not traits.infos[key].light for key in keys)
     return AveragedNewton(averaging=traits.constants.pose_averaging) if poses else AveragedNewton()
 
 

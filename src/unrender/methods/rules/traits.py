@@ -55,7 +55,7 @@ class Traits:
 
     @property
     def poses(self) -> list[str]:
-        """Keys of rigid motions, of shapes or sensors."""
+        """Keys of rigid motions, of shapes, lights or sensors."""
         return [key for key, info in self.infos.items() if info.rigid]
 
     @property
@@ -74,7 +74,8 @@ class Traits:
         """Why path gradients of the unknowns do not serve; "" where they do."""
         if rigid := next(iter(self.poses), ""):
             other = "; --method plain has path gradients" if self.infos[rigid].differentiable else ""
-            return f"parameter {rigid} moves a shape or sensor as a whole, with plateaus of the loss{other}"
+            what = "a light" if self.infos[rigid].light else "a shape or sensor"
+            return f"parameter {rigid} moves {what} as a whole, with plateaus of the loss{other}"
         return refusal(self.problem)
 
 

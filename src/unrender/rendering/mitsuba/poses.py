@@ -131,6 +131,7 @@ def info(key: PoseKey, obstacle: str, sensor: int | None) -> ParameterInfo:
         reason=why,
         lowest=low,
         rigid=True,
+        light=key.light,
         viewpoint=viewpoint,
         sensor=sensor,
     )
