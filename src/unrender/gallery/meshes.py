@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
+from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.described import load_described
 from unrender.scene.surfaces import Surface
 
@@ -68,12 +68,9 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
         coordinates.append(np.stack([u, v], -1).reshape(-1, 2) + np.array(piece.origin))
         normals.append(_normals(piece.positions, piece.closed).reshape(-1, 3))
         count += rows * columns
-    mesh = _mesh(name, np.concatenate(positions), np.concatenate(faces), bsdf, np.concatenate(coordinates))
-    # In a second update: Mitsuba replaces the normals, with a crease at the seam, whenever positions change.
-    parameters = mi.traverse(mesh)
-    parameters["vertex_normals"] = mi.Float(np.concatenate(normals).ravel().astype(np.float32))
-    parameters.update()
-    return mesh
+    # With normals of its own: Mitsuba's have a crease at the seam.
+    points, corners, uv = (np.concatenate(of) for of in (positions, faces, coordinates))
+    return mesh_layout.build(name, points, corners, np.concatenate(normals), uv, load_described(bsdf))
 
 
 def triangles(
@@ -91,30 +88,13 @@ def triangles(
     Returns:
         `mitsuba.Mesh` with normals; an entry of a scene dictionary.
     """
-    return _mesh(name, positions, faces, bsdf, coordinates)
+    return mesh_layout.build(name, positions, faces, None, coordinates, load_described(bsdf))
 
 
 def surface(mesh: Any) -> Surface:
     """That of a loaded mesh."""
-    found: Any = mi.traverse(mesh)
-    vertices = np.array(found["vertex_positions"]).reshape(-1, 3)
-    return Surface(vertices, np.array(found["faces"]).reshape(-1, 3))
-
-
-def _mesh(
-    name: str, positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any], coordinates: np.ndarray | None = None
-) -> Any:
-    properties = mi.Properties()
-    properties["bsdf"] = load_described(bsdf)
-    textured = coordinates is not None
-    mesh = mi.Mesh(name, len(positions), len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=textured)
-    parameters = mi.traverse(mesh)
-    parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
-    parameters["vertex_positions"] = mi.Float(positions.ravel().astype(np.float32))
-    if coordinates is not None:
-        parameters["vertex_texcoords"] = mi.Float(coordinates.ravel().astype(np.float32))
-    parameters.update()
-    return mesh
+    points, faces = np.array(mesh_layout.positions(mesh)), np.array(mesh_layout.faces(mesh))
+    return Surface(points.reshape(-1, 3), faces.reshape(-1, 3))
 
 
 def lathe(radius: np.ndarray, height: np.ndarray, columns: int) -> np.ndarray:

@@ -113,6 +113,8 @@ def read(path: Path) -> Mesh:
         raise InputError(f"--mesh {path}: expected a {' or '.join(_KINDS)} file")
     import mitsuba as mi
 
+    from unrender.rendering.mitsuba import mesh_layout
+
     if path.suffix.lower() == ".ply":
         mesh_files.check_ply(path)
     else:
@@ -123,11 +125,11 @@ def read(path: Path) -> Mesh:
         raise InputError(
             f"--mesh {path}: Mitsuba could not read it (has it faces?): {' '.join(str(error).split())[:300]}"
         ) from error
-    parameters = mi.traverse(loaded)
-    vertices = np.array(parameters["vertex_positions"], float).reshape(-1, 3)
-    faces = np.array(parameters["faces"], np.int64).reshape(-1, 3)
-    uv = np.array(parameters["vertex_texcoords"], float).reshape(-1, 2)
-    given = np.array(parameters["vertex_normals"], float).reshape(-1, 3)
+    parameters = mesh_layout.traverse(loaded)
+    vertices = np.array(mesh_layout.vertex_positions(loaded), float).reshape(-1, 3)
+    faces = np.array(parameters[mesh_layout.FACES], np.int64).reshape(-1, 3)
+    uv = np.array(parameters[mesh_layout.TEXCOORDS], float).reshape(-1, 2)
+    given = np.array(parameters[mesh_layout.NORMALS], float).reshape(-1, 3)
     if not len(faces) or not np.isfinite(vertices).all() or not np.ptp(vertices, axis=0).max() > 0:
         raise InputError(f"--mesh {path}: expected triangles with some extent and finite vertices")
     return Mesh(vertices, faces, uv if len(uv) else None, given if len(given) else None)

@@ -23,18 +23,14 @@ class Silhouettes:
     def __init__(self, mesh: Mesh):
         import mitsuba as mi
 
+        from unrender.app.capture.mesh import normals
+        from unrender.rendering.mitsuba import mesh_layout
+
         self._middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
         self._extent = float(np.ptp(mesh.vertices, axis=0).max())
         local = Mesh((mesh.vertices - self._middle) / self._extent, mesh.faces, mesh.uv, mesh.normals)
-        made: Any = mi.Mesh("mesh", len(local.vertices), len(local.faces), has_vertex_normals=True)
-        parameters = mi.traverse(made)
-        from unrender.app.capture.mesh import normals
-
         own = normals(local) if local.normals is None else local.normals
-        parameters["vertex_positions"] = np.ravel(local.vertices).astype(np.float32)
-        parameters["vertex_normals"] = np.ravel(own).astype(np.float32)
-        parameters["faces"] = np.ravel(local.faces).astype(np.uint32)
-        parameters.update()
+        made = mesh_layout.build("mesh", local.vertices, local.faces, own)
         self._scene: Any = mi.load_dict({"type": "scene", "mesh": made})
 
     def mask(self, lens: Lens, camera_to_world: np.ndarray) -> np.ndarray:

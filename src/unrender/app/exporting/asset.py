@@ -16,7 +16,7 @@ import numpy as np
 
 from unrender.app.exporting.materials import Material, check_size, read_material
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import turntable_light
+from unrender.rendering.mitsuba import mesh_layout, turntable_light
 from unrender.rendering.mitsuba.description import load
 
 __all__ = ["Asset", "Camera", "Part", "read", "read_environment"]
@@ -127,18 +127,20 @@ def _part(shape: Any, notices: list[str]) -> Part | None:
 
 def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Vertices, faces, normals, texture coordinates."""
-    found: Any = mi.traverse(shape)
-    if "vertex_positions" not in found:  # a rectangle, whose mesh is made when it is rendered
+    found: Any = mesh_layout.traverse(shape)
+    if mesh_layout.POSITIONS not in found:  # a rectangle, whose mesh is made when it is rendered
         corners = np.array([[-1.0, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1], [-1, 1, 0, 1]])
         vertices = corners @ np.array(found["to_world"].matrix, float).reshape(4, 4).T
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
         return vertices[:, :3].astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.uint32), None, uv
-    vertices = np.array(found["vertex_positions"], np.float32).reshape(-1, 3)
-    faces = np.array(found["faces"], np.uint32).reshape(-1, 3)
-    normals = np.array(found["vertex_normals"], np.float32).reshape(-1, 3) if shape.has_vertex_normals() else None
+    vertices = np.array(mesh_layout.vertex_positions(shape), np.float32).reshape(-1, 3)
+    faces = np.array(found[mesh_layout.FACES], np.uint32).reshape(-1, 3)
+    normals = (
+        np.array(found[mesh_layout.NORMALS], np.float32).reshape(-1, 3) if mesh_layout.has_normals(shape) else None
+    )
     if normals is not None:
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    uv = np.array(found["vertex_texcoords"], np.float32).reshape(-1, 2) if shape.has_vertex_texcoords() else None
+    uv = np.array(found[mesh_layout.TEXCOORDS], np.float32).reshape(-1, 2) if mesh_layout.has_texcoords(shape) else None
     return vertices, faces, None if shape.has_face_normals() else normals, uv
 
 

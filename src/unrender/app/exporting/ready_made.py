@@ -17,6 +17,7 @@ import numpy as np
 from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.io.volumes import write_grid
+from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.described import Recorded, recorded_descriptions
 
 __all__ = ["FilesOnly", "as_bitmap", "diffuse_description", "file_name", "make", "write_bitmap"]
@@ -84,7 +85,7 @@ class FilesOnly:
         found: dict[str, Any] = {"type": "ply", "filename": str(path)}
         if mesh.id() and mesh.id() != place[-1]:
             found["id"] = mesh.id()
-        if not mesh.has_vertex_normals():
+        if not mesh_layout.has_normals(mesh):
             found["face_normals"] = True  # or Mitsuba makes some up
         for name, part in (("bsdf", mesh.bsdf()), ("emitter", mesh.emitter())):
             if part is not None:

@@ -22,7 +22,7 @@ from unrender.core import arrays, periodic
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.io import files
-from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba import mesh_layout, poses
 from unrender.rendering.mitsuba.description import load
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
@@ -45,7 +45,7 @@ _FOLDERS = {
 _OF_SCENE = {SCENE, *_FOLDERS.values(), "files"}
 _OWN = {textures.RECORD, textures.TABLE, textures.FOLDER, *_OF_SCENE, *OWN}
 _SPP = 256
-_POSITIONS = "vertex_positions"
+_POSITIONS = mesh_layout.POSITIONS
 _ROUNDING = 1e-4
 
 
@@ -177,9 +177,9 @@ def _fill(
     for key, value in own.items():
         if (mesh := renderer.pair.replaced.get(key.rpartition(".")[0])) is not None and key.endswith(_POSITIONS):
             name = places[key].key.removesuffix(_POSITIONS)
-            graph.live[f"{name}faces"] = mi.UInt32(mesh.faces.ravel().astype(np.uint32))
+            graph.live[f"{name}{mesh_layout.FACES}"] = mi.UInt32(mesh.faces.ravel().astype(np.uint32))
             if mesh.uv is not None:
-                graph.live[f"{name}vertex_texcoords"] = mi.Float(mesh.uv.ravel().astype(np.float32))
+                graph.live[f"{name}{mesh_layout.TEXCOORDS}"] = mi.Float(mesh.uv.ravel().astype(np.float32))
         live = graph.live[places[key].key]
         graph.live[places[key].key] = from_tensor(renderer.array(value), live)
     graph.live.update()

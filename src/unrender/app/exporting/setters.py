@@ -12,6 +12,7 @@ from unrender.app.exporting.graph import Place, SceneGraph
 from unrender.app.exporting.ready_made import BITMAPS, MESHES, VOLUMES, as_bitmap, file_name, write_bitmap
 from unrender.core.errors import InputError
 from unrender.io.volumes import write_grid
+from unrender.rendering.mitsuba import mesh_layout
 
 __all__ = ["store"]
 
@@ -65,7 +66,7 @@ def _mesh(graph: SceneGraph, place: Place, folder: Path) -> None:
     props["filename"] = str(path)
     for name, value in kept.items():
         props[name] = value
-    if mesh.has_face_normals() or not mesh.has_vertex_normals():
+    if mesh.has_face_normals() or not mesh_layout.has_normals(mesh):
         props["face_normals"] = True
 
 

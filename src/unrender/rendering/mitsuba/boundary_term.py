@@ -15,6 +15,7 @@ from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.mesh_layout import POSITIONS
 from unrender.rendering.mitsuba.pixel_filter import is_box
 from unrender.rendering.mitsuba.poses import is_bare
 from unrender.rendering.mitsuba.scene_graph import has_instances
@@ -34,7 +35,7 @@ def moved_shape(scene: LoadedScene, key: str) -> str:
         target = scene.poses.key(key).target
         return "" if is_bare(scene.scene, target) else target
     owner, _, name = key.rpartition(".")
-    return owner if name == "vertex_positions" else ""
+    return owner if name == POSITIONS else ""
 
 
 def obstacles(pair: ScenePair, targets: Iterable[str]) -> dict[str, str]:
@@ -53,7 +54,7 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     if has_instances(pair.current):
         return "boundary derivatives do not know the silhouettes of the scene's instances"
     known = pair.current_parameters
-    if not shape.is_mesh() or not any(f"{target}.{name}" in known for name in ("vertex_positions", "to_world")):
+    if not shape.is_mesh() or not any(f"{target}.{name}" in known for name in (POSITIONS, "to_world")):
         return f"{target} is no mesh ({shape.class_name()}), which boundary derivatives are limited to"
     if shape.is_emitter():
         return "path gradients do not move emitters"
@@ -77,9 +78,9 @@ class BoundaryTerm:
     def __init__(self, pair: ScenePair, moving: Iterable[str], max_depth: int):
         scene = pair.loaded()
         loaded = {
-            mesh.id(): np.array(scene.value(f"{mesh.id()}.vertex_positions"))
+            mesh.id(): np.array(scene.value(f"{mesh.id()}.{POSITIONS}"))
             for mesh in pair.current.shapes()
-            if mesh.is_mesh() and f"{mesh.id()}.vertex_positions" in scene.parameters
+            if mesh.is_mesh() and f"{mesh.id()}.{POSITIONS}" in scene.parameters
         }
         self._integrator = BoundaryIntegrator(EdgeTable(pair.current, set(moving), loaded), max_depth)
         self._resolutions = pair.resolutions

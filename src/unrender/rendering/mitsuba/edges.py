@@ -14,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.rendering.mitsuba import mesh_layout
+
 __all__ = ["EdgePoints", "EdgeTable", "MeshEdges", "edges_of"]
 
 
@@ -81,7 +83,7 @@ class EdgeTable:
             mesh = by_id[name]
             found = edges_of(mesh, (loaded or {}).get(name))
             parts.append((found, first))
-            first += mesh.vertex_count()
+            first += dr.width(mesh_layout.positions(mesh)) // 3
             if name in moving:
                 self.moving += len(found.always)
         ends = np.concatenate([part.ends + offset for part, offset in parts])
@@ -95,7 +97,7 @@ class EdgeTable:
     def positions(self, scene: Any) -> Any:
         """The vertices of all meshes, one behind the other, `mi.Float`; attached where the caller resumes gradients."""
         by_id = {shape.id(): shape for shape in scene.shapes() if shape.is_mesh()}
-        return dr.concat([mi.Float(by_id[name].vertex_positions_buffer()) for name in self._order])
+        return dr.concat([mesh_layout.positions(by_id[name]) for name in self._order])
 
     def at(self, positions: Any, index: Any, active: Any = True) -> EdgePoints:
         """The edges of these numbers."""
@@ -111,8 +113,8 @@ class EdgeTable:
 
 def edges_of(mesh: Any, positions: np.ndarray | None) -> MeshEdges:
     """The edges of a mesh, each once."""
-    points = np.array(mesh.vertex_positions_buffer() if positions is None else positions).reshape(-1, 3)
-    faces = np.array(mesh.faces_buffer()).reshape(-1, 3).astype(np.int64)
+    points = np.array(mesh_layout.positions(mesh) if positions is None else positions).reshape(-1, 3)
+    faces = np.array(mesh_layout.faces(mesh)).reshape(-1, 3).astype(np.int64)
     _, welded = np.unique(points, axis=0, return_inverse=True)
     welded = welded.reshape(-1)
     a, b, c = (points[faces[:, corner]].astype(float) for corner in range(3))
@@ -130,7 +132,7 @@ def edges_of(mesh: Any, positions: np.ndarray | None) -> MeshEdges:
     first = np.flatnonzero(np.r_[True, (names[1:] != names[:-1]).any(axis=1)]) if len(names) else np.zeros(0, np.int64)
     faces_at = np.diff(np.r_[first, len(names)])
     second = first + (faces_at > 1)
-    flat = bool(mesh.has_face_normals() or not mesh.has_vertex_normals())
+    flat = bool(mesh.has_face_normals() or not mesh_layout.has_normals(mesh))
     torn = (ends[first] != ends[second]).any(axis=1)
     thirds = np.stack([thirds[first], thirds[second]], axis=-1)
     return MeshEdges(ends[first], thirds, faces_at != 2, (torn | flat) & (faces_at > 1))

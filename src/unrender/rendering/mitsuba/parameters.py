@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
+from unrender.rendering.mitsuba.mesh_layout import FACES, NORMALS, POSITIONS, TEXCOORDS
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.parameter_errors import Role
 
@@ -33,7 +34,7 @@ _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "Smoot
 _WRAPPERS = {"TwoSidedBRDF"}
 _BENDERS = {"BumpMap", "NormalMap"}
 _MIXED = "its BSDF mixes perfectly specular lobes with others"
-_COMPUTED_OR_FIXED = ("vertex_normals", "vertex_texcoords")
+_COMPUTED_OR_FIXED = (NORMALS, TEXCOORDS)
 _REFUTED = {
     "RoughDielectric": {"alpha", "alpha_u", "alpha_v", "eta"},
     "PrincipledThin": {"roughness", "anisotropic"},
@@ -41,7 +42,7 @@ _REFUTED = {
 """{class of a BSDF: slots whose path gradients disagree with finite differences}."""
 _LIGHT = ("radiance", "intensity", "irradiance")
 _REFLECTANCE = ("reflectance", "diffuse_reflectance", "specular_reflectance", "base_color")
-_DIRECTIONS = ("vertex_normals", "sun_direction", "direction")
+_DIRECTIONS = (NORMALS, "sun_direction", "direction")
 
 _OUTLINES = {
     "BSplineCurve": ("control_points",),
@@ -106,7 +107,7 @@ def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGrap
 
 def _is_attribute(leaf: str) -> bool:
     """Whether a mesh's parameter is an attribute that textures read."""
-    return leaf.startswith(("vertex_", "face_")) and leaf not in ("vertex_positions", *_COMPUTED_OR_FIXED)
+    return leaf.startswith(("vertex_", "face_")) and leaf not in (POSITIONS, *_COMPUTED_OR_FIXED)
 
 
 def _joined(one: ParameterTraits, other: ParameterTraits) -> ParameterTraits:
@@ -211,7 +212,7 @@ def update_obstacle(parameters: mi.SceneParameters, key: str) -> str:
     why = "it changes the outline of a shape that is no mesh, whose derivative has not been shown to be right"
     if leaf == "grid":
         why = "Mitsuba corrupts memory when the distances of an sdfgrid change"
-    return f"{why}; recover a mesh's vertex_positions instead"
+    return f"{why}; recover a mesh's {POSITIONS} instead"
 
 
 def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Role:
@@ -259,10 +260,10 @@ def is_nonlinear(parameters: mi.SceneParameters, key: str, singular: float | Non
 def is_of_vertices(parameters: mi.SceneParameters, key: str) -> bool:
     """Whether a parameter has values at the vertices of a mesh that images depend on: their positions, or an attribute."""
     owner, _, name = key.rpartition(".")
-    return name.startswith("vertex_") and name not in _COMPUTED_OR_FIXED and f"{owner}.faces" in parameters
+    return name.startswith("vertex_") and name not in _COMPUTED_OR_FIXED and f"{owner}.{FACES}" in parameters
 
 
 def normals_key(key: str) -> str:
     """The key of the normals that Mitsuba computes when the parameter `key` changes, "" where it computes none."""
     owner, _, name = key.rpartition(".")
-    return f"{owner}.vertex_normals" if name == "vertex_positions" else ""
+    return f"{owner}.{NORMALS}" if name == POSITIONS else ""

@@ -8,6 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 from unrender.rendering.mitsuba.scene_objects import Holders, children, class_name
 
@@ -105,9 +106,9 @@ KINDS: dict[str, dict[str, Range]] = {
         "focus_distance": _POSITIVE_LENGTH,
     },
     "Shape": {
-        "vertex_positions": _LENGTH,
-        "vertex_normals": Range(-1.0, 1.0, "direction"),
-        "vertex_texcoords": Range(unit="texture coordinates"),
+        mesh_layout.POSITIONS: _LENGTH,
+        mesh_layout.NORMALS: Range(-1.0, 1.0, "direction"),
+        mesh_layout.TEXCOORDS: Range(unit="texture coordinates"),
     },
 }  # fmt: skip
 """{kind of plugin: {slot: range}}, for slots that mean the same in all plugins of a kind."""

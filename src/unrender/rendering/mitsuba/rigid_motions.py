@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba.mesh_layout import NORMALS, POSITIONS
 from unrender.rendering.mitsuba.poses import Pose, PoseKey
 
 __all__ = ["RigidMotions"]
@@ -37,7 +38,7 @@ class RigidMotions:
 
     def _written(self, target: str) -> str:
         """Return the parameter of Mitsuba that places a target, "" where there is none."""
-        for name in ("vertex_positions", "position"):
+        for name in (POSITIONS, "position"):
             if f"{target}.{name}" in self._own:
                 return f"{target}.{name}"
         return f"{target}.to_world" if target in self._worlds else ""
@@ -85,7 +86,7 @@ class RigidMotions:
                 parameters[name] = pose.point(self._own[name])
                 continue
             parameters[name] = dr.ravel(pose.point(dr.unravel(mi.Point3f, self._own[name])))
-            normals = f"{target}.vertex_normals"
+            normals = f"{target}.{NORMALS}"
             if dr.width(self._own.get(normals, 0)) == dr.width(self._own[name]):
                 turned[normals] = dr.ravel(pose.matrix @ dr.unravel(mi.Vector3f, self._own[normals]))
         parameters.update()

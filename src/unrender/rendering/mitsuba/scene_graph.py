@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.rendering.mitsuba import mesh_layout
 
 __all__ = ["ObjectGraph", "all_shapes", "has_instances", "object_ids"]
 
@@ -48,7 +49,7 @@ class ObjectGraph:
 
     def parameters(self) -> mi.SceneParameters:
         """Return what `mitsuba.traverse` returns. A texture of the scene itself has the name of its first use in a material or light."""
-        return mi.SceneParameters(self.properties, self.hierarchy)
+        return mesh_layout.parameters(self.properties, self.hierarchy)
 
     def notify_other_owners(self, node: Any) -> None:
         """Have every owner of a shared object that changed update itself. Mitsuba updates those of its first place alone."""

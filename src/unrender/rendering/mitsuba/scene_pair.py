@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import emissive, film, scene_loading
+from unrender.rendering.mitsuba import emissive, film, mesh_layout, scene_loading
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
 from unrender.rendering.mitsuba.emitter_tables import emitter_tables
 from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_ellipsoids
@@ -199,7 +199,7 @@ class ScenePair:
                 "triangles": mi.UInt32(triangles),
                 "emitters": self._emitter_bounds(moving),
             }
-        positions = [[dr.detach(of.vertex_positions_buffer()) for of in states] for states in meshes]
+        positions = [[dr.detach(mesh_layout.positions(of)) for of in states] for states in meshes]
         # The same memory, which nobody can have written to since it is referenced here, has the same tables.
         indices = [[of.index for of in states] for states in positions]
         if self._moved_values is None or self._moved_values[0] != indices:
@@ -376,15 +376,17 @@ class ScenePair:
             singular=limits.singular,
             resizable=self._resizable(key, shape),
             mesh=partial(self._mesh, key) if is_of_vertices(self.current_parameters, key) else None,
-            welded=key.endswith(".vertex_positions"),
+            welded=key.endswith(f".{mesh_layout.POSITIONS}"),
         )
 
     def _mesh(self, key: str) -> tuple[np.ndarray, np.ndarray]:
         """The mesh at whose vertices a parameter has values, as loaded."""
-        owner = key.rpartition(".")[0]
-        faces = self.current_parameters[f"{owner}.faces"]
-        positions = self._current.value(f"{owner}.vertex_positions").numpy()
-        return positions.reshape(-1, 3), np.array(faces).reshape(-1, 3).astype(np.int64)
+        owner, _, name = key.rpartition(".")
+        mesh = self.current_parameters.properties[key][2]
+        moved = name == mesh_layout.POSITIONS
+        faces = mesh_layout.faces(mesh) if moved else self.current_parameters[f"{owner}.{mesh_layout.FACES}"]
+        points = self._current.value(key) if moved else mesh_layout.vertex_positions(mesh)
+        return points.numpy().reshape(-1, 3), np.array(faces).reshape(-1, 3).astype(np.int64)
 
     def _resizable(self, key: str, shape: tuple[int, ...]) -> bool:
         """Whether it is the data of a bitmap texture or a grid volume: these take another resolution when they are updated."""
@@ -395,6 +397,6 @@ class ScenePair:
 
 def _areas(mesh: Any) -> Any:
     """Twice the area of each of a mesh's triangles."""
-    corners = dr.unravel(mi.Point3u, mesh.faces_buffer())
-    a, b, c = (dr.gather(mi.Point3f, mesh.vertex_positions_buffer(), corner) for corner in corners)
+    corners = dr.unravel(mi.Point3u, mesh_layout.faces(mesh))
+    a, b, c = (dr.gather(mi.Point3f, mesh_layout.positions(mesh), corner) for corner in corners)
     return dr.norm(dr.cross(b - a, c - a))

@@ -9,13 +9,14 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
 __all__ = ["meshed", "moving_targets"]
 
 _ROWS, _COLUMNS = 64, 128
 """Of the mesh: its silhouette is within a 1700th of the radius of the sphere's."""
-_PARTS = ("translation", "rotation", "scale", "vertex_positions")
+_PARTS = ("translation", "rotation", "scale", mesh_layout.POSITIONS)
 
 
 def moving_targets(keys: Iterable[str]) -> frozenset[str]:
@@ -81,18 +82,8 @@ def _mesh(sphere: Any) -> Any:
     outwards = np.array(sample.p).reshape(-1) - matrix[:3, 3]
     if outwards @ np.array(sample.n).reshape(-1) < 0:  # `flip_normals`
         normals, faces = -normals, faces[:, ::-1]
-    properties = mi.Properties()
-    properties["bsdf"] = sphere.bsdf()
-    mesh = mi.Mesh(sphere.id(), len(points), len(faces), properties, has_vertex_normals=True, has_vertex_texcoords=True)
-    mesh.set_id(sphere.id())
-    parameters = mi.traverse(mesh)
-    for name, values in (("vertex_positions", points), ("vertex_texcoords", np.stack([u, v], -1))):
-        parameters[name] = mi.Float(values.ravel().astype(np.float32))
-    parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
-    parameters.update()
-    # In a second update: Mitsuba computes normals anew whenever positions change.
-    parameters["vertex_normals"] = mi.Float(
-        (normals / np.linalg.norm(normals, axis=1, keepdims=True)).ravel().astype(np.float32)
-    )
-    parameters.update()
-    return mesh
+    return mesh_layout.build(sphere.id(), points, faces, _unit(normals), np.stack([u, v], -1), sphere.bsdf())
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

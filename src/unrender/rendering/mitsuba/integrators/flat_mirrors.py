@@ -9,10 +9,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 
 __all__ = ["FlatMirrors", "MirroredView", "glossy_radiance", "is_glossy"]
-
 
 _NEAR = 1e-3
 """Share of a distance within which nothing occludes."""
@@ -132,8 +132,8 @@ def _is_flat_mirror(si: Any) -> Any:
 
 def _planes(mesh: Any) -> list[np.ndarray]:
     """Normal and height (4,) of the planes of a mesh's faces; none of one that is not made of a few flat sides."""
-    points = np.array(mesh.vertex_positions_buffer(), float).reshape(-1, 3)
-    faces = np.array(mesh.faces_buffer()).reshape(-1, 3).astype(np.int64)
+    points = np.array(mesh_layout.positions(mesh), float).reshape(-1, 3)
+    faces = np.array(mesh_layout.faces(mesh)).reshape(-1, 3).astype(np.int64)
     if len(faces) > 2 * _PLANES:
         return []
     a, b, c = (points[faces[:, k]] for k in range(3))

@@ -1,0 +1,190 @@
+"""The one place that knows how Mitsuba lays out a mesh.
+
+Up to Mitsuba 3.9 a mesh has flat arrays: `vertex_positions` (3 V,), `vertex_normals` (3 V,), `vertex_texcoords` (2 V,) and `faces` (3 F,).
+From 3.10 on it has tensors: `positions` (P, 3), `normals` (N, 3), `texcoords` (V, 2) and `faces` (F, 3), with maps from vertices to
+positions and normals, so that vertices on both sides of a seam share a position. In this package keys and values are those of 3.9:
+`parameters` and `traverse` translate both, and the functions below read what a mesh has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+__all__ = [
+    "FACES",
+    "NORMALS",
+    "POSITIONS",
+    "TEXCOORDS",
+    "build",
+    "faces",
+    "has_normals",
+    "has_texcoords",
+    "parameters",
+    "positions",
+    "traverse",
+    "vertex_positions",
+]
+
+POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
+_RENAMED = {"positions": POSITIONS, "normals": NORMALS, "texcoords": TEXCOORDS}
+"""{name from Mitsuba 3.10 on: name here}."""
+
+
+def _has_tensors(mesh: Any) -> bool:
+    """Return whether a mesh, or the class of meshes, has the layout of Mitsuba 3.10."""
+    return "geometric_faces" in dir(mesh)
+
+
+# ------------------------------------------------------------------ parameters
+
+
+def traverse(node: Any) -> Any:
+    """Return `mitsuba.traverse(node)` with the names and flat arrays of this package."""
+    found: Any = mi.traverse(node)
+    return parameters(found.properties, found.hierarchy)
+
+
+def parameters(properties: dict[str, Any], hierarchy: dict[Any, Any]) -> Any:
+    """Return the `mitsuba.SceneParameters` of traversed objects, with the names and flat arrays of this package.
+
+    Args:
+        properties, hierarchy: of `mitsuba.SceneParameters`.
+    """
+    named: dict[Any, set[str]] = {}
+    for key, entry in properties.items():
+        named.setdefault(entry[2], set()).add(key.rpartition(".")[2])
+    meshes = {node for node, names in named.items() if {"positions", FACES} <= names}
+    return _flat(mi.variant())(properties, hierarchy, meshes) if meshes else mi.SceneParameters(properties, hierarchy)
+
+
+@cache
+def _flat(_variant: str) -> type:
+    """Return the class for the layout of Mitsuba 3.10: its base class exists only under a variant."""
+
+    class FlatMeshes(mi.SceneParameters):
+        """Scene parameters in which the tensors of meshes are flat arrays."""
+
+        def __init__(self, properties: Mapping[str, Any], hierarchy: dict[Any, Any], meshes: set[Any]):
+            self.originals: dict[str, str] = {}
+            renamed = {}
+            for key, entry in properties.items():
+                owner, dot, leaf = key.rpartition(".")
+                if entry[2] in meshes:
+                    key = f"{owner}{dot}{_RENAMED.get(leaf, leaf)}"
+                    self.originals[key] = leaf
+                renamed[key] = entry
+            super().__init__(renamed, hierarchy)
+
+        def __getitem__(self, key: str) -> Any:
+            value: Any = super().__getitem__(key)
+            return value.array if self._is_flat(key, value) else value
+
+        def __setitem__(self, key: str, value: Any) -> None:
+            held: Any = super().__getitem__(key)
+            if self._is_flat(key, held) and not dr.is_tensor_v(value):
+                width = held.shape[1]
+                value = type(held)(type(held.array)(value), (dr.width(value) // width, width))
+            super().__setitem__(key, value)
+
+        def set_dirty(self, key: str) -> Any:
+            """Mark a parameter as changed, to the mesh by the mesh's own name."""
+            entry = super().set_dirty(key)
+            if key in self.originals:
+                node = entry[2]
+                names = self.nodes_to_update[self.hierarchy[node][1], node]
+                names.discard(key.rpartition(".")[2])
+                names.add(self.originals[key])
+            return entry
+
+        def _is_flat(self, key: str, value: Any) -> bool:
+            return key in self.originals and dr.is_tensor_v(value) and value.ndim == 2
+
+    return FlatMeshes
+
+
+# ------------------------------------------------------------------ meshes
+
+
+def positions(mesh: Any) -> Any:
+    """Return the positions of a mesh, flat, `mi.Float` (3 P,), with their derivatives."""
+    return mi.Float(mesh.positions().array if _has_tensors(mesh) else mesh.vertex_positions_buffer())
+
+
+def faces(mesh: Any) -> Any:
+    """Return the numbers of the positions that each triangle joins, flat, `mi.UInt32` (3 F,)."""
+    return mi.UInt32(mesh.geometric_faces().array if _has_tensors(mesh) else mesh.faces_buffer())
+
+
+def vertex_positions(mesh: Any) -> Any:
+    """Return the position of each vertex, flat, `mi.Float` (3 V,): vertices on both sides of a seam may share one."""
+    if not _has_tensors(mesh) or not len(mesh.position_index()):
+        return positions(mesh)
+    return dr.ravel(dr.gather(mi.Point3f, positions(mesh), mi.UInt32(mesh.position_index())))
+
+
+def has_normals(mesh: Any) -> bool:
+    """Return whether a mesh has normals at its vertices."""
+    return bool(mesh.has_normals() if _has_tensors(mesh) else mesh.has_vertex_normals())
+
+
+def has_texcoords(mesh: Any) -> bool:
+    """Return whether a mesh has texture coordinates at its vertices."""
+    return bool(mesh.has_texcoords() if _has_tensors(mesh) else mesh.has_vertex_texcoords())
+
+
+def build(
+    name: str,
+    points: np.ndarray,
+    triangles: np.ndarray,
+    normals: np.ndarray | None = None,
+    texcoords: np.ndarray | None = None,
+    bsdf: Any = None,
+) -> Any:
+    """Return a new mesh with smooth normals.
+
+    Args:
+        name: its id.
+        points: (V, 3).
+        triangles: (F, 3), numbers of vertices.
+        normals: (V, 3); None for those that Mitsuba computes.
+        texcoords: (V, 2); None for none.
+        bsdf: `mitsuba.BSDF`; None for Mitsuba's own.
+    """
+    given = {
+        POSITIONS: np.ascontiguousarray(points, np.float32),
+        NORMALS: None if normals is None else np.ascontiguousarray(normals, np.float32),
+        TEXCOORDS: None if texcoords is None else np.ascontiguousarray(texcoords, np.float32),
+    }
+    corners = np.ascontiguousarray(triangles, np.uint32)
+    if _has_tensors(mi.Mesh):
+        tensors = {new: mi.TensorXf(given[old]) for new, old in _RENAMED.items() if given[old] is not None}
+        mesh: Any = mi.Mesh(name, faces=mi.TensorXu(corners), **tensors)  # pyright: ignore[reportCallIssue]
+        if bsdf is not None:
+            mesh.set_bsdf(bsdf)
+    else:
+        properties = mi.Properties()
+        if bsdf is not None:
+            properties["bsdf"] = bsdf
+        textured = texcoords is not None
+        mesh = mi.Mesh(
+            name, len(points), len(corners), properties, has_vertex_normals=True, has_vertex_texcoords=textured
+        )
+        _fill(mesh, {FACES: corners, POSITIONS: given[POSITIONS], TEXCOORDS: given[TEXCOORDS]})
+        # In a second update: Mitsuba computes normals anew whenever positions change.
+        _fill(mesh, {NORMALS: given[NORMALS]})
+    mesh.set_id(name)
+    return mesh
+
+
+def _fill(mesh: Any, values: Mapping[str, np.ndarray | None]) -> None:
+    found: Any = mi.traverse(mesh)
+    for name, value in values.items():
+        if value is not None:
+            found[name] = (mi.UInt32 if name == FACES else mi.Float)(value.ravel())
+    found.update()
