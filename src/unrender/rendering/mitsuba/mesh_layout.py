@@ -21,6 +21,8 @@ __all__ = [
     "NORMALS",
     "POSITIONS",
     "TEXCOORDS",
+    "areas",
+    "at_vertices",
     "build",
     "faces",
     "has_normals",
@@ -121,11 +123,22 @@ def faces(mesh: Any) -> Any:
     return mi.UInt32(mesh.geometric_faces().array if _has_tensors(mesh) else mesh.faces_buffer())
 
 
-def vertex_positions(mesh: Any) -> Any:
-    """Return the position of each vertex, flat, `mi.Float` (3 V,): vertices on both sides of a seam may share one."""
-    if not _has_tensors(mesh) or not len(mesh.position_index()):
-        return positions(mesh)
-    return dr.ravel(dr.gather(mi.Point3f, positions(mesh), mi.UInt32(mesh.position_index())))
+def at_vertices(mesh: Any, points: np.ndarray) -> np.ndarray:
+    """Return the position of each vertex, (V, 3), for positions (P, 3): vertices on both sides of a seam may share one."""
+    index = np.array(mesh.position_index()) if _has_tensors(mesh) else np.zeros(0, np.uint32)
+    return points[index] if index.size else points
+
+
+def vertex_positions(mesh: Any) -> np.ndarray:
+    """Return the position of each vertex, (V, 3)."""
+    return at_vertices(mesh, np.array(positions(mesh)).reshape(-1, 3))
+
+
+def areas(mesh: Any) -> Any:
+    """Return twice the area of each triangle of a mesh, (F,)."""
+    corners = dr.unravel(mi.Point3u, faces(mesh))
+    a, b, c = (dr.gather(mi.Point3f, positions(mesh), corner) for corner in corners)
+    return dr.norm(dr.cross(b - a, c - a))
 
 
 def has_normals(mesh: Any) -> bool:

@@ -204,7 +204,7 @@ class ScenePair:
         indices = [[of.index for of in states] for states in positions]
         if self._moved_values is None or self._moved_values[0] != indices:
             with dr.suspend_grad():
-                ratios = [_areas(before) / _areas(now) for now, before in meshes]
+                ratios = [mesh_layout.areas(before) / mesh_layout.areas(now) for now, before in meshes]
                 found = {"area_ratios": dr.concat([mi.Float(1), *ratios]), "ellipsoids": bounding_ellipsoids(positions)}
             dr.eval(found)
             self._moved_values = indices, positions, found
@@ -385,18 +385,13 @@ class ScenePair:
         mesh = self.current_parameters.properties[key][2]
         moved = name == mesh_layout.POSITIONS
         faces = mesh_layout.faces(mesh) if moved else self.current_parameters[f"{owner}.{mesh_layout.FACES}"]
-        points = self._current.value(key) if moved else mesh_layout.vertex_positions(mesh)
-        return points.numpy().reshape(-1, 3), np.array(faces).reshape(-1, 3).astype(np.int64)
+        points = self._current.value(f"{owner}.{mesh_layout.POSITIONS}").numpy().reshape(-1, 3)
+        return points if moved else mesh_layout.at_vertices(mesh, points), np.array(faces).reshape(-1, 3).astype(
+            np.int64
+        )
 
     def _resizable(self, key: str, shape: tuple[int, ...]) -> bool:
         """Whether it is the data of a bitmap texture or a grid volume: these take another resolution when they are updated."""
         node = self.current_parameters.properties[key][2]
         axes = 4 if isinstance(node, mi.Volume) else 3 if isinstance(node, mi.Texture) else 0
         return key.endswith("data") and len(shape) == axes
-
-
-def _areas(mesh: Any) -> Any:
-    """Twice the area of each of a mesh's triangles."""
-    corners = dr.unravel(mi.Point3u, mesh_layout.faces(mesh))
-    a, b, c = (dr.gather(mi.Point3f, mesh_layout.positions(mesh), corner) for corner in corners)
-    return dr.norm(dr.cross(b - a, c - a))
