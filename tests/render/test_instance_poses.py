@@ -13,6 +13,7 @@ from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
 RUNS, SPP = 12, 64
+render: Any = mi.render
 SHIFT, TURN = np.array([0.1, 0.05, -0.1], np.float32), np.array([0.0, 0.4, 0.0], np.float32)
 
 
@@ -75,10 +76,10 @@ def test_pictures_of_posed_objects_beside_instances_are_those_of_the_moved_scene
     path = mi.load_dict({"type": "path", "max_depth": 3, "rr_depth": 100})
     for state, description in enumerate((scene(), scene(target, motion(target)))):
         loaded = mi.load_dict(description)
-        stock = [np.array(mi.render(loaded, integrator=path, spp=SPP, seed=100 + n)) for n in range(RUNS)]
+        stock = [np.array(render(loaded, integrator=path, spp=SPP, seed=100 + n)) for n in range(RUNS)]
         assert difference(np.stack([images[state] for images in batches]), np.stack(stock)) < 6
     planted = mi.load_dict(scene(target, mi.ScalarTransform4f().translate([0.3, 0, 0]) @ motion(target)))
-    stock = [np.array(mi.render(planted, integrator=path, spp=SPP, seed=100 + n)) for n in range(RUNS)]
+    stock = [np.array(render(planted, integrator=path, spp=SPP, seed=100 + n)) for n in range(RUNS)]
     assert difference(np.stack([images[1] for images in batches]), np.stack(stock)) > 6
 
 
