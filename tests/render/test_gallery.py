@@ -225,7 +225,7 @@ def test_what_is_unknown(small):
 
 def test_truth_and_start_lie_inside_the_bounds_and_differ(small):
     for key, start in ur.gallery.problem(small.name, **SMALL | {"reference_spp": 1}).initial().items():
-        truth, (low, high) = small.truth[key], small.bounds[key]
+        truth, (low, high) = small.truth[key], small.unknowns[key].bounds
         assert low is not None
         for values in (truth, start.numpy()):
             assert np.all(values >= low)
@@ -391,7 +391,7 @@ def start_of(problem: ur.Problem) -> np.ndarray:
 def test_poses_are_counted_from_the_truth(posed):
     assert [parameter.key for parameter in posed.parameters] == POSES[posed.name]
     assert {key: value.tolist() for key, value in posed.truth.items()} == dict.fromkeys(POSES[posed.name], 0.0)
-    for key, (low, high) in posed.bounds.items():
+    for key, (low, high) in ((key, unknown.bounds) for key, unknown in posed.unknowns.items()):
         for value in (0.0, float(np.asarray(posed.initial()[key]).item())):
             assert low is None or low < value
             assert high is None or value < high
