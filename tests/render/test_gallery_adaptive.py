@@ -122,7 +122,7 @@ def test_what_is_unknown_has_gradients_and_is_carried(small):
 
 def test_truth_and_start_lie_inside_the_bounds_and_differ(small):
     for key, start in start_of(small).items():
-        low, high = small.bounds[key]
+        low, high = small.unknowns[key].bounds
         assert low is not None
         assert high is not None
         for values in (small.truth[key], start):

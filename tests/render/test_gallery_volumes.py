@@ -40,7 +40,7 @@ def test_what_is_unknown(small):
     assert {key: value.shape for key, value in small.truth.items()} == UNKNOWN[small.name]
     assert small.notices == []
     for key, start in small.initial().items():
-        low, high = small.bounds[key]
+        low, high = small.unknowns[key].bounds
         for values in (small.truth[key], start.numpy()):
             assert np.all(values >= low)
             assert high is None or np.all(values <= high)
