@@ -119,7 +119,7 @@ def test_unknowns_by_choice_are_parameters_of_the_scene(unrender: Unrender, capt
         "light.data": (16, 34, 3),
         "exposure": (7, 3),
     }
-    assert problem.unknowns["asset.vertex_positions"].preconditioner.strength == 20  # pyright: ignore[reportAttributeAccessIssue]
+    assert problem.unknowns["asset.vertex_positions"].preconditioner.strength == 20  # pyright: ignore
     held_out = ur.Problem.from_file("asset/held-out.toml")
     assert [*held_out.initial_values(), "exposure"] == list(problem.initial_values())
     # The band counts a tenth, in training views alone.

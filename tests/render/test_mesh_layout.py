@@ -34,7 +34,7 @@ def new_mesh() -> Any:
                 "positions": mi.TensorXf(POINTS),
                 "normals": mi.TensorXf(np.tile(np.array([0, 0, 1], np.float32), (6, 1))),
                 "texcoords": mi.TensorXf(np.linspace(0, 1, 12, dtype=np.float32).reshape(6, 2)),
-                "faces": mi.TensorXu(CORNERS),
+                "faces": mi.TensorXu(CORNERS),  # pyright: ignore[reportCallIssue]
                 "position_index": mi.UInt32(INDEX),
                 "vertex_color": mi.TensorXf(np.linspace(0, 1, 18, dtype=np.float32).reshape(6, 3)),
             }
@@ -52,7 +52,7 @@ def new_mesh() -> Any:
             return self.held["positions"]
 
         def geometric_faces(self) -> Any:
-            return mi.TensorXu(INDEX[CORNERS.ravel()].reshape(-1, 3))
+            return mi.TensorXu(INDEX[CORNERS.ravel()].reshape(-1, 3))  # pyright: ignore[reportCallIssue]
 
         def position_index(self) -> Any:
             return self.held["position_index"]
