@@ -34,8 +34,10 @@ def _registered() -> Iterator[Any]:
     while missing < _LONGEST_GAP:
         pointer: Any = dr.reinterpret_array(mi.SensorPtr, mi.UInt32(number))  # pyright: ignore[reportAttributeAccessIssue]
         try:
-            yield pointer[0]
-            missing = 0
-        except RuntimeError:  # no object has that id
-            missing += 1
+            sensor = pointer[0]
+        except RuntimeError:
+            sensor = None
+        if sensor is not None:  # an object has that id
+            yield sensor
+        missing = 0 if sensor is not None else missing + 1
         number += 1
