@@ -24,8 +24,6 @@ from unrender.estimators.capabilities import (
 from unrender.parameterisations.base import Transform
 from unrender.scene.problem import Problem
 
-__all__ = ["by_coordinates", "regularized", "restricted"]
-
 
 def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
     """The estimate by v, where x = φ(u) and u = S v (`problem.coordinates`); itself where it is by v already.

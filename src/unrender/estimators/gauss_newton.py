@@ -22,8 +22,6 @@ from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["GaussNewton", "GaussNewtonState", "explained"]
-
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Of the widths: passes of their own before the first estimate, and factors by which a width changes at most, there and later."""
 _VALUES = 1 << 22

@@ -23,8 +23,6 @@ from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler, restarted, upsampled
 
-__all__ = ["HybridGradient", "HybridState", "beyond_paths"]
-
 _PERTURBED = 1 << 33
 """The stream of a step's key that draws the perturbed renders; path gradients have those below."""
 

@@ -18,8 +18,6 @@ from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 
-__all__ = ["BlackBox", "LossState", "LossValues"]
-
 
 @dataclass(frozen=True)
 class LossState:

@@ -31,8 +31,6 @@ from unrender.rendering.renderer import with_differential_bsdf
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler, upsampled
 
-__all__ = ["PathGradient", "PathGradientState"]
-
 _EMITTERS = PIXELS + 1
 """The stream of a step's key that chooses emitters' tangents."""
 

@@ -13,8 +13,6 @@ from unrender.core.trees import Tree
 from unrender.preconditioners.base import Preconditioner
 from unrender.scene.problem import Problem
 
-__all__ = ["PreconditionedPerturbations"]
-
 _PROBES = 4
 """Draws that tell how much S shrinks white noise: of a thousand vertices, to 5 percent or less."""
 

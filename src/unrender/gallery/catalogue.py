@@ -14,8 +14,6 @@ from unrender.gallery.fields import Option
 from unrender.gallery.specification import ProblemSource, build_problem
 from unrender.scene.problem import Problem
 
-__all__ = ["names", "options", "problem", "summary"]
-
 _KIND = "gallery problem"
 
 

@@ -20,8 +20,6 @@ from unrender.optimizers.base import Optimizer
 from unrender.scene.problem import Problem
 from unrender.schedules.functions import Schedule
 
-__all__ = ["SCHEDULE_HELP", "Method", "Options", "method", "methods", "parameterised", "parse_schedule"]
-
 SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
 
 

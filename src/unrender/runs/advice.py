@@ -8,8 +8,6 @@ from unrender.optimizers.base import Optimizer
 from unrender.optimizers.meta_adam import MetaAdam
 from unrender.scene.problem import Problem
 
-__all__ = ["remarks"]
-
 _LARGEST_STEP = 0.5
 """Of a bounded parameter's range: a first step that is longer leads from anywhere in it to a bound."""
 

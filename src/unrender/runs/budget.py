@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from unrender.runs.loop import Descent
     from unrender.runs.run import Run
 
-__all__ = ["Budget", "check_budget", "last_step"]
-
 _MOST_SKIPPED = 20
 _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning says so, and the steps whose time tells it."""
@@ -31,14 +29,12 @@ class Budget(Hook):
     """Stops a run that has used up its steps or seconds, or whose last twenty steps were not finite."""
 
     def on_start(self, descent: Descent) -> None:
-        """See `Hook.on_start`."""
         run = descent.run
         if run.last_step is not None and run.seconds is not None:
             run.last_step = max(run.last_step, time.perf_counter() + _LEAST_SHARE * run.seconds)
         self._check(descent)
 
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
-        """See `Hook.on_update`."""
         del estimate, applied
         self._check(descent)
 

@@ -15,8 +15,6 @@ from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import render
 
-__all__ = ["Change", "common_factor", "undetermined", "undetermined_cells"]
-
 _LEAST = 0.005
 """Change of the pictures, relative to themselves, below which a parameter counts as undetermined over its whole range."""
 _FACTOR = 1.25

@@ -18,17 +18,6 @@ from unrender.runs.run import Run
 from unrender.scene.fingerprint import fingerprint
 from unrender.scene.problem import Problem
 
-__all__ = [
-    "RunAnnotations",
-    "RunMetadata",
-    "describe",
-    "describe_run",
-    "fingerprint_of",
-    "first_values",
-    "recorded_measures",
-    "to_numpy",
-]
-
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 

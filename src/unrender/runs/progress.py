@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.runs.run import Run
 
-__all__ = ["Progress"]
-
 _BAR_SECONDS = 0.1
 _LINE_SECONDS = 2.0
 _SMOOTHING = 0.1
@@ -100,14 +98,12 @@ class Progress(Callback):
     # ------------------------------------------------------------------ steps
 
     def on_start(self, run: Run) -> None:
-        """See `Callback.on_start`."""
         self._started, self._before, self._shown = time.perf_counter(), run.progress(), 0.0
         self._loss, self._error, self._told = None, {}, len(run.warnings)
         if self._console.is_terminal:
             self._open("", 1.0)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
         loss = record["loss"]
         if math.isfinite(loss):
             self._loss = loss if self._loss is None else self._loss + _SMOOTHING * (loss - self._loss)
@@ -128,7 +124,6 @@ class Progress(Callback):
             self._print(self._line(run, record))
 
     def on_end(self, run: Run, result: Result) -> None:
-        """See `Callback.on_end`."""
         del run, result
         self._close()
 

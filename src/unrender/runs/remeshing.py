@@ -22,8 +22,6 @@ from unrender.scene.upsampling import restarted
 if TYPE_CHECKING:
     from unrender.runs.loop import Descent
 
-__all__ = ["MeshRefinement", "remeshed"]
-
 
 def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
     """Return the same problem with other meshes, {key of vertex positions: mesh}, which are also where these parameters start.
@@ -65,7 +63,6 @@ class MeshRefinement(Hook):
         self._made: dict[str, int] = {}
 
     def before_step(self, descent: Descent) -> None:
-        """See `Hook.before_step`."""
         run, state = descent.run, descent.state
         ways = {key: unknown.remeshing for key, unknown in run.problem.unknowns.items()}
         due = {key: way for key, way in ways.items() if way is not None and run.step in way.steps}
@@ -99,7 +96,6 @@ class MeshRefinement(Hook):
         descent.log.warmup_seconds += time.perf_counter() - started + descent.warm_up()[0]
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
-        """See `Hook.on_step`."""
         if self._made:
             record["faces"] = dict(self._made)
             self._made = {}

@@ -22,8 +22,6 @@ from unrender.runs.resume import load_run, resume_run
 from unrender.scene import serialization
 from unrender.scene.problem import Problem
 
-__all__ = ["problem_of", "resume", "with_meshes"]
-
 _LONGEST = 1 << 24
 
 

@@ -24,17 +24,6 @@ from unrender.runs.noise import GradientNoise
 from unrender.runs.result import INTERRUPTED, TERMINATED
 from unrender.scene.problem import Problem
 
-__all__ = [
-    "SNAPSHOT_COUNTS",
-    "Candidate",
-    "Run",
-    "RunState",
-    "interruptible",
-    "restore",
-    "snapshot",
-    "terminate_if_told",
-]
-
 
 @dataclass
 class Run:

@@ -16,8 +16,6 @@ from unrender.rendering.renderer import RenderSession
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, view_request
 
-__all__ = ["around", "hardly_seen", "seen_cells", "sensitivity"]
-
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 _MAP_AXES = 3
 _HARDLY = 0.05

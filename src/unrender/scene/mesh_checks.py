@@ -15,8 +15,6 @@ from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.remeshing import Remeshing
 from unrender.scene.surfaces import Surface, area_normals
 
-__all__ = ["check_regularizer", "check_remeshing", "check_self_intersection", "check_surfaces", "mesh_notices"]
-
 _NO_MESH = "expected none: it is of the vertex positions of a mesh"
 
 _Mesh = tuple[np.ndarray, np.ndarray]

@@ -12,8 +12,6 @@ from unrender.display.pictures import shown_image, shown_map
 if TYPE_CHECKING:
     from unrender.scene.problem import Problem
 
-__all__ = ["describe_views", "html", "line"]
-
 _VIEWS, _MAPS = 4, 3
 
 

@@ -16,8 +16,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.remeshing import Remeshing
 from unrender.scene.surfaces import Surface, surface_error
 
-__all__ = ["Unknown"]
-
 
 @dataclass(frozen=True, eq=False)
 class Unknown:

@@ -32,21 +32,6 @@ from unrender.scene.mesh_checks import check_regularizer, check_remeshing, check
 from unrender.scene.parameter import Parameter, ParameterSettings
 from unrender.scene.unknown import Unknown
 
-__all__ = [
-    "check_loss",
-    "check_loss_function",
-    "check_max_depth",
-    "check_parameter",
-    "check_sequence",
-    "check_truth",
-    "configure",
-    "is_number",
-    "mesh_topology",
-    "open_renderer",
-    "renderer_notices",
-    "texture_coordinates",
-]
-
 _DEEPEST = 1 << 20
 _LONGEST_KEY = 200
 _SHORTEST_NORMAL = 0.1

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from unrender.scene.problem import Problem
 
-__all__ = ["gallery"]
-
 _SPP = 64
 
 

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from unrender.runs.result import Result
     from unrender.scene.problem import Problem
 
-__all__ = ["conclude", "exit_status", "run"]
-
 
 _MethodName = Annotated[
     str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")

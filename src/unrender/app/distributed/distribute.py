@@ -19,8 +19,6 @@ from unrender.backend.variant import check_threads
 from unrender.core.errors import InputError
 from unrender.scene.problem import Problem
 
-__all__ = ["distribute"]
-
 _log = logging.getLogger("unrender")
 _LEAST_STORE = 256 << 20
 _GRADIENTS, _DOUBLE, _SLACK = 3, 8, 1.5

@@ -36,8 +36,6 @@ from unrender.pixels.pixel_statistics import PilotRequest
 from unrender.runs.folder.state import pack, unpack
 from unrender.scene.problem import Problem
 
-__all__ = ["DistributedExecutor", "Traffic"]
-
 _MOST_LOSSES = 5
 """Times that shares may be lost in one step."""
 _PICTURES_EVERY = 25

@@ -12,8 +12,6 @@ from unrender.methods.rules.constants import CONSTANTS, Constants
 from unrender.scene.bounds import MARGIN
 from unrender.scene.problem import Problem
 
-__all__ = ["first_rates", "logarithms"]
-
 _ALBEDO, _EXTINCTION, _NORMALS = ".albedo.", ".sigma_t.", ".normalmap."
 """Parts of keys: of a medium's grids, and of a normal map."""
 _TEXELS = ".data"

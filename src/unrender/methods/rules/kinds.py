@@ -17,8 +17,6 @@ from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.parameter import ParameterSettings
 from unrender.schedules import InverseRoot
 
-__all__ = ["KINDS", "Part"]
-
 _GRID = 4
 """Dimensions of a grid, (Z, Y, X, C)."""
 

@@ -27,8 +27,6 @@ from unrender.rendering.partial import PartialDerivatives
 from unrender.scene.parameter import ParameterSettings
 from unrender.schedules import Exponential
 
-__all__ = ["paths", "paths_and_perturbed", "perturbed"]
-
 
 def paths_and_perturbed(traits: Traits) -> Plan | None:
     """Return path gradients beside perturbed renders of what they do not reach; None where they reach all, or nothing."""

@@ -13,8 +13,6 @@ from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
 
-__all__ = ["CameraPaths", "Kernel", "Tables", "dropped_together", "is_finite"]
-
 Kernel = PathPair | VolumePair | PrbKernel
 """What traces paths."""
 

@@ -18,8 +18,6 @@ from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.renderer import PictureFormat, Rendering, SampleRequest
 from unrender.rendering.wrapper import SessionWrapper
 
-__all__ = ["LuminanceSession", "formats"]
-
 _COLOURS = {"y": "luminance", "ya": "luminance", "xyz": "xyz", "xyza": "xyz"}
 _WEIGHTS = (0.212671, 0.715160, 0.072169)
 """Of red, green and blue in `mitsuba.luminance`."""

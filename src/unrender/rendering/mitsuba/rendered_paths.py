@@ -14,8 +14,6 @@ from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.camera_paths import is_finite
 from unrender.rendering.renderer import SampleRequest, Space
 
-__all__ = ["DroppedSamples", "Paths"]
-
 
 @dataclass(frozen=True)
 class Paths:

@@ -38,8 +38,6 @@ from unrender.rendering.renderer import (
     differentiated,
 )
 
-__all__ = ["MitsubaRenderer", "StockSession"]
-
 
 class MitsubaRenderer:
     """A Mitsuba scene, held twice (current and previous state), with path replay gradients.
@@ -114,11 +112,9 @@ class MitsubaRenderer:
         return self.pair.resolutions
 
     def formats(self) -> list[PictureFormat]:
-        """See `WithFormats.formats`."""
         return self._formats
 
     def cameras(self) -> Mapping[int, Camera]:
-        """See `WithCameras.cameras`."""
         found = {}
         for index, sensor in enumerate(self.pair.current.sensors()):
             keys = f"{sensor.id()}.rotation", f"{sensor.id()}.translation"
@@ -182,7 +178,6 @@ class MitsubaRenderer:
         return self._differential
 
     def stock(self) -> StockSession:
-        """See `StockRenderer.stock`."""
         if self.pair.replaced:
             raise InputError("method stock: a mesh has other triangles than the scene's own")
         if any(form.colour == "xyz" for form in self._formats):
@@ -289,7 +284,6 @@ class StockSession:
     def gradient(
         self, parameters: Tree, sensor: int, spp: int, seeds: tuple[int, int], weigh: LossWeights
     ) -> tuple[mi.TensorXf, Tree]:
-        """See `StockLoop.gradient`."""
         scene = self._loaded
         scene.detach()  # of leaves that were differentiated before, the derivative graph is gone
         scene.set_parameters(parameters, parameters.keys())

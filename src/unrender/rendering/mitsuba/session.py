@@ -46,8 +46,6 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.tensors import is_broadcast, tensor
 from unrender.rendering.renderer import EmitterMoments, Rendering, SampleRequest, Space
 
-__all__ = ["MitsubaSession"]
-
 _LANES = 1 << 22
 """Paths per launch of a batch: what fits a small machine's memory."""
 
@@ -291,7 +289,6 @@ class MitsubaSession:
         return moments if paths.request.groups > 1 else moments[0]
 
     def emitters(self) -> np.ndarray:
-        """See `EmitterSession.emitters`."""
         own = own_probabilities(self._pair.current)
         moves = self._geometric or any((self._posed, self._camera, self._boundary))
         if len(own) > 1 and (moves or self._pair.volumetric):
@@ -302,7 +299,6 @@ class MitsubaSession:
     def emitter_moments(
         self, parameters: Tree, paths: Paths, tangents: Tree, weights: mi.TensorXf, noise: mi.TensorXf
     ) -> EmitterMoments:
-        """See `EmitterSession.emitter_moments`."""
         scene = self._pair.loaded()
         self._check_keys(parameters)
         scene.set_tangents(parameters, tangents, self._attached)
@@ -312,7 +308,6 @@ class MitsubaSession:
         return connection_moments(scene.scene, *found)
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
-        """See `CountingSession.vertices`."""
         self.set_parameters(parameters)
         request = replace(request, groups=1)
         found = self.run(VerticesPass(), request)

@@ -15,8 +15,6 @@ from unrender.io import files, mesh_files
 from unrender.scene.problem import Problem
 from unrender.scene.surfaces import Surface
 
-__all__ = ["FOLDER", "RunMesh", "arrays_of", "meshes_in", "write_files"]
-
 FOLDER = "meshes"
 """Of PLY and OBJ files."""
 _FACES, _FIRST, _UV, _VERTICES, _TRUE_FACES = "faces", "first_faces", "uv", "true_vertices", "true_faces"

@@ -16,8 +16,6 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
-__all__ = ["EmitterConnection", "direct_emission", "met_emitter", "mis_weight"]
-
 _LARGEST = 1e18
 """Solid angle density whose square, and twice that, is a finite single-precision number."""
 
