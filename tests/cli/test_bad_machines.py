@@ -118,7 +118,7 @@ def test_a_clock_that_jumps(unrender, monkeypatch: pytest.MonkeyPatch, mitsuba_v
     started = time.perf_counter()
     words = [*WORDS, "--seconds", 1, "--variant", mitsuba_variant]
     assert unrender(*words, "--out", "run").status == 0
-    assert 1 < time.perf_counter() - started < 100
+    assert 0.4 < time.perf_counter() - started < 100  # steps have half of the second at least
     assert json.loads(Path("run/run.json").read_text())["seconds"] == pytest.approx(1, abs=2)
     assert unrender("report", "run").status == 0
 

@@ -123,11 +123,16 @@ MISTAKES = [
         6,
         "views[0].refrence: no such field; did you mean reference?",
     ),
-    ("key =", "initial = 1\nkeys =", 5, "parameters[0].keys: no such field; did you mean key?"),
+    ("key =", "initial = 1\nkye =", 5, "parameters[0].kye: no such field; did you mean key?"),
     # missing
     ('scene = "scenes/wall.xml"', "", 1, "scene: missing, expected the path of a Mitsuba .xml file"),
     ('reference = "photo.exr"', "", 5, "views[0].reference: missing, expected the path of a picture"),
-    (f'key = "{KEY}"', "", 3, "parameters[0].key: missing, expected the name of a scene parameter"),
+    (
+        f'key = "{KEY}"',
+        "",
+        3,
+        "parameters[0].key: missing, expected the name of a scene parameter, or several names as keys",
+    ),
     ("[[views]]", "[[parameters]]\nkey='x'\n#", 8, "parameters[1].reference: no such field"),
     # kinds
     ('"scenes/wall.xml"', "3", 1, "scene: expected the path of a Mitsuba .xml file, got 3"),

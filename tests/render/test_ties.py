@@ -190,7 +190,11 @@ def test_a_problem_file_has_keys_and_factors_and_a_run_folder_keeps_them(tmp_pat
 @pytest.mark.parametrize(
     ("fields", "line", "words"),
     [
-        ("initial = 0.25", "problem.toml:", "expected key, the name of a scene parameter, or keys"),
+        (
+            "initial = 0.25",
+            "problem.toml:",
+            "missing, expected the name of a scene parameter, or several names as keys",
+        ),
         (
             'keys = ["a.bsdf.reflectance.value", "sky.radiance.valu"]',
             "problem.toml:4",

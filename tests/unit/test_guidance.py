@@ -168,7 +168,6 @@ def test_a_mini_batch_of_the_default_size_is_not_refused() -> None:
 
 
 def test_the_guide_tells_the_schedule_of_sigma_that_the_method_has() -> None:
-    text = (GUIDE / "poses.md").read_text()
+    text = (GUIDE / "pose.md").read_text()
     default = SmoothedMethod.model_fields["sigma_schedule"].default
-    assert f"`{default}`" in text.replace("(`", "`").replace("`;", "`").replace("`)", "`") or f"(`{default}`" in text
-    assert "which keeps σ unless it is given" in " ".join(text.split())
+    assert f"| `sigma_schedule` | factor of σ by step; `none` keeps σ | `{default}` |" in text

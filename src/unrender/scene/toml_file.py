@@ -148,7 +148,7 @@ def _build(model: _Problem, file: Path) -> Problem:
 def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
     if not model.key and not model.keys:
         raise FieldError(
-            ("parameters", index, "key"), "expected key, the name of a scene parameter, or keys, several names"
+            ("parameters", index, "key"), "missing, expected the name of a scene parameter, or several names as keys"
         )
     preconditioner = None
     if model.preconditioner is not None:

@@ -48,7 +48,7 @@ def judge(
 def _tell(console: object, found: Judgement) -> None:
     from rich.table import Table
 
-    from unrender.app.cli.compare import plain
+    from unrender.app.cli.comparison_table import plain
     from unrender.display.terminal import Console
 
     assert isinstance(console, Console)

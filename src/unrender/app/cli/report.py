@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.sweeps import folders
-from unrender.app.sweeps.record import SweepRecord
 from unrender.core.errors import InputError
+
+if TYPE_CHECKING:
+    from unrender.app.sweeps.record import SweepRecord
 
 _MOST = 6
 
 
 def write_page(folder: Path, record: SweepRecord) -> Path:
-    """Write compare.html of the six best finished trials; returns its path. Raises `InputError` where none has finished."""
+    """Write compare.html of the six best finished trials; return its path. Raise `InputError` where none has finished."""
+    from unrender.app import report
+    from unrender.app.sweeps import folders
+
     directories = folders.best(folder, record, _MOST)
     if not directories:
         raise InputError(f"{folder}: no trial of the sweep has finished")
-    from unrender.app import report
-
     return report.write_comparison(*report.load_comparison(directories), folder)
 
 
