@@ -1,0 +1,55 @@
+"""What `unrender compare` prints: one table for each metric. Apart, since its imports would cost `unrender --help` a second."""
+
+from __future__ import annotations
+
+from rich.markup import escape
+from rich.table import Table
+
+from unrender.app.report.equal_time import Comparison, Spread
+from unrender.core.text import visible
+from unrender.display import formatting
+from unrender.display.terminal import Console
+from unrender.losses.metrics import has_flip
+
+
+def show(console: Console, comparison: Comparison) -> None:
+    """The median over each method's runs, and the range: of every metric, and of the last pictures."""
+    parameters = [metric for metric in comparison.metrics if metric.name != "loss"]
+    for metric in parameters or comparison.metrics:
+        console.print(f"[bold]{plain(metric.title)}[/]", soft_wrap=True)
+        first = metric.methods[comparison.groups[0].label]
+        times = [f"at {formatting.duration(moment.seconds)}" for moment in first.moments]
+        table = _table("method", "runs", *times, f"after {formatting.count(comparison.samples)} paths")
+        for group in comparison.groups:
+            outcome = metric.methods[group.label]
+            cells = [moment.error for moment in (*outcome.moments, outcome.at_samples[-1])]
+            table.add_row(plain(group.label), str(len(group.runs)), *map(_spread, cells))
+        console.print(table)
+    if comparison.image_error[comparison.groups[0].label].median is not None:
+        console.print("[bold]Last pictures, each run's at its own end[/]")
+        table = _table("method", *comparison.images)
+        for group in comparison.groups:
+            table.add_row(plain(group.label), *(_spread(of[group.label]) for of in comparison.images.values()))
+        console.print(table)
+        if not has_flip():
+            console.print("FLIP is left out: its package is missing (pip install 'unrender[flip]')", markup=False)
+
+
+def plain(text: str) -> str:
+    """Text of a run folder, without marks for rich; in a column as wide as what is printed."""
+    return escape(visible(text))
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    for heading in headings:
+        table.add_column(plain(heading), overflow="fold")
+    return table
+
+
+def _spread(of: Spread) -> str:
+    if of.median is None:
+        return "–"
+    middle = formatting.number(of.median)
+    low, high = formatting.number(of.low), formatting.number(of.high)
+    return middle if low == high else f"{middle} ({low}–{high})"
