@@ -66,6 +66,24 @@ def test_a_wall_is_judged_by_its_photograph(unrender, run: Path, mitsuba_variant
     assert np.ptp(read(folder / "environment.png")) == 0
 
 
+def test_a_tie_is_judged_by_its_members(unrender, problem: Path, mitsuba_variant: str) -> None:
+    """Held-out photographs have a scene of their own, whose parameters are the members of ties, not the unknown that stands for them."""
+    tied = f'key = "paint"\nkeys = {{ "{KEY}" = 0.5 }}\nbounds = [0, 2]'
+    text = problem.read_text().replace(f'key = "{KEY}"', tied).replace("[0.6, 0.5, 0.4]", "[1.2, 1.0, 0.8]")
+    problem.write_text(text)
+    (problem.parent / "held-out.toml").write_text(text)
+    words = ["--steps", 1, "--out", "result", "--variant", mitsuba_variant, "--method", "plain", "--final-spp", 4]
+    answer = unrender("run", "problem.toml", *words)
+    assert answer.status == 0, answer.error
+    np.savez(problem.parent / "result" / "parameters.npz", paint=2 * FOUND)
+    answer = unrender("judge", "result", "--variant", mitsuba_variant, "--spp", 4096)
+    assert answer.status == 0, answer.error
+    record = json.loads((problem.parent / "result" / "judge" / "judge.json").read_text())
+    assert record["notices"] == []
+    assert record["mean"]["psnr"] == pytest.approx(EXPECTED, abs=0.1)
+    assert record["albedo"]["rmse"] == pytest.approx(0.1, abs=1e-4)
+
+
 @pytest.mark.slow
 def test_under_another_light(unrender, run: Path, mitsuba_variant: str) -> None:
     """Twice the light: twice the picture; the photograph of that is named, or nothing is measured."""

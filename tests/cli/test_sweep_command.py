@@ -184,18 +184,20 @@ LONG = [
 ]
 
 
-def wait_for(folder: Path, pattern: str, count: int) -> list[Path]:
+def wait_for(process: subprocess.Popen, folder: Path, pattern: str, count: int) -> list[Path]:
+    """Return the files, as soon as there are so many. A command that ends before fails at once, with what it said."""
     until = time.monotonic() + 200
     while len(found := sorted(folder.glob(pattern))) < count:
+        assert process.poll() is None, f"ended without {pattern}: {process.communicate()}"
         assert time.monotonic() < until, f"no {pattern}"
-        time.sleep(0.1)
+        time.sleep(0.05)
     return found
 
 
 @pytest.mark.slow
 def test_workers_find_what_one_process_does_though_one_is_killed(started: Any, tmp_path: Path, unrender) -> None:
     process = started("sweep", *LONG, "--steps", 600, "--workers", 2, "--out", "s")
-    lock = wait_for(tmp_path / "s", "trial-*/checkpoints/*/manifest.json", 1)[0].parents[2] / "lock"
+    lock = wait_for(process, tmp_path / "s", "trial-*/checkpoints/*/manifest.json", 1)[0].parents[2] / "lock"
     os.kill(json.loads(lock.read_text())["pid"], signal.SIGKILL)
     out, error = process.communicate(timeout=300)
     assert (process.returncode, error) == (0, "")
@@ -210,7 +212,7 @@ def test_workers_find_what_one_process_does_though_one_is_killed(started: Any, t
 @pytest.mark.slow
 def test_an_interrupt_ends_workers_and_what_was_reached_is_kept(started: Any, tmp_path: Path) -> None:
     process = started("sweep", *LONG, "--steps", 200_000, "--workers", 2, "--out", "s")
-    wait_for(tmp_path / "s", "trial-*/checkpoints/*/manifest.json", 2)
+    wait_for(process, tmp_path / "s", "trial-*/checkpoints/*/manifest.json", 2)
     os.killpg(process.pid, signal.SIGINT)
     began = time.monotonic()
     out, error = process.communicate(timeout=60)

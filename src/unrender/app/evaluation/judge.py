@@ -28,7 +28,7 @@ from unrender.losses import metrics
 from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.photographs import OF_PHOTOGRAPHS, member_values
+from unrender.rendering.photographs import OF_PHOTOGRAPHS, member_values, scene_renderer
 from unrender.rendering.response import RESPONSE, curve
 from unrender.rendering.vignetting import VIGNETTING, falloff
 from unrender.runs import reopen
@@ -134,13 +134,21 @@ def judge(
 
 
 def _found(run: Path, problem: Problem, found: RunFolder) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """What a run found, and the truth where it is known. Of a stage, with what it took over from those before it, as part of its scene."""
-    values, truth = problem.full(found.parameters), dict(found.truth)
+    """What a run found, and the truth where it is known, of ties as their members.
+
+    Of a stage, with what it took over from those before it, as part of its scene.
+    """
+    full = problem.full(found.parameters)
+    values, truth = (member_values(problem.renderer, each) for each in (full, found.truth))
     staged = run_folders.stage_of(run)
     if staged is None:
         return values, truth
     stages, last = staged
-    earlier = [key for stage in stages.stages[:last] for key in stage.unknowns if key not in values]
+    unknowns = [key for stage in stages.stages[:last] for key in stage.unknowns if key not in full]
+    if not unknowns:
+        return values, truth
+    whole = Problem.from_file(stages.problem).renderer
+    earlier = list(member_values(whole, dict.fromkeys(unknowns, np.zeros(()))))
     there = problem.renderer.parameters()
     for key in earlier:
         if key not in there:
@@ -148,8 +156,9 @@ def _found(run: Path, problem: Problem, found: RunFolder) -> tuple[dict[str, np.
     for index in range(last):
         folder = stages_file.folder_of(stages, index, run.resolve().parent)
         if (folder / schema.RECORD).is_file():
-            truth = {key: value for key, value in folders.read(folder).truth.items() if key in earlier} | truth
-    own = problem.renderer.values(list(dict.fromkeys(earlier)))
+            known = member_values(whole, folders.read(folder).truth)
+            truth = {key: value for key, value in known.items() if key in earlier} | truth
+    own = problem.renderer.values(earlier)
     return {key: arrays.numpy(value) for key, value in own.items()} | values, truth
 
 
@@ -157,14 +166,14 @@ def _problem(
     problem: Problem, held_out: Path, parameters: Mapping[str, np.ndarray], run: RunFolder
 ) -> tuple[Problem, dict[str, np.ndarray], list[str]]:
     """What was found with the held-out views, and its values."""
-    other, parameters = Problem.from_file(held_out), member_values(problem.renderer, parameters)
-    known = set(other.renderer.parameters()).difference(OF_PHOTOGRAPHS)
+    other = Problem.from_file(held_out)
+    known = scene_renderer(other.renderer).parameters()
     kept = [key for key in parameters if key in known]
     if not kept:
         raise InputError(f"{held_out}: its scene has none of the run's parameters, such as {problem.parameters[0].key}")
     left_out = [key for key in parameters if key not in known and key not in OF_PHOTOGRAPHS]
     notices = [f"{', '.join(left_out)}: not in the scene of {held_out.name}, left out"] if left_out else []
-    bounds = {parameter.key: parameter.bounds for parameter in problem.parameters}
+    bounds = {parameter.key: parameter.bounds for parameter in problem.parameters if parameter.keys is None}
     plain = [Parameter(key, bounds=bounds.get(key)) for key in kept]
     judged = Problem(other.origin["scene"], plain, other.given_views, max_depth=problem.max_depth, name=other.name)
     if not isinstance(judged.renderer, MitsubaRenderer):
