@@ -20,12 +20,14 @@ from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.partial import HeldParameters, PartialDerivatives
 from unrender.rendering.renderer import Camera, EmitterMoments, PictureFormat, SampleRequest
 from unrender.rendering.response import RespondingRenderer
+from unrender.rendering.tied import Tie, TiedRenderer
 from unrender.rendering.vignetting import VignettedRenderer
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
 WRAPPERS: dict[str, Callable[[Any], Any]] = {
     "partial": lambda inner: PartialDerivatives(inner, frozenset({"c0.rotation"})),
     "held": lambda inner: HeldParameters(inner, {"still": np.full((1,), 0.5)}),
+    "tied": lambda inner: TiedRenderer(inner, (Tie("paint", {"map": 0.5}),)),
     "poses": lambda inner: PosedCameras(inner, [0, 1, 2]),
     "vignetting": VignettedRenderer,
     "exposure": lambda inner: ExposedRenderer(inner, [0, 1, 2]),

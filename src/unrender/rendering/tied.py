@@ -14,23 +14,17 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
-from unrender.rendering.camera_poses import Camera, WithCameras
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import (
-    EmitterMoments,
     ParameterInfo,
-    PictureFormat,
     Renderer,
-    Rendering,
     RenderSession,
+    ReplacedMesh,
     SampleRequest,
     Space,
-    counted_vertices,
     differentiated,
-    drawing_emitters,
-    format_of,
-    with_differential_bsdf,
 )
+from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
 __all__ = ["Tie", "TieError", "TiedRenderer", "with_ties"]
 
@@ -140,20 +134,17 @@ def with_ties(renderer: Renderer, ties: Iterable[Tie]) -> Renderer:
     return TiedRenderer(scene, ties) if ties else scene
 
 
-class TiedRenderer:
+class TiedRenderer(RendererWrapper):
     """A renderer whose unknowns are ties. Images, gradients and tangents are as unbiased as the inner renderer's.
 
     Args:
         inner: renders the scene.
         ties: unknowns that stand for several parameters.
-
-    Attributes:
-        notices: of the inner renderer.
     """
 
     def __init__(self, inner: Renderer, ties: tuple[Tie, ...]):
-        self.inner, self.ties = inner, ties
-        self.notices: tuple[str, ...] = tuple(getattr(inner, "notices", ()))
+        super().__init__(inner)
+        self.ties = ties
         self.max_depth = getattr(inner, "max_depth", 6)
         known, taken = inner.parameters(), dict[str, str]()
         infos = {tie.key: tie.info(known) for tie in ties}
@@ -178,22 +169,6 @@ class TiedRenderer:
         inner = self.inner.values([first[key][0] if key in first else key for key in keys])
         return {key: inner[first[key][0]] * (1 / first[key][1]) if key in first else inner[key] for key in keys}
 
-    def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
-        return self.inner.resolutions()
-
-    def formats(self) -> list[PictureFormat]:
-        """See `WithFormats.formats`."""
-        return [format_of(self.inner, sensor) for sensor in range(len(self.resolutions()))]
-
-    def cameras(self) -> Mapping[int, Camera]:
-        """See `WithCameras.cameras`."""
-        return self.inner.cameras() if isinstance(self.inner, WithCameras) else {}
-
-    def array(self, values: np.ndarray) -> Array:
-        """See `Renderer.array`."""
-        return self.inner.array(values)
-
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
@@ -202,9 +177,11 @@ class TiedRenderer:
         inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(wanted)))
         return TiedSession(self, inner)
 
-    def with_differential_bsdf(self) -> TiedRenderer:
-        """See `DifferentialBsdfRenderer`. Raises `InputError` where the inner renderer is none."""
-        return TiedRenderer(with_differential_bsdf(self.inner), self.ties)
+    def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
+        return super().with_meshes(meshes, self.expanded(keys))
+
+    def _around(self, inner: Renderer) -> TiedRenderer:
+        return TiedRenderer(inner, self.ties)
 
     def expanded(self, keys: Iterable[str]) -> list[str]:
         """Return the parameters of the inner renderer that these keys stand for."""
@@ -221,58 +198,22 @@ class TiedRenderer:
         return found
 
 
-class TiedSession:
+class TiedSession(SessionWrapper):
     """Images and derivatives with respect to ties. See `RenderSession`."""
 
     def __init__(self, renderer: TiedRenderer, inner: RenderSession):
-        self._renderer, self._inner = renderer, inner
+        super().__init__(inner)
+        self._renderer = renderer
         self._ties = {tie.key: tie.factors for tie in renderer.ties}
         self._known: list[tuple[Array, Tree]] = []
 
-    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
-        return self._inner.image(self._scene(parameters), request)
-
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `RenderSession.image_batch`."""
         return self._inner.image_batch(self._renderer.scene_values(parameters), request)
 
-    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`."""
-        return self._inner.image_pair(self._scene(current), self._scene(previous), request, space)
+    def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
+        return self._renderer.scene_values(tangents)
 
-    def adjoint(self, parameters: Tree, paths: Any, weights: Array) -> Tree:
-        """See `RenderSession.adjoint`."""
-        return self._gathered(parameters, self._inner.adjoint(self._scene(parameters), paths, weights))
-
-    def adjoint_pair(
-        self, current: Tree, previous: Tree, paths: Any, weights: Array, weights_previous: Array
-    ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
-        states = self._scene(current), self._scene(previous)
-        found = self._inner.adjoint_pair(*states, paths, weights, weights_previous)
-        return self._gathered(current, found[0]), self._gathered(previous, found[1])
-
-    def tangent_moment(self, parameters: Tree, paths: Any, tangents: Tree) -> Array:
-        """See `RenderSession.tangent_moment`."""
-        return self._inner.tangent_moment(self._scene(parameters), paths, self._renderer.scene_values(tangents))
-
-    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `CountingSession.vertices`: ones where the inner session does not count."""
-        return counted_vertices(self._inner, self._scene(parameters), request)
-
-    def emitters(self) -> np.ndarray:
-        """See `EmitterSession.emitters`."""
-        return drawing_emitters(self._inner).emitters()
-
-    def emitter_moments(
-        self, parameters: Tree, paths: Any, tangents: Tree, weights: Array, noise: Array
-    ) -> EmitterMoments:
-        """See `EmitterSession.emitter_moments`."""
-        moved = self._renderer.scene_values(tangents)
-        return drawing_emitters(self._inner).emitter_moments(self._scene(parameters), paths, moved, weights, noise)
-
-    def _scene(self, parameters: Tree) -> Tree:
+    def _state(self, parameters: Tree) -> Tree:
         """Return the values of the scene's parameters: the same arrays for the same value, which the scene need not set again."""
         found: Tree = {}
         for key, value in parameters.items():
@@ -286,17 +227,15 @@ class TiedSession:
             found |= members
         return found
 
-    def _gathered(self, parameters: Tree, gradient: Tree) -> Tree:
+    def _gradient(self, parameters: Tree, found: Tree, paths: Any) -> Tree:
         """Return the gradient by the unknowns: of a tie, the members' by their factors, summed."""
-        found: Tree = {}
+        gathered: Tree = {}
         for key in parameters:
-            if key not in self._ties:
-                found |= {key: gradient[key]} if key in gradient else {}
-                continue
-            parts = [gradient[member] * factor for member, factor in self._ties[key].items() if member in gradient]
+            factors = self._ties.get(key, {key: 1.0})
+            parts = [found[member] * factor for member, factor in factors.items() if member in found]
             if parts:
-                found[key] = sum(parts[1:], parts[0])
-        return found
+                gathered[key] = sum(parts[1:], parts[0])
+        return gathered
 
 
 def _scaled(value: Any, factor: float) -> Any:
