@@ -210,6 +210,15 @@ def test_the_table_tells_errors_from_the_truth(tmp_path):
     assert "0.25" in words_of_page
 
 
+def test_numbers_have_their_standard_errors(tmp_path):
+    parameters = {"a": np.array([-0.3, 0.4]), "b": np.array([1.25])}
+    run = write_run(tmp_path / "run", truth=parameters, parameters=parameters, standard_error={"a": [0.012, 0.034]})
+    text = Page(report.page(run)).words
+    assert f"{formatting.number(-0.3)} ± 0.012, 0.4 ± 0.034" in text
+    assert "1.25 ±" not in text
+    assert "one standard error of the noise" in text
+
+
 def test_a_texture_refined_on_the_way_is_shown_without_an_error(tmp_path):
     truth = {KEY: np.full((8, 8, 3), 0.5)}
     run = write_run(tmp_path / "run", truth=truth, initial={KEY: np.zeros((2, 2, 3))})

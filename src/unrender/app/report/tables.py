@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,6 +99,7 @@ class ParameterRow:
     """One line of the table of parameters. Values as text, errors as numbers, None where not known.
 
     Attributes:
+        recovered: with the standard errors of the run's noise where they are known.
         unit: of the errors, "" for that of the values.
         error_seen: at the end, over the cells that the pictures tell of.
         seen: the share of these cells.
@@ -194,7 +195,7 @@ def parameter_row(run: RunFolder, key: str) -> ParameterRow:
         " × ".join(str(n) for n in run.shape(key)) or "number",
         _values(truth) if truth is not None else "",
         _values(initial),
-        _values(result),
+        _values(result, run.record.standard_error.get(key)),
         _swatch(result),
         run.error_before.get(key),
         run.error_after.get(key),
@@ -204,12 +205,16 @@ def parameter_row(run: RunFolder, key: str) -> ParameterRow:
     )
 
 
-def _values(array: np.ndarray) -> str:
+def _values(array: np.ndarray, standard_error: Sequence[float] | None = None) -> str:
+    """Return an array's elements as text, few of them with their standard errors; of many the least and the largest."""
     if array.size == 0:
         return ""
     if array.size > _LISTED_VALUES:
         return " … ".join(formatting.number(float(value)) for value in (array.min(), array.max()))
-    return ", ".join(formatting.number(float(value)) for value in array.reshape(-1))
+    values = [formatting.number(float(value)) for value in array.reshape(-1)]
+    if standard_error is not None and len(standard_error) == len(values):
+        values = [f"{value} ± {formatting.number(error)}" for value, error in zip(values, standard_error, strict=True)]
+    return ", ".join(values)
 
 
 def _swatch(array: np.ndarray) -> str:
