@@ -86,7 +86,8 @@ class TracePass(Pass):
 
     def _trace(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: Any, weight: Any) -> dict[str, Any]:
         context = PathContext(dr.ADMode.Primal, scene, tables, (), False)
-        record = _Record(self._empty(dr.width(ray)), dr.width(ray), mi.Color3f(weight))
+        lanes = sampler.wavefront_size()  # rays of a sensor may all be the same one, of width 1
+        record = _Record(self._empty(lanes), lanes, mi.Color3f(weight))
         state = _State(
             ray=mi.Ray3f(dr.detach(ray)),
             depth=mi.UInt32(0),
