@@ -205,6 +205,27 @@ def test_standard_errors_cover_the_truth_in_68_percent_of_the_seeds(
     np.testing.assert_allclose(record.standard_error["a"], kept.standard_error["a"], rtol=1e-5)
 
 
+@pytest.mark.parametrize(("ratio", "told"), [(1e-4, {"y"}), (0.1, {"x", "y"})])
+def test_a_direction_that_hardly_shows_has_no_standard_error(ratio: float, told: set[str]) -> None:
+    """A spotlight's turn about its own axis, of which two numbers have a part: their gradients have hardly any noise along it."""
+    along, across = np.array([1.0, 2.0]) / np.sqrt(5.0), np.array([2.0, -1.0]) / np.sqrt(5.0)
+    hessian = np.zeros((3, 3))
+    hessian[:2, :2] = np.outer(across, across) + ratio * np.outer(along, along)
+    hessian[2, 2] = 1.0
+    optimizer, rng = AveragedNewton(), np.random.default_rng(0)
+    tree = {"x": np.zeros(2), "y": np.zeros(1)}
+    state = optimizer.init(tree)
+    for noise in 1e-3 * rng.normal(size=(20, 3)):
+        noise[:2] = noise[0] * across + ratio * noise[1] * along
+        place = np.concatenate([tree["x"], tree["y"]])
+        gradient = hessian @ place + noise
+        steps, state = optimizer.update(
+            Estimate(0.0, {"x": gradient[:2], "y": gradient[2:]}, (Hessian(hessian),)), state, tree
+        )
+        tree = {key: x + steps[key] for key, x in tree.items()}
+    assert optimizer.standard_errors(state, tree).keys() == told
+
+
 def test_directions_of_noise_alone_hardly_move_until_enough_steps_tell_more() -> None:
     """Step 1: (H + N)⁻¹ of the gradient; after k models at one place, (H + σ N)⁻¹, with the sum σ of their squared weights."""
     optimizer, noise, x = AveragedNewton(trust_radius=None), 4.0 * HESSIAN, np.zeros(3)

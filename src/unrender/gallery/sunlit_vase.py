@@ -72,7 +72,7 @@ def vase(texture_resolution: int) -> dict[str, Any]:
 
 
 def _sky() -> np.ndarray:
-    """The sky and its sun: see `skies.picture`."""
+    """Return the sky and its sun: see `parts.picture`."""
     return parts.picture(SUN, _SUN_RADIUS, (620.0, 560.0, 460.0))
 
 

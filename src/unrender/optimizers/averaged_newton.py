@@ -18,6 +18,8 @@ from unrender.optimizers.newton import trust_region_step
 
 _FEWEST_MODELS = 8.0
 """Models in the mean from which on their scatter tells a standard error."""
+_WEAK_SHARE = 0.01
+"""Share of an element in directions that are held back, as a square, from which on it has no standard error."""
 
 
 @dataclass(frozen=True)
@@ -141,13 +143,24 @@ class AveragedNewton:
         """See `Measuring`: of A⁻¹ b, from the scatter of the models' gradients about those of the mean.
 
         It is of the run's own noise, not of the references', nor of what differences of a width leave out. It needs some ten models.
+        Parameters with a share in a direction that `damping` holds back have none: the step there is not the whole one to A⁻¹ b.
         """
-        inverse = np.linalg.pinv(state.matrix, rcond=1e-12, hermitian=True)
-        errors = vectors.parts(np.sqrt(np.abs(np.diag(inverse @ state.scatter @ inverse)))[None], parameters)
+        errors = np.full(len(state.matrix), np.nan)
+        for block in _blocks(state.matrix != 0.0):
+            both = np.ix_(block, block)
+            units = np.sqrt(np.abs(np.diag(state.matrix[both])))
+            if not units.all():
+                continue
+            eigenvalues, directions = np.linalg.eigh(state.matrix[both] / np.outer(units, units))
+            weak = eigenvalues <= self.damping * eigenvalues.max()
+            inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / np.outer(units, units)
+            found = np.sqrt(np.abs(np.diag(inverse @ state.scatter[both] @ inverse)))
+            errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.nan, found)
+        split = vectors.parts(errors[None], parameters)
         counts = vectors.parts(state.counts[None], parameters)
         return {
             key: x[0]
-            for key, x in errors.items()
+            for key, x in split.items()
             if counts[key].min() >= _FEWEST_MODELS and np.isfinite(x).all() and x.all()
         }
 

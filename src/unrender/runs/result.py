@@ -63,7 +63,7 @@ class Result:
             reference and what the picture converges to, the noise of its rendering taken out; see `evaluation.debiased`.
         standard_error: {key: array} of the parameters' shapes: how far the noise of this run's renderings moves each number, one standard
             deviation; not the noise of the references, nor what other unknowns that are wrong do. Of numbers by `AveragedNewton` after
-            the last step alone; {} for others.
+            the last step alone; none of those with a share in a direction that the pictures hardly show; {} for others.
         phases: {phase: seconds}: where the time went, in order: "compiling", "steps", "checkpoints and callbacks", "final pictures",
             and, of the command line, what came before. Of the last session, where the run was resumed.
         sensitivity: {key: array} of the parameters' shapes: by how much the images change per unit of each element, as the root of the sum

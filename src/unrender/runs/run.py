@@ -40,7 +40,7 @@ class Run:
         parameters: the current ones (the renderer's arrays), at the present resolution where the problem has them coarse at first.
         estimate: the last one.
         skipped: steps not applied so far.
-        ahead: steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `multiresolution.hurry`.
+        ahead: steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
         warnings: one line each.
         stopped: why it ends after the present step; "" while it goes on.
         last_step: when the steps should end, on the clock of `time.perf_counter`, so that all is done within the budget; None where the
