@@ -13,8 +13,9 @@ import zoo
 import unrender as ur
 from unrender.core import arrays
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import frozen
+from unrender.rendering.mitsuba import frozen, turntable_light
 from unrender.rendering.mitsuba.integrators.emitters import EmitterConnection
+from unrender.rendering.mitsuba.path_cache import lookups
 from unrender.rendering.mitsuba.path_cache import session as caching
 from unrender.rendering.mitsuba.path_cache.lookups import Lookups
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
@@ -56,6 +57,46 @@ def textured_lamp() -> dict[str, Any]:
     return described
 
 
+def checkerboards() -> dict[str, Any]:
+    """Textures of textures, each with a transform of its own."""
+    to = mi.ScalarTransform4f
+    plain: dict[str, Any] = {"type": "rgb", "value": [0.2, 0.4, 0.6]}
+    inner = zoo.texture(3) | {"to_uv": to().scale(2), "wrap_mode": "clamp"}
+    floor = {"type": "checkerboard", "color0": plain, "color1": inner, "to_uv": to().scale(7)}
+    ball = {"type": "checkerboard", "color0": zoo.texture(2), "color1": {"type": "uniform", "value": 0.4}}
+    described = zoo.scene({"type": "diffuse", "reflectance": ball})
+    described["floor"]["bsdf"] = {"type": "diffuse", "reflectance": floor}
+    return described
+
+
+def instances() -> dict[str, Any]:
+    """One material on a ball and on several instances of a group, one of whose shapes is seen from both sides."""
+    to = mi.ScalarTransform4f
+    described = zoo.scene({"type": "diffuse"})
+    described["shared"] = {"type": "diffuse", "reflectance": zoo.texture(2)}
+    described["ball"] = {"type": "sphere", "center": [0, 0, 0.8], "radius": 0.8, "b": {"type": "ref", "id": "shared"}}
+    described["group"] = {
+        "type": "shapegroup",
+        "round": {"type": "sphere", "radius": 0.35, "b": {"type": "ref", "id": "shared"}},
+        "flat": {
+            "type": "rectangle",
+            "to_world": to().translate([0, 0.5, 0]).rotate([1, 0, 0], 70).scale(0.4),
+            "b": {"type": "twosided", "m": {"type": "ref", "id": "shared"}},
+        },
+    }
+    for number, (x, y) in enumerate([(1.2, -0.6), (-1.1, -0.9)]):
+        placed = to().translate([x, y, 0.4]).rotate([0, 0, 1], 20 + 120 * number).scale(1 + 0.2 * number)
+        described[f"copy_{number}"] = {"type": "instance", "to_world": placed, "g": {"type": "ref", "id": "group"}}
+    return described
+
+
+def roulette() -> dict[str, Any]:
+    """Paths that roulette ends early, by the reflectances of the current state."""
+    return zoo.scene({"type": "diffuse", "reflectance": zoo.texture(2)}) | {
+        "integrator": {"type": "path", "max_depth": 9, "rr_depth": 1, "hide_emitters": True}
+    }
+
+
 SCENES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...]]] = {
     "textures": (diffuse, (FLOOR, BALL)),
     "texture and emitters": (diffuse, (BALL, LAMP, "sky.data")),
@@ -66,7 +107,13 @@ SCENES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...]]] = {
 
 def prepared(name: str) -> tuple[CachingSession, dict[str, Any], dict[str, Any]]:
     """The session, and two states."""
-    make, keys = SCENES[name]
+    return states(*SCENES[name])
+
+
+def states(
+    make: Callable[[], dict[str, Any]], keys: tuple[str, ...]
+) -> tuple[CachingSession, dict[str, Any], dict[str, Any]]:
+    """See `prepared`."""
     renderer = MitsubaRenderer(make, zoo.DEPTH)
     session = renderer.prepare(list(keys), "path")
     assert isinstance(session, CachingSession)
@@ -114,7 +161,18 @@ def compare(session: CachingSession, current: dict[str, Any], previous: dict[str
             assert_equal(one[key], value)
 
 
-@pytest.mark.parametrize("name", SCENES)
+MORE_SCENES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...]]] = {
+    "checkerboards": (
+        checkerboards,
+        ("ball.bsdf.reflectance.color0.data", "floor.bsdf.reflectance.color0.value", "sky.data"),
+    ),
+    "instances": (instances, ("ball.bsdf.reflectance.data", FLOOR)),
+    "early roulette": (roulette, (FLOOR, BALL, LAMP)),
+}
+SCENES |= MORE_SCENES
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in MORE_SCENES)) for n in SCENES])
 def test_images_and_gradients_are_those_of_traced_paths(name: str) -> None:
     compare(*prepared(name))
 
@@ -207,6 +265,88 @@ def test_two_sides_of_different_materials_and_what_moves_are_not_served() -> Non
         if key in renderer.parameters():
             with pytest.raises(InputError, match=named):
                 Lookups(renderer.pair, [key])
+
+
+def turntable() -> dict[str, Any]:
+    """An environment map that a light of another class turns."""
+    turntable_light.register()
+    described = zoo.scene({"type": "diffuse", "reflectance": zoo.texture(2)})
+    described["sky"] = {"type": "turntable", "turns": "1 0 0 0, 0.7 0.7 0 0", "map": described["sky"]}
+    return described
+
+
+def test_a_light_that_another_holds_is_not_served() -> None:
+    """Paths meet the outer light, so the inner one would never be looked up."""
+    renderer = MitsubaRenderer(turntable, zoo.DEPTH)
+    with pytest.raises(InputError, match=r"sky\.map\.data: it lies under"):
+        Lookups(renderer.pair, ["sky.map.data"])
+    assert not isinstance(renderer.prepare(["sky.map.data", FLOOR], "path"), CachingSession)
+    assert isinstance(renderer.prepare([FLOOR], "path"), CachingSession)
+
+
+@pytest.mark.slow
+def test_a_light_that_is_never_looked_up_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lookups, "_check_around", lambda owner, around: None)
+    with pytest.raises(AssertionError, match="Not equal"):
+        compare(*states(turntable, ("sky.map.data", FLOOR)))
+
+
+def test_a_texture_that_a_plugin_may_hold_unseen_is_not_served() -> None:
+    """Such a plugin shows `mitsuba.traverse` nothing."""
+
+    class Silent(mi.BSDF):
+        def __init__(self, properties: Any):
+            super().__init__(properties)
+            self.held = properties["held"]
+            self.m_components = [mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide]
+            self.m_flags = self.m_components[0]
+
+        def traverse(self, callback: Any) -> None:
+            pass
+
+        def to_string(self) -> str:
+            return "Silent[]"
+
+    mi.register_bsdf("silent", Silent)
+
+    def described() -> dict[str, Any]:
+        shared = {"type": "ref", "id": "shared"}
+        found = zoo.scene({"type": "silent", "held": shared})
+        found["floor"]["bsdf"] = {"type": "diffuse", "reflectance": shared}
+        return {"type": "scene", "shared": zoo.texture(2)} | found
+
+    renderer = MitsubaRenderer(described, zoo.DEPTH)
+    with pytest.raises(InputError, match="a plugin in Python"):
+        Lookups(renderer.pair, [FLOOR])
+    assert not isinstance(renderer.prepare([FLOOR], None), CachingSession)
+
+
+def test_textures_beside_a_served_one_are_looked_at() -> None:
+    """A checkerboard with a colour of a parameter may have its other one from elsewhere than texture coordinates."""
+
+    def described() -> dict[str, Any]:
+        other = {"type": "mesh_attribute", "name": "vertex_color"}
+        board = {"type": "checkerboard", "color0": zoo.texture(2), "color1": other}
+        return zoo.scene({"type": "diffuse", "reflectance": board})
+
+    renderer = MitsubaRenderer(described, zoo.DEPTH)
+    with pytest.raises(InputError, match="MeshAttribute"):
+        Lookups(renderer.pair, ["ball.bsdf.reflectance.color0.data"])
+
+
+def test_paths_are_those_of_the_same_parameters_in_any_order() -> None:
+    """Sessions of other parameters number their lookups otherwise: they trace."""
+    renderer = MitsubaRenderer(SCENES["textures"][0], zoo.DEPTH)
+    one, turned, more = (
+        renderer.prepare(list(keys), "path") for keys in ((FLOOR, BALL), (BALL, FLOOR), (BALL, FLOOR, LAMP))
+    )
+    values = renderer.values([FLOOR, BALL])
+    rendering = one.image(values, SampleRequest(0, 4, 7))
+    expected = one.adjoint(values, rendering.paths, rendering.images)
+    for other in (turned, more):
+        found = other.adjoint(values, rendering.paths, rendering.images)
+        for key, value in expected.items():
+            assert_equal(found[key], value)
 
 
 def test_a_run_is_the_same_with_kept_paths(monkeypatch: pytest.MonkeyPatch) -> None:

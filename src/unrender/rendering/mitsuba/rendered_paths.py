@@ -26,6 +26,7 @@ class Paths:
         space: where the pair shares its samples.
         previous: parameters of the previous state; None unless a pair was rendered.
         vertices: what `TracePass` returned, where paths are kept; else None.
+        keys: the parameters whose lookups the vertices number.
     """
 
     request: SampleRequest
@@ -34,6 +35,7 @@ class Paths:
     space: Space = "path"
     previous: Tree | None = None
     vertices: dict[str, Any] | None = None
+    keys: tuple[str, ...] = ()
 
 
 class DroppedSamples:

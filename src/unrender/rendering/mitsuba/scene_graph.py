@@ -102,10 +102,10 @@ class ObjectGraph:
             table = np.zeros(int(source.max(initial=0)) + 1, np.uint32)
             table[source] = target
             found[kind] = mi.UInt32(table)
-        self._check_complete()
+        self.check_complete()
         return found
 
-    def _check_complete(self) -> None:
+    def check_complete(self) -> None:
         """Raise `InputError` for an object that a path can meet and that its owner's `traverse` does not show."""
         shown = {kind: set(self.of(kind)) for kind in _KINDS}
         shapes = [

@@ -20,6 +20,8 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 _TEXTURES = ("BitmapTextureImpl", "UniformSpectrum", "SRGBReflectanceSpectrum", "Checkerboard")
 """Beginnings of the class names of textures that read texture coordinates alone."""
 _ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
+_TRAVERSED = ("mitsuba", "unrender")
+"""Packages whose plugins show `mitsuba.traverse` all that they hold."""
 _FIXED = ("sampling_weight", "to_world", "to_uv")
 
 
@@ -43,6 +45,8 @@ class Lookups:
         if pair.volumetric:
             raise InputError("paths through participating media are not kept")
         self._graph = pair.loaded(previous).graph
+        self._graph.check_complete()
+        _check_plugins(self._graph)
         properties = pair.loaded(previous).parameters.properties
         surfaces: dict[Any, list[Any]] = {}
         emitters: dict[Any, None] = {}
@@ -79,25 +83,52 @@ def _slots(graph: ObjectGraph, node: Any, leaf: str) -> Iterator[tuple[Any, Any]
 
     Raises `ValueError` that tells why one of them is not served.
     """
-    chains = list(graph.chains(node))
     if leaf in _FIXED:
         raise ValueError("it decides where paths go")
+    chains, checked = list(graph.chains(node)), set()
     for chain in [chain for chain in chains if len(chain) > 2] or chains:
         place = next((i for i, item in enumerate(chain) if isinstance(item, (mi.BSDF, mi.Emitter))), None)
         if place is None:
             raise ValueError("it is neither a material's nor an emitter's, so it moves paths")
         owner = chain[place]
-        for texture in chain[:place]:
+        way = tuple(item for item in chain if not isinstance(item, (mi.Shape, mi.Scene)))
+        if way in checked:  # by another shape
+            continue
+        checked.add(way)
+        # A texture may hold others beside the parameter's.
+        for texture in (*chain[:place], *_below(graph, owner if isinstance(owner, mi.Emitter) else chain[place - 1])):
             if not texture.class_name().startswith(_TEXTURES):
                 raise ValueError(f"{texture.class_name()} looks up more than texture coordinates")
+        _check_around(owner, way[place + 1 :])
         if isinstance(owner, mi.Emitter):
             if owner.class_name() not in ("AreaLight", *_ENVIRONMENTS):
                 raise ValueError(f"the light of {owner.class_name()} is not kept")
             yield owner, None
             continue
-        bsdfs = [item for item in chain if isinstance(item, mi.BSDF)]
-        _check_bsdfs(graph, bsdfs)
-        yield chain[place - 1], bsdfs[-1]
+        _check_bsdfs(graph, way[place:])
+        yield chain[place - 1], way[-1]
+
+
+def _below(graph: ObjectGraph, node: Any) -> Iterator[Any]:
+    """Yield all that an object holds, and what that holds."""
+    for other, owners in graph.owners.items():
+        if node in owners:
+            yield other
+            yield from _below(graph, other)
+
+
+def _check_around(owner: Any, around: Sequence[Any]) -> None:
+    """Raise `ValueError` for an object that paths meet in the place of a light, or of a BSDF and its two sides."""
+    for item in around:
+        if isinstance(owner, mi.Emitter) or not isinstance(item, mi.BSDF):
+            raise ValueError(f"it lies under a {item.class_name()}")
+
+
+def _check_plugins(graph: ObjectGraph) -> None:
+    """Raise `InputError` where a plugin in Python may hold a served texture and not show it to `mitsuba.traverse`."""
+    for node in graph.nodes:
+        if type(node).__module__.partition(".")[0] not in _TRAVERSED:
+            raise InputError(f"paths are not kept beside {type(node).__name__}, a plugin in Python")
 
 
 def _check_bsdfs(graph: ObjectGraph, bsdfs: Sequence[Any]) -> None:

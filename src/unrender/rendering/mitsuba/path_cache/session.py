@@ -52,10 +52,10 @@ class CachingSession(SessionWrapper):
     ):
         if not derivatives or pair.single or paths.max_depth > _DEEPEST:
             raise InputError("paths are not kept: no derivatives, one state, or too many segments")
-        lookups = Lookups(pair, keys)
+        self._keys = tuple(sorted(keys))  # Sessions of the same keys in another order number lookups alike.
+        lookups = Lookups(pair, self._keys)
         super().__init__(inner)
         self._pair, self._depth = pair, paths.max_depth
-        self._keys = tuple(keys)
         self._objects = {False: (lookups.textures, lookups.emitters)}
         self._task = TracePass(lookups, paths.max_depth, paths.rr_depth)
         self._evaluation = Evaluation(lookups, paths.max_depth)
@@ -78,7 +78,9 @@ class CachingSession(SessionWrapper):
         self._inner.set_parameters(parameters)
         vertices = self._inner.run(self._task, request)
         (radiance,) = self._radiance(vertices, (False,), request)
-        return Rendering(self._inner.develop(radiance, request), None, Paths(request, radiance, vertices=vertices))
+        return Rendering(
+            self._inner.develop(radiance, request), None, Paths(request, radiance, vertices=vertices, keys=self._keys)
+        )
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         if self.path_bytes(request) > _MOST_BYTES:
@@ -92,12 +94,14 @@ class CachingSession(SessionWrapper):
         vertices = self._inner.run(self._task, request)
         radiances = self._radiance(vertices, (False, True), request)
         images, before = (self._inner.develop(radiance, request) for radiance in radiances)
-        return Rendering(images, before, Paths(request, radiances[0], radiances[1], space, previous, vertices))
+        return Rendering(
+            images, before, Paths(request, radiances[0], radiances[1], space, previous, vertices, self._keys)
+        )
 
     # ------------------------------------------------------------------ derivatives
 
     def adjoint(self, parameters: Tree, paths: Paths, weights: mi.TensorXf) -> Tree:
-        if paths.vertices is None:
+        if not self._keeps(paths):
             return self._inner.adjoint(parameters, paths, weights)
         self._inner.set_parameters(parameters)
         self._backward(paths, {False: (weights, paths.radiance)})
@@ -106,7 +110,7 @@ class CachingSession(SessionWrapper):
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Paths, weights: mi.TensorXf, weights_previous: mi.TensorXf
     ) -> tuple[Tree, Tree]:
-        if paths.vertices is None:
+        if not self._keeps(paths):
             return self._inner.adjoint_pair(current, previous, paths, weights, weights_previous)
         self._inner.set_parameters(current)
         self._inner.set_parameters(previous, previous=True)
@@ -120,6 +124,10 @@ class CachingSession(SessionWrapper):
         return self._inner.tangent_moment(parameters, paths, tangents, combined)
 
     # ------------------------------------------------------------------ launches
+
+    def _keeps(self, paths: Paths) -> bool:
+        """Whether the vertices of the paths are in memory and have the numbers of this session's lookups."""
+        return paths.vertices is not None and paths.keys == self._keys
 
     def _radiance(
         self, vertices: dict[str, Any], states: tuple[bool, ...], request: SampleRequest
