@@ -194,6 +194,30 @@ def test_a_texture_that_was_black_when_paths_were_traced() -> None:
     assert abs(found.mean() / expected.mean() - 1) < 0.03
 
 
+def test_the_gradient_of_black_texels_has_their_indirect_light() -> None:
+    """Against a difference on the same paths. Path replay leaves that light out: nothing is left to divide by the reflectance."""
+    session, current, _ = prepared("textures")
+    rng, request, step = np.random.default_rng(2), SampleRequest(0, 4, 7), 1e-2
+    black = {key: arrays.numpy(value) * (rng.random(value.shape) < 0.5) for key, value in current.items()}
+    along = {key: np.where(value == 0, rng.random(value.shape), 0.0) for key, value in black.items()}
+
+    def rendering(length: float) -> Any:
+        moved = {key: (value + length * along[key]).astype(np.float32) for key, value in black.items()}
+        return session.image({key: mi.TensorXf(value) for key, value in moved.items()}, request)  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+    at, after = rendering(0), rendering(step)
+    weights = rng.normal(size=at.images.shape).astype(np.float32)
+    expected = ((arrays.numpy(after.images).astype(float) - arrays.numpy(at.images)) * weights).sum() / step
+    values = {key: mi.TensorXf(value.astype(np.float32)) for key, value in black.items()}  # pyright: ignore[reportCallIssue, reportArgumentType]
+
+    def slope(of: Any) -> float:
+        gradient = of.adjoint(values, of.image(values, request).paths, mi.TensorXf(weights))
+        return sum(float((arrays.numpy(gradient[key]) * along[key]).sum()) for key in along)
+
+    assert slope(session) == pytest.approx(expected, rel=0.02)
+    assert slope(session._inner) != pytest.approx(expected, rel=0.05)
+
+
 def test_large_renderings_and_random_numbers_alone_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     session, current, previous = prepared("textures")
     request = SampleRequest(0, 2, 7)
@@ -207,6 +231,18 @@ def test_large_renderings_and_random_numbers_alone_are_not_kept(monkeypatch: pyt
         assert rendering.paths.vertices is None
         weights = mi.TensorXf(np.ones(rendering.images.shape, np.float32))  # pyright: ignore[reportCallIssue]
         assert set(session.adjoint(current, rendering.paths, weights)) == set(current)
+
+
+def test_paths_in_use_share_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A loop that renders many views before its adjoints traces those that would take more."""
+    session, current, _ = prepared("textures")
+    monkeypatch.setattr(caching, "_MOST_ALIVE", 2 * session.path_bytes(SampleRequest(0, 2, 7)))
+    renderings = [session.image(current, SampleRequest(0, 2, seed)) for seed in range(4)]
+    assert [rendering.paths.vertices is not None for rendering in renderings] == [True, True, False, False]
+    weights = renderings[0].images
+    assert all(set(session.adjoint(current, each.paths, weights)) == set(current) for each in renderings)
+    del renderings
+    assert session.image(current, SampleRequest(0, 2, 9)).paths.vertices is not None
 
 
 def test_kernels_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -26,14 +27,19 @@ _DEEPEST = 16
 """Segments of the longest paths that are kept: kernels have a stage for each."""
 _MOST_BYTES = 1 << 26
 """Memory that the paths of one rendering may take. Larger renderings trace their adjoints."""
+_MOST_ALIVE = 1 << 29
+"""Memory that all paths of a session may take which are still in use, where a loop renders all views before their adjoints."""
 
 
 class CachingSession(SessionWrapper):
     """A `MitsubaSession` whose paths are traced once and kept for their adjoints.
 
     Neither rays nor densities depend on the parameters of `Lookups`. So a pair's previous image, and each adjoint, cost a tenth of a traced
-    one. Samples and results are the inner session's, but for rounding. Renderings whose paths would take more than 64 MB, and
-    pairs that share random numbers alone, are the inner session's.
+    one. Samples and results are the inner session's, but for rounding. Only gradients by reflectances that are exactly 0 differ: they
+    include the indirect light, which path replay leaves out.
+
+    The inner session serves pairs that share random numbers alone, and renderings whose paths would take too much memory: more than
+    64 MB, or more than 512 MB with those of all renderings that are still in use.
 
     Args:
         pair: both loads of the scene.
@@ -60,6 +66,7 @@ class CachingSession(SessionWrapper):
         self._task = TracePass(lookups, paths.max_depth, paths.rr_depth)
         self._evaluation = Evaluation(lookups, paths.max_depth)
         self._functions: dict[tuple[Any, ...], FrozenFunction] = {}
+        self._alive: list[weakref.ref[Paths]] = []
 
     @property
     def dropped(self) -> DroppedSamples:
@@ -70,20 +77,34 @@ class CachingSession(SessionWrapper):
         """Memory that the paths of a rendering take."""
         return self._task.bytes_per_row * self._depth * self._inner.count(request) * request.spp
 
+    def _fits(self, request: SampleRequest) -> bool:
+        """Whether the memory suffices to keep a rendering's paths."""
+        alive = [paths for reference in self._alive if (paths := reference()) is not None]
+        self._alive = [weakref.ref(paths) for paths in alive]
+        size = self.path_bytes(request)
+        return size <= _MOST_BYTES and size + sum(self.path_bytes(paths.request) for paths in alive) <= _MOST_ALIVE
+
+    def _kept(self, paths: Paths) -> Paths:
+        """Count the memory of the paths until nobody uses them."""
+        self._alive.append(weakref.ref(paths))
+        return paths
+
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        if self.path_bytes(request) > _MOST_BYTES:
+        if not self._fits(request):
             return self._inner.image(parameters, request)
         self._inner.set_parameters(parameters)
         vertices = self._inner.run(self._task, request)
         (radiance,) = self._radiance(vertices, (False,), request)
         return Rendering(
-            self._inner.develop(radiance, request), None, Paths(request, radiance, vertices=vertices, keys=self._keys)
+            self._inner.develop(radiance, request),
+            None,
+            self._kept(Paths(request, radiance, vertices=vertices, keys=self._keys)),
         )
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        if self.path_bytes(request) > _MOST_BYTES:
+        if not self._fits(request):
             return self._inner.image_pair(current, previous, request, space)
         if space != "path":
             # Of the current state, to the bit the image that it has alone.
