@@ -146,12 +146,9 @@ def test_a_mesh_is_built_by_the_constructor_of_either_layout(monkeypatch: pytest
         def set_bsdf(self, given: Any) -> None:
             made["bsdf"] = given
 
-        def set_id(self, name: str) -> None:
-            made["id"] = name
-
     monkeypatch.setattr(mi, "Mesh", Recorder)
     mesh_layout.build("square", POINTS, faces, None, texcoords, bsdf)
-    assert (made["name"], made["id"], made["bsdf"]) == ("square", "square", bsdf)
+    assert (made["name"], made["bsdf"]) == ("square", bsdf)
     assert {name: value.shape for name, value in made.items() if dr.is_tensor_v(value)} == {
         "faces": (2, 3),
         "positions": (4, 3),

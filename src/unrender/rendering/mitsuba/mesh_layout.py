@@ -162,7 +162,7 @@ def build(
     """Return a new mesh with smooth normals.
 
     Args:
-        name: its id.
+        name: for messages. The id is left to the scene's description: two objects may hold meshes of one name.
         points: (V, 3).
         triangles: (F, 3), numbers of vertices.
         normals: (V, 3); None for those that Mitsuba computes.
@@ -191,7 +191,6 @@ def build(
         _fill(mesh, {FACES: corners, POSITIONS: given[POSITIONS], TEXCOORDS: given[TEXCOORDS]})
         # In a second update: Mitsuba computes normals anew whenever positions change.
         _fill(mesh, {NORMALS: given[NORMALS]})
-    mesh.set_id(name)
     return mesh
 
 

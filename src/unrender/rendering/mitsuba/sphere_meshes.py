@@ -82,7 +82,9 @@ def _mesh(sphere: Any) -> Any:
     outwards = np.array(sample.p).reshape(-1) - matrix[:3, 3]
     if outwards @ np.array(sample.n).reshape(-1) < 0:  # `flip_normals`
         normals, faces = -normals, faces[:, ::-1]
-    return mesh_layout.build(sphere.id(), points, faces, _unit(normals), np.stack([u, v], -1), sphere.bsdf())
+    mesh = mesh_layout.build(sphere.id(), points, faces, _unit(normals), np.stack([u, v], -1), sphere.bsdf())
+    mesh.set_id(sphere.id())
+    return mesh
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
