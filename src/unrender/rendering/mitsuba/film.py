@@ -42,6 +42,10 @@ class RepeatingSampler:
         """Another with the same numbers to come."""
         return RepeatingSampler(self.period, mi.PCG32(self.rng), self.lanes)  # pyright: ignore[reportCallIssue]
 
+    def wavefront_size(self) -> int:
+        """Return the number of lanes."""
+        return dr.width(self.rng)
+
     def next_1d(self, active: Any = True) -> Any:
         """A uniform number per lane, in lanes that are not active, too."""
         del active
