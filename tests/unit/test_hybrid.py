@@ -235,6 +235,8 @@ def test_a_block_of_numbers_is_solved_beside_a_texture(tmp_path: Path) -> None:
     errors = asked.parameter_error(whole.parameters)
     assert errors["pose"] < 0.04
     assert errors["map"] < 0.05
+    first = ur.optimize(asked, block(wait=9), solver(), steps=6)
+    assert not [line for line in first.warnings if "gradient is zero" in line]
     ur.optimize(asked, estimator, solver(), steps=20, run_directory=tmp_path / "run")
     resumed = ur.resume(tmp_path / "run", asked, steps=80)
     for key in TRUTH:

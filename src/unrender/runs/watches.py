@@ -8,6 +8,7 @@ import numpy as np
 
 from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import BlockEstimate
 from unrender.runs.hooks import Hook
 from unrender.scene.self_intersections import crossing_triangles
 from unrender.scene.surfaces import folds
@@ -47,14 +48,18 @@ _STEPS = 5
 
 
 class InfluenceWatch(Hook):
-    """Warns of parameters whose gradient was exactly zero in each of the first five steps."""
+    """Warns of parameters whose gradient was exactly zero in each of the first five steps. Parameters that wait for a later step are left
+    out: nothing was estimated of them.
+    """
 
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
         run, zero = descent.run, descent.state.zero_gradient
         if not applied or run.step > _STEPS:
             return
+        block = estimate.get(BlockEstimate)
+        waiting = block.keys if block is not None and block.estimate is None else ()
         for key, gradient in estimate.gradient.items():
-            zero[key] = zero[key] and arrays.number(memory.square(gradient)) == 0.0
+            zero[key] = zero[key] and key not in waiting and arrays.number(memory.square(gradient)) == 0.0
             if zero[key] and run.step == _STEPS:
                 run.warnings.append(
                     f"parameter {key}: its gradient is zero so far; it does not seem to influence the images"
