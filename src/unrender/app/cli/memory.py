@@ -62,7 +62,10 @@ def says_so(error: BaseException) -> bool:
 
 def exhaustion(how: str = "") -> str:
     """Return the line for a command that ran out of memory."""
-    limit = f" ({_described()})" if limits.address_space() or limits.group_memory() else ""
+    try:
+        limit = f" ({described})" if (described := _described()) else ""
+    except MemoryError:  # there is not enough to read the limits
+        limit = ""
     return (
         f"out of memory{limit}{how}; what a run had written remains. Allow more memory, or use fewer samples (--set spp=N), "
         "smaller pictures or fewer --threads"
