@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks.runner import apart
 from benchmarks.runner.records import scratch
 from benchmarks.suite import scenes
 from benchmarks.suite.run import FOREIGN, GALLERY, visible
@@ -45,7 +44,11 @@ def main(arguments: Sequence[str]) -> int:
     finished = True
     for row in rows:
         for seed in range(given.seeds):
-            found = {"row": row, "seed": seed, **_apart(row, given.assets, given.seconds, seed)}
+            found = {
+                "row": row,
+                "seed": seed,
+                **apart.call(_run, row, given.assets, given.seconds, seed, seconds=_SECONDS_OF_A_ROW),
+            }
             finished &= found.get("status") == "finished"
             with given.file.open("a") as file:
                 file.write(json.dumps(found) + "\n")
@@ -55,30 +58,8 @@ def main(arguments: Sequence[str]) -> int:
     return int(not finished)
 
 
-def _apart(row: str, assets: Path | None, seconds: float, seed: int) -> dict[str, Any]:
-    """Run a row in a process of its own."""
-    context = multiprocessing.get_context("fork")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_send, args=(theirs, row, assets, seconds, seed))
-    process.start()
-    theirs.close()
-    try:
-        found = ours.recv() if ours.poll(_SECONDS_OF_A_ROW) else {"failed": f"no answer in {_SECONDS_OF_A_ROW:g} s"}
-    except EOFError:
-        found = {"failed": "the process ended"}
-    process.kill()
-    process.join()
-    return found
-
-
-def _send(connection: Any, row: str, assets: Path | None, seconds: float, seed: int) -> None:
-    try:
-        connection.send(_run(row, assets, seconds, seed))
-    except BaseException:  # any traceback is a finding
-        connection.send({"failed": traceback.format_exc()[-800:]})
-
-
 def _run(row: str, assets: Path | None, seconds: float, seed: int) -> dict[str, Any]:
+    """Run a row."""
     if row in GALLERY:
         problem = ur.gallery.problem(row, **_SIZES)
     else:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import unrender as ur
+from benchmarks.runner import apart
 
 __all__ = ["RECORD", "main"]
 
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str]) -> int:
             known = record.get(name) if given.descents else None
             if known is not None and "parameters" not in known:
                 continue  # refused as a whole
-            record[name] = _measure_apart(name, known)
+            record[name] = apart.call(_measure, name, known, seconds=_SECONDS)
             print(name, json.dumps(record[name]), flush=True)
             given.record.write_text(json.dumps({key: record[key] for key in scenes if key in record}, indent=1) + "\n")
     if given.record != RECORD:
@@ -50,26 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     return 0
 
 
-def _measure_apart(name: str, known: dict[str, Any] | None) -> dict[str, Any]:
-    """Measure a plugin in a process of its own, which Mitsuba may end."""
-    context = multiprocessing.get_context("fork")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_send, args=(theirs, name, known))
-    process.start()
-    theirs.close()
-    try:
-        found = ours.recv() if ours.poll(_SECONDS) else {"failed": f"no answer within {_SECONDS:g} s"}
-    except EOFError:
-        found = {"failed": "the process ended"}
-    process.kill()
-    process.join()
-    return found
+def _measure(name: str, known: dict[str, Any] | None) -> dict[str, Any]:
+    from benchmarks.coverage.measure import measure  # imports Mitsuba, in the process of its own
 
-
-def _send(connection: Any, name: str, known: dict[str, Any] | None) -> None:
-    from benchmarks.coverage.measure import measure
-
-    try:
-        connection.send(measure(name, known))
-    except BaseException as error:  # any traceback is a finding
-        connection.send({"failed": f"{type(error).__name__}: {error}"[:400]})
+    return measure(name, known)
