@@ -13,6 +13,7 @@ from unrender.core import arrays
 
 if TYPE_CHECKING:
     import mitsuba as mi
+    import pytest
 
 
 def on_device(x: Any) -> mi.TensorXf:
@@ -20,6 +21,24 @@ def on_device(x: Any) -> mi.TensorXf:
     import mitsuba as mi
 
     return mi.TensorXf(arrays.owned(x, mi.Float), np.shape(x))
+
+
+def count_recordings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that gets an entry for each attempt to record a function, until the monkeypatch ends."""
+    from unrender.rendering.mitsuba import frozen
+
+    found: list[int] = []
+    make = frozen._recorder
+
+    def counting(function: Any, tracing: Any) -> Any:
+        def counted(*arguments: Any) -> Any:
+            found.append(1)
+            return function(*arguments)
+
+        return make(counted, tracing)
+
+    monkeypatch.setattr(frozen, "_recorder", counting)
+    return found
 
 
 @contextmanager

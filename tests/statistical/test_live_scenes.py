@@ -11,6 +11,7 @@ import pytest
 import zoo
 
 import unrender as ur
+from kernels import count_recordings
 from unrender.rendering.mitsuba import frozen
 
 KEY = "back.bsdf.reflectance.data"
@@ -25,19 +26,7 @@ def warned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture
 def recordings(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """One entry for each attempt to record a function."""
-    found: list[int] = []
-    make = frozen._recorder
-
-    def counting(function: Any, tracing: Any) -> Any:
-        def counted(*arguments: Any) -> Any:
-            found.append(1)
-            return function(*arguments)
-
-        return make(counted, tracing)
-
-    monkeypatch.setattr(frozen, "_recorder", counting)
-    return found
+    return count_recordings(monkeypatch)
 
 
 def room(views: int = 1) -> dict[str, Any]:
