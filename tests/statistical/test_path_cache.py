@@ -11,9 +11,10 @@ import pytest
 import zoo
 
 import unrender as ur
+from kernels import count_recordings
 from unrender.core import arrays
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba import frozen, turntable_light
+from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.mitsuba.integrators.emitters import EmitterConnection
 from unrender.rendering.mitsuba.path_cache import lookups
 from unrender.rendering.mitsuba.path_cache import session as caching
@@ -233,11 +234,16 @@ def test_large_renderings_and_random_numbers_alone_are_not_kept(monkeypatch: pyt
         assert set(session.adjoint(current, rendering.paths, weights)) == set(current)
 
 
-def test_paths_in_use_share_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("pairs", [False, True])
+def test_paths_in_use_share_a_budget(monkeypatch: pytest.MonkeyPatch, pairs: bool) -> None:
     """A loop that renders many views before its adjoints traces those that would take more."""
-    session, current, _ = prepared("textures")
+    session, current, previous = prepared("textures")
+
+    def render(request: SampleRequest) -> Any:
+        return session.image_pair(current, previous, request, "path") if pairs else session.image(current, request)
+
     monkeypatch.setattr(caching, "_MOST_ALIVE", 2 * session.path_bytes(SampleRequest(0, 2, 7)))
-    renderings = [session.image(current, SampleRequest(0, 2, seed)) for seed in range(4)]
+    renderings = [render(SampleRequest(0, 2, seed)) for seed in range(4)]
     assert [rendering.paths.vertices is not None for rendering in renderings] == [True, True, False, False]
     weights = renderings[0].images
     assert all(set(session.adjoint(current, each.paths, weights)) == set(current) for each in renderings)
@@ -246,17 +252,7 @@ def test_paths_in_use_share_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_kernels_are_recorded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded: list[int] = []
-    make = frozen._recorder
-
-    def counting(function: Any, tracing: Any) -> Any:
-        def counted(*arguments: Any) -> Any:
-            recorded.append(1)
-            return function(*arguments)
-
-        return make(counted, tracing)
-
-    monkeypatch.setattr(frozen, "_recorder", counting)
+    recorded = count_recordings(monkeypatch)
     session, current, previous = prepared("texture and emitters")
     counts = []
     for step in range(6):

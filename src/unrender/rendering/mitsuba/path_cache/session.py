@@ -97,11 +97,8 @@ class CachingSession(SessionWrapper):
         self._inner.set_parameters(parameters)
         vertices = self._inner.run(self._task, request)
         (radiance,) = self._radiance(vertices, (False,), request)
-        return Rendering(
-            self._inner.develop(radiance, request),
-            None,
-            self._kept(Paths(request, radiance, vertices=vertices, keys=self._keys)),
-        )
+        paths = Paths(request, radiance, vertices=vertices, keys=self._keys)
+        return Rendering(self._inner.develop(radiance, request), None, self._kept(paths))
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         if not self._fits(request):
@@ -115,9 +112,8 @@ class CachingSession(SessionWrapper):
         vertices = self._inner.run(self._task, request)
         radiances = self._radiance(vertices, (False, True), request)
         images, before = (self._inner.develop(radiance, request) for radiance in radiances)
-        return Rendering(
-            images, before, Paths(request, radiances[0], radiances[1], space, previous, vertices, self._keys)
-        )
+        paths = Paths(request, radiances[0], radiances[1], space, previous, vertices, self._keys)
+        return Rendering(images, before, self._kept(paths))
 
     # ------------------------------------------------------------------ derivatives
 

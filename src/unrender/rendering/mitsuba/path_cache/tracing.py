@@ -205,9 +205,8 @@ class TracePass(Pass):
     def _write(
         self, record: _Record, source: str, row: UInt32, light: Spectrum, number: UInt32, place: Any, active: Bool
     ) -> None:
-        weighted = (
-            mi.Color3f(light) * record.weight
-        )  # negative in some lobes of a film's filter, where paths go on all the same
+        # The weight is negative in some lobes of a film's filter, where paths go on all the same.
+        weighted = mi.Color3f(light) * record.weight
         if not self.lookups.emitters:
             dr.scatter_add(record.arrays["light"], weighted, row, active)
             return
