@@ -1,4 +1,4 @@
-"""What `unrender compare` prints: one table for each metric. Apart, since its imports would cost `unrender --help` a second."""
+"""Tables that `unrender compare` prints, one for each metric. A module of its own: its imports would make `unrender --help` slow."""
 
 from __future__ import annotations
 

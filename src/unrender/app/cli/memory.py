@@ -37,8 +37,10 @@ _is_child = False
 
 def check() -> None:
     """Raise `VariantError` where `ulimit -v` leaves too few addresses for the libraries to be loaded."""
-    given, needed = limits.address_space(), _BASE + _PER_CORE * limits.cores()
-    if 0 < given < needed:
+    if not (given := limits.address_space()):
+        return
+    needed = _BASE + _PER_CORE * limits.cores()
+    if given < needed:
         raise VariantError(
             f"memory: {_described()}, expected at least {needed >> 10} kB on {limits.cores()} cores; raise it: ulimit -v unlimited"
         )
