@@ -61,21 +61,6 @@ def _block(block: BlockEstimate, problem: Problem, parameters: Tree) -> BlockEst
     return BlockEstimate(block.keys, by_coordinates(block.estimate, restricted(problem, block.keys), own))
 
 
-def regularized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
-    """The estimate of the loss with the terms of regularizers added, which have no noise; itself where there are none."""
-    regularizers = {key: u.regularizer for key, u in problem.unknowns.items() if u.regularizer is not None}
-    if not regularizers:
-        return estimate
-    loss, added = estimate.loss, {}
-    for key, regularizer in regularizers.items():
-        value, gradient = regularizer.evaluate(arrays.numpy(parameters[key]))
-        loss, added[key] = loss + value, arrays.like(gradient.astype(np.float32), estimate.gradient[key])
-    if estimate.preconditioned:
-        added = problem.coordinates.pull_back(added, problem.coordinates.slopes(parameters))
-    total = {key: g + added[key] if key in added else g for key, g in estimate.gradient.items()}
-    return replace(estimate, loss=loss, gradient=total)
-
-
 def _second_order(
     capability: Capability, gradient: Tree, problem: Problem, parameters: Tree, slopes: Tree
 ) -> Capability:

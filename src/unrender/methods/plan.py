@@ -35,6 +35,12 @@ class Plan:
     settings: Mapping[str, ParameterSettings] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
 
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The reasons, and the priors of the problem, which the loss contains, one line each."""
+        priors = {key: u.prior for key, u in self.problem.unknowns.items() if u.prior is not None}
+        return (*self.reasons, *(f"prior of {key}: {prior.describe()}" for key, prior in priors.items()))
+
     def configured(self) -> Problem:
         """Return the problem with the settings of this plan. Raises `InputError` for a setting that does not suit."""
         return self.problem.configured(self.settings)

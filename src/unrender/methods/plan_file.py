@@ -60,5 +60,5 @@ def text(plan: Plan) -> str:
     for name in ("estimator", "optimizer"):
         if isinstance(table[name], str):
             raise InputError(f"{name}: {table[name]}")
-    reasons = "".join(f"# {line}\n" for line in plan.reasons)
+    reasons = "".join(f"# {line}\n" for line in plan.lines)
     return f"{reasons}\n{tomli_w.dumps(table)}" if reasons else tomli_w.dumps(table)

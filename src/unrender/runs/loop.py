@@ -15,7 +15,8 @@ from unrender.core.random import Key, check_seed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
-from unrender.estimators.coordinates import by_coordinates, regularized
+from unrender.estimators.coordinates import by_coordinates
+from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Choosing, Measuring, OnMeshes, Optimizer
 from unrender.runs.hooks import Hook
@@ -156,7 +157,7 @@ def _discarded_step(run: Run, state: RunState) -> None:
     """One step for its kernels alone."""
     key = Key(run.seed, 0, stream=1)
     found, state.estimator = run.estimator.estimate(run.problem, run.parameters, state.estimator, key)
-    found = regularized(found, run.problem, run.parameters)
+    found = penalized(found, run.problem, run.parameters)
     memory.trim_cache(run.parameters)
     update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
     run.parameters, state.optimizer = update.parameters, update.state
@@ -182,7 +183,7 @@ def _step(
     run.estimate = None  # its gradient is as large as the one to come
     memory.trim_cache(run.parameters)
     estimate, after = run.estimator.estimate(problem, run.parameters, state.estimator, Key(run.seed, run.step))
-    estimate = regularized(estimate, problem, run.parameters)
+    estimate = penalized(estimate, problem, run.parameters)
     memory.trim_cache(run.parameters)
     culprit = _not_finite(estimate)
     if not culprit:

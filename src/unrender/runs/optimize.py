@@ -102,7 +102,7 @@ def optimize(
         checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
     annotations = annotations or RunAnnotations()
     if isinstance(named, str) and not annotations.method:
-        annotations = replace(annotations, method=named, choices=plan.reasons)
+        annotations = replace(annotations, method=named, choices=plan.lines)
     run, state = prepare(plan, steps, seconds, seed)
     run.last_step = last_step(seconds) if annotations.within_seconds else None
     run.warnings += advice.remarks(problem, plan.optimizer)

@@ -14,6 +14,7 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
+from unrender.estimators.penalties import penalty
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.batches import PixelBatch, PixelSample
 from unrender.scene.problem import Problem
@@ -127,6 +128,8 @@ class FreshPictures:
         images = self.images(parameters, problem)
         parts = [self._losses(frame, of) for frame, of in zip(self.frames, images, strict=True)]
         losses = np.concatenate(parts, axis=1)
+        # Without noise, so each part gets the same share.
+        losses += penalty(problem or self._problem, parameters) / losses.shape[1]
         return Picture(tuple(images), losses)
 
     def images(self, parameters: Mapping[str, np.ndarray] | Tree, problem: Problem | None = None) -> list[np.ndarray]:

@@ -130,7 +130,7 @@ class Verify(Hook):
         memory = _memory(descent, pictures, last)
         disagrees = memory is not None and memory.disagrees
         kept = places[best][0] if places else last
-        lines = self._residual(result)
+        lines = self._residual(problem, result)
         few = result.steps < FEW_STEPS
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
@@ -155,7 +155,7 @@ class Verify(Hook):
             warnings=[*result.warnings, *lines],
         )
 
-    def _residual(self, result: Result) -> list[str]:
+    def _residual(self, problem: Problem, result: Result) -> list[str]:
         """The warning that the pictures have stopped to improve, and still differ from the references by more than noise."""
         earlier = next((one for one in reversed(self._earlier) if one.step <= _EARLIER * result.steps), None)
         if self._pictures is None or earlier is None:
@@ -174,10 +174,13 @@ class Verify(Hook):
         if found.score <= _SCORE or error <= _OF_PICTURE * size:
             return []
         noise = math.sqrt(max(float((weights[:, None] * residual**2).sum()) / total - found.mean_square, 0.0))
+        cause = "light, depth or something else that is not among the unknowns may be wrong"
+        if any(unknown.prior is not None for unknown in problem.unknowns.values()):
+            cause = f"a prior may be too strong, or {cause}"
         times = f", {error / noise:.1f} times its noise" if noise > 0 else ""
         return [
             f"the final picture differs from the references by {formatting.number(error)} ({error / size:.0%} of the picture{times}), and "
-            "no longer improves: light, depth or something else that is not among the unknowns may be wrong"
+            f"no longer improves: {cause}"
         ]
 
 

@@ -65,7 +65,7 @@ def _take(problem: Problem) -> dict[str, str]:
         found[f"parameter {key}: bounds"] = str(unknown.bounds)
         found[f"parameter {key}: learning_rate"] = str(unknown.learning_rate)
         found[f"parameter {key}: preconditioner"] = repr(unknown.preconditioner)
-        for name in ("parameterisation", "regularizer", "remeshing", "coarse_to_fine"):
+        for name in ("parameterisation", "regularizer", "prior", "remeshing", "coarse_to_fine"):
             if (setting := getattr(unknown, name)) is not None:
                 found[f"parameter {key}: {name}"] = repr(setting)
         if unknown.given.keys is not None:

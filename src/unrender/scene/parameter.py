@@ -17,6 +17,7 @@ from unrender.rendering.tied import Tie, TieError, with_ties
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
 from unrender.scene.mesh_regularizer import MeshRegularizer
+from unrender.scene.prior import Prior
 from unrender.scene.remeshing import Remeshing
 
 __all__ = ["Parameter", "ParameterSettings", "tied", "ties_of"]
@@ -43,6 +44,8 @@ class Parameter:
             bounds and results are the parameter's own. None for the identity.
         regularizer: of the vertex positions of a mesh, what is added to the loss: `MeshRegularizer`, or a table of its options such as
             {"bilaplacian": 0.001}; None for nothing.
+        prior: What is known of the values before any picture: `Prior`, or a table of its options such as {"smoothness": 0.05}; None for
+            nothing.
         remeshing: of the vertex positions of a mesh, when it gets other triangles: `Remeshing`, its steps alone, or a table of its options
             such as {"steps": [100], "method": "subdivide"}; None for never.
         self_intersection: of the vertex positions of a mesh, what is done where it passes through itself: "warn" looks now and then and
@@ -60,6 +63,7 @@ class Parameter:
     coarse_to_fine: CoarseToFine | Sequence[int] | None = None
     parameterisation: Parameterisation | str | Mapping[str, Any] | None = None
     regularizer: MeshRegularizer | Mapping[str, Any] | None = None
+    prior: Prior | Mapping[str, Any] | None = None
     remeshing: Remeshing | Sequence[int] | Mapping[str, Any] | None = None
     self_intersection: Literal["warn", "prevent", "ignore"] = "warn"
     keys: Sequence[str] | Mapping[str, float] | None = None

@@ -26,6 +26,7 @@ from unrender.scene.errors import FieldError
 from unrender.scene.executor import LOCAL, Executor
 from unrender.scene.mesh_checks import check_surfaces
 from unrender.scene.parameter import Parameter, ParameterSettings, tied, ties_of
+from unrender.scene.reference_noise import likelihood_scale
 from unrender.scene.references import References
 from unrender.scene.surfaces import Surface
 from unrender.scene.unknown import Unknown
@@ -238,6 +239,11 @@ class Problem(ViewLosses):
             {key: u.preconditioner for key, u in known if u.preconditioner is not None},
             {key: u.measure.repeated for key, u in known if u.measure.repeated},
         )
+
+    @cached_property
+    def prior_scale(self) -> float:
+        """The factor by which negative log densities of priors enter the loss, see `reference_noise.likelihood_scale`."""
+        return likelihood_scale(self)
 
     @cached_property
     def learning_rates(self) -> dict[str, float]:

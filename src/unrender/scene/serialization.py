@@ -80,7 +80,7 @@ def _parameter(index: int, unknown: Unknown, store: _Arrays) -> dict[str, Any]:
         table["preconditioner"] = _component(parameter.preconditioner)
     if unknown.parameterisation is not None:
         table["parameterisation"] = _component(unknown.parameterisation)
-    for name in ("coarse_to_fine", "regularizer", "remeshing"):
+    for name in ("coarse_to_fine", "regularizer", "prior", "remeshing"):
         if (setting := getattr(unknown, name)) is not None:
             table[name] = tables.fields(setting)
     if parameter.self_intersection != "warn":

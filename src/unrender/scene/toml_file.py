@@ -73,6 +73,9 @@ class _Parameter(Table):
     regularizer: dict[str, Any] | None = Field(
         None, description="of vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"
     )
+    prior: dict[str, Any] | None = Field(
+        None, description="a table such as { smoothness = 0.05 } or { near = [0.5, 0.5, 0.5], std = 0.1 }"
+    )
     remeshing: list[StrictInt] | dict[str, Any] | None = Field(
         None,
         description='of vertex positions, a list of steps such as [100], or a table such as { steps = [100], method = "subdivide" }',
@@ -164,7 +167,7 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
     given = {"parameterisation": model.parameterisation, "regularizer": model.regularizer, "remeshing": model.remeshing}
-    given |= {"self_intersection": model.self_intersection, "keys": model.keys}
+    given |= {"prior": model.prior, "self_intersection": model.self_intersection, "keys": model.keys}
     return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, **given)
 
 

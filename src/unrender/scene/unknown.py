@@ -13,6 +13,7 @@ from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.parameter import Parameter
+from unrender.scene.prior import Prior
 from unrender.scene.remeshing import Remeshing
 from unrender.scene.surfaces import Surface, surface_error
 
@@ -33,6 +34,7 @@ class Unknown:
         coarse_to_fine: Resolutions over the steps; None for one resolution.
         faces: (F, 3) numbers of vertices, where it is the vertex positions of a mesh; else None.
         regularizer: Bound to the mesh; None for none.
+        prior: Bound to the unknown; None for none.
         remeshing: When the mesh gets other triangles; None for never.
         truth: True value, of the shape of `initial`; None where it is not known.
         surface: True surface of a mesh, where it is not known which point of it a vertex belongs to; else None.
@@ -50,6 +52,7 @@ class Unknown:
     coarse_to_fine: CoarseToFine | None = None
     faces: np.ndarray | None = None
     regularizer: MeshRegularizer | None = None
+    prior: Prior | None = None
     remeshing: Remeshing | None = None
     truth: np.ndarray | None = None
     surface: Surface | None = None

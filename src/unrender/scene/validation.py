@@ -23,13 +23,14 @@ from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
-from unrender.scene import coarse_to_fine
+from unrender.scene import coarse_to_fine, prior
 from unrender.scene.bounds import check_bounds, clip_to_bounds, project
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
 from unrender.scene.key_hints import instead_of, near_key
 from unrender.scene.mesh_checks import check_regularizer, check_remeshing, check_self_intersection, mesh_notices
 from unrender.scene.parameter import Parameter, ParameterSettings
+from unrender.scene.prior import Prior
 from unrender.scene.unknown import Unknown
 
 _DEEPEST = 1 << 20
@@ -129,6 +130,8 @@ def check_parameter(
     mesh = None if info.moving_mesh is None else info.moving_mesh()
     with checking("regularizer"):
         regularizer = check_regularizer(parameter.regularizer, mesh)
+    with checking("prior"):
+        known_prior = None if parameter.prior is None else _bound_prior(parameter.prior, info, initial)
     with checking("remeshing"):
         remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
     with checking("self_intersection"):
@@ -149,9 +152,14 @@ def check_parameter(
         coarse_to_fine=schedule,
         faces=None if mesh is None else np.asarray(mesh[1]).astype(np.int64).reshape(-1, 3),
         regularizer=regularizer,
+        prior=known_prior,
         remeshing=remeshing,
         notices=tuple(notices),
     )
+
+
+def _bound_prior(given: Any, info: ParameterInfo, initial: np.ndarray) -> Prior:
+    return prior.of(given).on(initial, info.conversion.repeated, mesh_topology(info), info.welded)
 
 
 def _check_rate(rate: Any) -> float | None:

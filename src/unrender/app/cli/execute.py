@@ -65,7 +65,7 @@ def execute(
 ) -> Result:
     """Run, and leave a run folder. An interrupted run is saved as far as it came. `callbacks` listen besides."""
     plan = order.method.plan(order.problem, order.settings)
-    for line in plan.reasons:
+    for line in plan.lines:
         console.print(f"{order.method.name}: {escape(line)}", soft_wrap=True)
     options = order.method.options_of(order.settings)
     settings = {"options": options, "problem_options": dict(order.problem_settings)}
@@ -74,7 +74,7 @@ def execute(
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
     annotations = RunAnnotations(
-        order.method.name, settings, plan.reasons, order.command, order.final_spp, earlier, order.within_seconds
+        order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, order.within_seconds
     )
     live = Live(directory, order.problem.name, order.method.name, order.command)
     result = optimize(

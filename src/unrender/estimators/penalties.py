@@ -1,0 +1,113 @@
+"""Priors and regularizers of unknowns as parts of the loss: their values and derivatives, which have no noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from unrender.core import arrays, vectors
+from unrender.core.arrays import Array
+from unrender.core.trees import Tree
+from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import (
+    BlockEstimate,
+    Capability,
+    FreshGradient,
+    Hessian,
+    HessianProduct,
+    LossFunction,
+)
+from unrender.estimators.coordinates import restricted
+from unrender.scene.problem import Problem
+
+
+def penalty(problem: Problem, parameters: Mapping[str, Array | np.ndarray]) -> float:
+    """Return what priors and regularizers add to the loss at `parameters`; 0 where there are none."""
+    return sum(_terms(problem, key, parameters[key])[0] for key in _keys(problem))
+
+
+def penalized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
+    """Return the estimate with priors and regularizers added to the loss and its derivatives; itself where there are none.
+
+    Second derivatives and products of `estimate` are by the parameters. The part of regularizers of meshes in these is left out.
+    """
+    if not (keys := _keys(problem)):
+        return estimate
+    terms = {key: _terms(problem, key, parameters[key]) for key in keys}
+    added = {key: arrays.like(gradient.astype(np.float32), parameters[key]) for key, (_, gradient) in terms.items()}
+    if estimate.preconditioned:
+        added = problem.coordinates.pull_back(added, problem.coordinates.slopes(parameters))
+    capabilities = tuple(_added(one, added, problem, parameters) for one in estimate.capabilities)
+    return replace(
+        estimate,
+        loss=estimate.loss + sum(value for value, _ in terms.values()),
+        gradient=_sum(estimate.gradient, added),
+        capabilities=capabilities,
+    )
+
+
+def _keys(problem: Problem) -> list[str]:
+    return [key for key, u in problem.unknowns.items() if u.regularizer is not None or u.prior is not None]
+
+
+def _terms(problem: Problem, key: str, x: Array | np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the value of the terms of one unknown and their gradient, of its shape."""
+    unknown, values = problem.unknowns[key], x if isinstance(x, np.ndarray) else arrays.numpy(x)
+    value, gradient = 0.0, np.zeros(values.shape)
+    if unknown.regularizer is not None:
+        own, slope = unknown.regularizer.evaluate(values)
+        value, gradient = value + own, gradient + slope
+    if unknown.prior is not None:
+        own, slope = unknown.prior.evaluate(values)
+        value, gradient = value + problem.prior_scale * own, gradient + problem.prior_scale * slope
+    return value, gradient
+
+
+def _sum(gradient: Tree, added: Tree) -> Tree:
+    return {key: g + added[key] if key in added else g for key, g in gradient.items()}
+
+
+def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tree) -> Capability:
+    """Return a capability of the data's loss as one of the whole."""
+    match capability:
+        case FreshGradient(values):
+            return FreshGradient(_sum(values, added))
+        case Hessian(matrix):
+            product, shape = _product(problem, parameters), parameters
+            rows = [vectors.ravel(product(vectors.parts(row, shape))) for row in np.eye(len(arrays.numpy(matrix)))]
+            return Hessian(arrays.numpy(matrix).astype(np.float64) + np.stack(rows))
+        case HessianProduct(apply):
+            product = _product(problem, parameters)
+
+            def whole(v: Tree) -> Tree:
+                return _sum(apply(v), {key: arrays.like(x, v[key]) for key, x in product(v).items()})
+
+            return HessianProduct(whole)
+        case LossFunction(evaluate):
+
+            def losses(points: np.ndarray) -> np.ndarray:
+                split = [vectors.parts(point, parameters) for point in points]
+                return evaluate(points) + np.array([penalty(problem, x) for x in split])
+
+            return LossFunction(losses)
+        case BlockEstimate(keys, estimate) if estimate is not None:
+            own = {key: parameters[key] for key in keys}
+            return BlockEstimate(keys, penalized(estimate, restricted(problem, keys), own))
+    return capability
+
+
+def _product(problem: Problem, parameters: Tree) -> Callable[[Mapping[str, Array | np.ndarray]], dict[str, np.ndarray]]:
+    """Return v -> the product of the priors' curvature with v, by the parameters."""
+    unknowns, scale = problem.unknowns, problem.prior_scale
+    points = {key: arrays.numpy(x) for key, x in parameters.items()}
+
+    def product(v: Mapping[str, Array | np.ndarray]) -> dict[str, np.ndarray]:
+        found = {}
+        for key, x in v.items():
+            values, prior = x if isinstance(x, np.ndarray) else arrays.numpy(x), unknowns[key].prior
+            found[key] = np.zeros(points[key].shape) if prior is None else scale * prior.product(points[key], values)
+        return found
+
+    return product

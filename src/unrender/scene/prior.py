@@ -1,0 +1,270 @@
+"""Priors of unknowns: what is known of their values before any picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.core import checks, periodic, tables
+from unrender.core.errors import InputError
+from unrender.io import resampling
+from unrender.preconditioners import grid
+from unrender.preconditioners.mesh import MeshTopology
+
+_CORNER = 0.1
+"""Size of a difference, in units of `total_variation`, below which its norm is rounded to have a derivative at 0."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A prior density p(x) of one unknown x. The descent minimises the loss − s log p(x), with
+
+        −log p(x) / weight = Σ_e (x_e − near_e)² / (2 std²)
+                           + Σ_c min_k |x_c − palette_k|² / (2 std²)
+                           + Σ_(c ~ d) |x_c − x_d|² / (2 smoothness²)
+                           + Σ_(c ~ d) |x_c − x_d| / total_variation
+
+    over elements e, over texels, voxels or vertices c (or the one colour or number), and over pairs (c ~ d) of neighbours. Terms that
+    are not set are absent. s is the loss that the noise of the references alone causes, per pixel value and likelihood unit
+    (`reference_noise.likelihood_scale`): with an L2 or L1 loss and weight 1 the minimum is the maximum a posteriori estimate. Norms below
+    a tenth of `total_variation` are rounded to be differentiable. A prior biases the result towards itself, by design.
+
+    Args:
+        near: Expected value: a number, one number per channel, or "initial" for the unknown's initial value.
+        std: Standard deviation around `near` or around the nearest colour of `palette`, > 0, in units of the unknown.
+        palette: k >= 1 colours, each with one number per channel.
+        smoothness: Standard deviation of the difference of neighbours, > 0, in units of the unknown.
+        total_variation: Scale of the Laplace distribution of the difference of neighbours, > 0, in units of the unknown.
+        weight: Factor of all terms, > 0.
+
+    Raises:
+        InputError: No term, a term without its `std`, or a number out of range.
+    """
+
+    near: float | Sequence[float] | str | None = None
+    std: float | None = None
+    palette: Sequence[Sequence[float]] | None = None
+    smoothness: float | None = None
+    total_variation: float | None = None
+    weight: float = 1.0
+    _unknown: _Unknown | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        for name in ("std", "smoothness", "total_variation", "weight"):
+            if getattr(self, name) is not None:
+                checks.number("prior", name, getattr(self, name), above=0.0)
+        pulled = self.near is not None or self.palette is not None
+        if pulled != (self.std is not None):
+            raise InputError("prior: near or palette needs std, and std needs one of these")
+        if not pulled and self.smoothness is None and self.total_variation is None:
+            raise InputError("prior: expected near, palette, smoothness or total_variation")
+        if isinstance(self.near, str) and self.near != "initial":
+            raise InputError(
+                f'prior: near must be a number, one number per channel, or "initial", got {self.near!r:.60}'
+            )
+
+    def on(
+        self, initial: np.ndarray, repeated: int = 0, topology: MeshTopology | None = None, moving: bool = False
+    ) -> Prior:
+        """Return the prior bound to an unknown.
+
+        Args:
+            initial: Initial value, at the scene's resolution.
+            repeated: Number of columns at each end that repeat those of the other, for an environment map.
+            topology: Mesh at whose vertices the unknown has values; None for textures, volumes, colours and numbers.
+            moving: Whether the values are the positions of that mesh.
+
+        Raises:
+            InputError: A term that does not suit the unknown's shape.
+        """
+        shape = periodic.interior_shape(initial.shape, repeated)
+        channels = initial.size // len(topology.places) if topology is not None else _channels(shape)
+        inner = periodic.interior(initial, repeated)
+        near = None if self.near is None else _values(self.near, inner, channels)
+        palette = None if self.palette is None else _palette(self.palette, channels)
+        if self.smoothness is not None or self.total_variation is not None:
+            if moving:
+                raise InputError("prior: neighbouring positions differ; a mesh has regularizer = { bilaplacian = ... }")
+            if topology is None and not grid.is_map(shape):
+                raise InputError("prior: smoothness and total_variation need a texture, a volume or vertices of a mesh")
+        bound = Prior(self.near, self.std, self.palette, self.smoothness, self.total_variation, self.weight)
+        object.__setattr__(bound, "_unknown", _Unknown(channels, near, palette, repeated, topology))
+        return bound
+
+    def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return −log p(x) up to a constant, and its gradient, of the shape of `x`, in double precision."""
+        unknown = self._of()
+        cells = unknown.cells(x)
+        value, gradient = 0.0, np.zeros_like(cells)
+        if self.std is not None:
+            away = unknown.away(cells)
+            value += float(np.sum(away * away)) / (2 * self.std**2)
+            gradient += away / self.std**2
+        for scale, size, slope in self._pair_terms():
+            for i, j in unknown.neighbours(cells):
+                difference = cells[i] - cells[j]
+                norm = np.sqrt(np.sum(difference * difference, axis=-1, keepdims=True))
+                value += float(np.sum(size(norm / scale)))
+                pull = difference * slope(norm / scale) / scale**2
+                unknown.add(gradient, i, pull)
+                unknown.add(gradient, j, -pull)
+        return self.weight * value, self.weight * unknown.spread(gradient, x)
+
+    def product(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return M v, of the shape of `x`: M is positive semidefinite and equals the Hessian of −log p(x) for all quadratic terms.
+
+        The total variation's part of M is that of the quadratic function that touches it at `x` from above.
+        """
+        unknown = self._of()
+        cells, along = unknown.cells(x), unknown.cells(v)
+        product = np.zeros_like(cells)
+        if self.std is not None:
+            product += along / self.std**2
+        for scale, _, slope in self._pair_terms():
+            for i, j in unknown.neighbours(cells):
+                difference = cells[i] - cells[j]
+                norm = np.sqrt(np.sum(difference * difference, axis=-1, keepdims=True))
+                pull = (along[i] - along[j]) * slope(norm / scale) / scale**2
+                unknown.add(product, i, pull)
+                unknown.add(product, j, -pull)
+        return self.weight * unknown.spread(product, x)
+
+    def describe(self) -> str:
+        """Return the terms in one line."""
+        return ", ".join(
+            f"{name} {value}" for name, value in tables.fields(self).items() if name != "weight" or value != 1.0
+        )
+
+    def _of(self) -> _Unknown:
+        if self._unknown is None:
+            raise InputError("prior: it is bound to no unknown yet (on)")
+        return self._unknown
+
+    def _pair_terms(self) -> list[tuple[float, Any, Any]]:
+        """Return (scale, value, slope over r) of the terms of pairs, as functions of r, their distance in units of the scale."""
+        terms: list[tuple[float, Any, Any]] = []
+        if self.smoothness is not None:
+            terms.append((self.smoothness, lambda r: 0.5 * r * r, lambda r: 1.0))
+        if self.total_variation is not None:
+            terms.append((self.total_variation, _rounded, lambda r: 1 / np.sqrt(r * r + _CORNER**2)))
+        return terms
+
+
+def _rounded(r: np.ndarray) -> np.ndarray:
+    """Return √(r² + c²) − c."""
+    return np.sqrt(r * r + _CORNER**2) - _CORNER
+
+
+@dataclass(frozen=True, eq=False)
+class _Unknown:
+    """What a prior needs to know of its unknown.
+
+    Attributes:
+        channels: Number of values per texel, voxel or vertex.
+        near: Expected values, which broadcast with the cells; None for none.
+        palette: (k, channels); None for none.
+        repeated: Number of repeated columns at each end.
+        topology: Mesh of the vertices; None for grids and numbers.
+    """
+
+    channels: int
+    near: np.ndarray | None
+    palette: np.ndarray | None
+    repeated: int
+    topology: MeshTopology | None
+
+    def cells(self, x: np.ndarray) -> np.ndarray:
+        """Return the cells (..., channels) without repeated columns, in double precision."""
+        if self.topology is not None:
+            return x.astype(np.float64).reshape(-1, self.channels)
+        inner = periodic.interior(x.astype(np.float64), self.repeated)
+        return inner if inner.ndim and inner.shape[-1] == self.channels else inner.reshape(*inner.shape, 1)
+
+    def spread(self, values: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Return values of the cells in the shape of `x`; repeated columns, which are no unknowns, are copies."""
+        if not self.repeated:
+            return values.reshape(x.shape)
+        return periodic.pad(values.reshape(periodic.interior_shape(x.shape, self.repeated)), self.repeated)
+
+    def away(self, cells: np.ndarray) -> np.ndarray:
+        """Return the difference of the cells from the expected value or the nearest colour."""
+        if self.near is not None:
+            return cells - self._expected(cells.shape)
+        palette = np.asarray(self.palette)
+        nearest, least = np.broadcast_to(palette[0], cells.shape), np.full((*cells.shape[:-1], 1), np.inf)
+        for colour in palette:
+            distance = np.sum((cells - colour) ** 2, axis=-1, keepdims=True)
+            nearest, least = np.where(distance < least, colour, nearest), np.minimum(least, distance)
+        return cells - nearest
+
+    def _expected(self, shape: tuple[int, ...]) -> np.ndarray:
+        """Return the expected values, averaged over the cells of a coarser grid."""
+        near = np.asarray(self.near)
+        if near.size == self.channels or near.size == math.prod(shape):
+            return near if near.size == self.channels else near.reshape(shape)
+        return resampling.downsample(near, shape[:-1])
+
+    def neighbours(self, cells: np.ndarray) -> list[tuple[Any, Any]]:
+        """Return index pairs (i, j) into the cells, each pair of neighbours once."""
+        if self.topology is not None:
+            _, first = np.unique(self.topology.places, return_index=True)
+            i, j = first[self.topology.neighbours].T
+            return [(i, j)]
+        pairs: list[tuple[Any, Any]] = []
+        for axis in range(cells.ndim - 1):
+            before = (slice(None),) * axis
+            pairs.append(((*before, slice(1, None)), (*before, slice(None, -1))))
+            if self.repeated and axis == 1:  # an environment map continues from its last column to its first
+                pairs.append(((*before, slice(0, 1)), (*before, slice(-1, None))))
+        return pairs
+
+    def add(self, total: np.ndarray, index: Any, values: np.ndarray) -> None:
+        """Add values to the cells of an index of `neighbours`, which may repeat on meshes."""
+        if self.topology is None:
+            total[index] += values
+        else:
+            np.add.at(total, index, values)
+
+
+def of(given: Any) -> Prior:
+    """Return the prior that a user gives: a `Prior`, or a table of its options. Raises `InputError`."""
+    if isinstance(given, Prior):
+        return given
+    if not isinstance(given, Mapping):
+        raise InputError(f"expected a table such as {{ smoothness = 0.05 }}, got {given!r:.60}")
+    return tables.build(Prior, given)
+
+
+def _channels(shape: tuple[int, ...]) -> int:
+    """Return the number of channels: the last axis of textures (H, W, C) and volumes (Z, Y, X, C), all elements of a colour."""
+    return shape[-1] if shape else 1
+
+
+def _values(near: Any, initial: np.ndarray, channels: int) -> np.ndarray:
+    if isinstance(near, str):
+        return initial.astype(np.float64)
+    values = _numbers("near", near)
+    if values.ndim > 1 or values.size not in (1, channels):
+        raise InputError(f"prior: near must be a number or {channels} numbers, got an array of shape {values.shape}")
+    return np.broadcast_to(values, (channels,)).copy()
+
+
+def _palette(palette: Any, channels: int) -> np.ndarray:
+    colours = _numbers("palette", palette)
+    if colours.ndim != 2 or not len(colours) or colours.shape[1] != channels:
+        raise InputError(f"prior: palette must be a list of colours of {channels} numbers each")
+    return colours
+
+
+def _numbers(name: str, given: Any) -> np.ndarray:
+    try:
+        values = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        values = np.full(1, np.nan)
+    if not np.isfinite(values).all():
+        raise InputError(f"prior: {name} must have finite numbers")
+    return values
