@@ -52,11 +52,13 @@ def ended(process: subprocess.Popen[str], number: signal.Signals) -> float:
     process.send_signal(number)
     before = time.monotonic()
     _, said = process.communicate(timeout=60)
+    seconds = time.monotonic() - before
     if process.returncode == 0:  # it came too late
         assert said == ""
     else:
-        assert (process.returncode, said) == (128 + number, f"unrender: {WORDS[number]}\n")
-    return time.monotonic() - before
+        waited = f"unrender: {handled._WAITING}\n"
+        assert (process.returncode, said.removeprefix(waited)) == (128 + number, f"unrender: {WORDS[number]}\n")
+    return seconds
 
 
 def await_package(process: subprocess.Popen[str]) -> None:
@@ -85,6 +87,33 @@ def test_an_import_that_never_ends_is_interrupted_all_the_same(tmp_path: Path) -
     """)
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (143, "unrender: terminated\n")
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_compiled_code_that_goes_on_says_why_nothing_happens(tmp_path: Path, again: bool) -> None:
+    """The first signal is acknowledged though no handler can run, and the second ends the process."""
+    code = textwrap.dedent("""
+        import hashlib, os, signal, sys, threading, time
+        from unrender.app.cli import signals
+        signals._SILENT = 0.2
+        rounds, again = int(sys.argv[1]), sys.argv[2] == "True"
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+        if again:
+            threading.Timer(1.5, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        try:
+            with signals.Signals(process=True) as handled:
+                hashlib.pbkdf2_hmac("sha256", b"", b"", rounds)
+        except KeyboardInterrupt:
+            print("interrupted", handled.status)
+    """)
+    rounds = 2_000_000_000 if again else 6_000_000
+    words = [sys.executable, "-c", code, str(rounds), str(again)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
+    waiting = f"unrender: {handled._WAITING}\n"
+    if again:
+        assert (done.returncode, done.stderr) == (143, waiting + "unrender: terminated\n")
+    else:
+        assert (done.stdout, done.stderr) == ("interrupted 130\n", waiting)
 
 
 @pytest.mark.slow

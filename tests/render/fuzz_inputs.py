@@ -428,6 +428,29 @@ def faults(outcomes: list[Outcome]) -> list[str]:
     ]
 
 
+class Tally:
+    """Counts of the outcomes of one target, its processor seconds, and its largest input in memory and in time."""
+
+    def __init__(self) -> None:
+        self.kinds, self.faults = Counter[str](), 0
+        self.seconds = self.slowest = 0.0
+        self.largest = 0
+
+    def add(self, outcome: Outcome) -> None:
+        self.kinds[outcome.kind] += 1
+        self.faults += len(faults([outcome]))
+        self.seconds += outcome.seconds
+        self.slowest = max(self.slowest, outcome.seconds)
+        self.largest = max(self.largest, outcome.bytes)
+
+    def __str__(self) -> str:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(self.kinds.items()))
+        return (
+            f"{sum(self.kinds.values())} inputs in {self.seconds:.0f} processor seconds ({kinds}), at most "
+            f"{self.largest >> 20} MB and {self.slowest:.1f} s; {self.faults} faults"
+        )
+
+
 def _main() -> int:
     options = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
     options.add_argument("--seconds", type=float, default=60.0)
@@ -435,20 +458,22 @@ def _main() -> int:
     options.add_argument("--batch", type=int, default=100, help="inputs of each target between two reports")
     options.add_argument("--targets", nargs="+", default=list(TARGETS), choices=TARGETS, help="kinds of inputs")
     given = options.parse_args()
-    end, first, counts = time.monotonic() + given.seconds, given.first, Counter[str]()
+    end, first = time.monotonic() + given.seconds, given.first
     found: list[str] = []
+    tallies = {target: Tally() for target in given.targets}
     while time.monotonic() < end:
         with tempfile.TemporaryDirectory(prefix="fuzz") as place:
             outcomes = take_in(
                 Path(__file__).stem, "INPUTS", names(first, given.batch, given.targets), Path(place), LONGEST
             )
         first += given.batch
-        counts.update(f"{o.name.partition(' ')[0]} {o.kind}" for o in outcomes)
-        counts["inputs"] += len(outcomes)
+        for outcome in outcomes:
+            tallies[outcome.name.partition(" ")[0]].add(outcome)
         for line in faults(outcomes):
             print(line, flush=True)
             found.append(line)
-        print(f"# {dict(sorted(counts.items()))}; {len(found)} faults; next seed {first}", flush=True)
+        for target, tally in tallies.items():
+            print(f"# {target}: {tally}; seeds {given.first} to {first - 1}", flush=True)
     return int(bool(found))
 
 

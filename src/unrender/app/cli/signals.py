@@ -3,12 +3,15 @@
 A run takes both over while it goes, and ends in good order after its step (`runs.run.interruptible`). Elsewhere, and when they come a
 second time, the command is interrupted where it is; while it is still busy with that, one more ends the process at once. What a run had
 written remains, as after a kill.
+
+Python's handlers wait for the end of compiled code. A thread says so where that takes long, and lets a second signal end the process.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import sys
 import threading
@@ -32,6 +35,9 @@ WORDS = {
 
 _LATER, _LONGEST = 0.02, 1.5
 """Seconds until a signal comes again that came during an import, and until the command ends at once though the import goes on."""
+_SILENT = 1.5
+"""Seconds after which a signal that compiled code holds back is acknowledged."""
+_WAITING = "a kernel is compiled or a picture rendered: the command ends after that, and at once when told again"
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
@@ -51,9 +57,13 @@ class Signals:
         self._before: dict[int, Any] = {}
         self._deferred: set[int] = set()
         self._first: dict[int, float] = {}
+        self._watch: _Watch | None = None
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
+            if self._process:
+                with contextlib.suppress(OSError, RuntimeError):  # no memory for a thread
+                    self._watch = _Watch()
             for number in (signal.SIGINT, signal.SIGTERM):
                 if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
                     self._before[number] = signal.signal(number, _Handler(self))
@@ -64,6 +74,8 @@ class Signals:
     ) -> None:
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_IGN if self._process else handler)
+        if self._watch is not None:
+            self._watch.close()
 
     def receive(self, number: int, frame: FrameType | None) -> None:
         """End the command where it is; at once where it is busy with that already.
@@ -72,11 +84,7 @@ class Signals:
         """
         waited = time.monotonic() - self._first.setdefault(number, time.monotonic())
         if self.status or number in self._deferred or waited > _LONGEST:
-            status = self.status or 128 + number
-            if sys.stderr.isatty():
-                os.write(2, _SHOW_CURSOR)
-            os.write(2, f"unrender: {WORDS[status]}\n".encode())
-            os._exit(status)
+            _leave(self.status or 128 + number)
         if _is_importing(frame):
             self._deferred.add(number)
             timer = threading.Timer(_LATER, self._send_again, (number,))
@@ -89,7 +97,54 @@ class Signals:
 
     def _send_again(self, number: int) -> None:
         self._deferred.discard(number)
+        if self._watch is not None:
+            self._watch.own += 1
         os.kill(os.getpid(), number)
+
+
+class _Watch:
+    """A thread that hears of signals at once, though compiled code keeps the main thread from handling them.
+
+    Attributes:
+        own: number of signals to come that the process sent itself.
+    """
+
+    def __init__(self) -> None:
+        self.own = 0
+        self._main = threading.main_thread().ident
+        self._read, self._write = os.pipe()
+        os.set_blocking(self._write, False)
+        threading.Thread(target=self._run, daemon=True).start()
+        self._before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
+
+    def close(self) -> None:
+        """End the thread."""
+        signal.set_wakeup_fd(self._before)
+        os.close(self._write)
+
+    def _run(self) -> None:
+        held: tuple[int, int] | None = None  # where the main thread was when a signal came
+        silent = False
+        while True:
+            heard = select.select([self._read], [], [], _SILENT if silent else None)[0]
+            if not heard:
+                silent = False
+                if held == self._place():
+                    os.write(2, f"unrender: {_WAITING}\n".encode())
+            elif not (data := os.read(self._read, 1)):
+                os.close(self._read)
+                return
+            elif self.own:
+                self.own -= 1
+            elif data[0] in (signal.SIGINT, signal.SIGTERM):
+                if held is not None and held == self._place():
+                    _leave(128 + data[0])
+                held, silent = self._place(), True
+
+    def _place(self) -> tuple[int, int]:
+        """Return the instruction at which the main thread is."""
+        frame = sys._current_frames().get(self._main or 0)
+        return (0, 0) if frame is None else (id(frame), frame.f_lasti)
 
 
 class _Handler:
@@ -101,6 +156,14 @@ class _Handler:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         self._signals.receive(number, frame)
+
+
+def _leave(status: int) -> None:
+    """End the process at once, with its line."""
+    if sys.stderr.isatty():
+        os.write(2, _SHOW_CURSOR)
+    os.write(2, f"unrender: {WORDS[status]}\n".encode())
+    os._exit(status)
 
 
 def _is_importing(frame: FrameType | None) -> bool:
