@@ -15,6 +15,7 @@ from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder import reader
 from unrender.runs.folder.schema import NOT_VERIFIED
+from unrender.runs.verification import FreshPictures
 from unrender.statistics import paired_losses
 
 SIDE, WIDE, SIZE = 12, 20, 6
@@ -261,6 +262,48 @@ def test_pixels_are_drawn_where_there_are_many() -> None:
     assert result.verification["paths"] == 1 << 13
     assert result.verification["end"][0] == pytest.approx(loss, rel=0.15)
     assert result.status == "finished"
+
+
+class Noting(AnalyticRenderer):
+    """Notes the form of each request of four groups."""
+
+    forms: list[tuple[int, int | None]]
+
+    def image(self, parameters: Any, request: Any) -> Any:
+        if request.groups == 4:
+            self.forms.append((request.spp, None if request.pixels is None else int(np.size(request.pixels))))
+        return super().image(parameters, request)
+
+
+def noting(problem: ur.Problem) -> tuple[ur.Problem, list[Any]]:
+    """The problem, and the list of the forms that it is asked for from now on."""
+    assert isinstance(problem.renderer, AnalyticRenderer)
+    sensors = len(problem.views)
+    renderer = Noting({"x": np.full(SIZE, 0.5)}, problem.renderer.matrix, 0.5, shape=(SIDE, SIDE), sensors=sensors)
+    renderer.forms = []
+    return problem.with_parts(renderer=renderer), renderer.forms
+
+
+@pytest.mark.parametrize(("views", "form"), [(1, (32, None)), (30, (4, 2048))])
+def test_all_pictures_of_a_short_run_have_one_form(views: int, form: Any) -> None:
+    """Candidates, start, end and memory: kernels are compiled once."""
+    problem, forms = noting(made(views=views))
+    ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(0.03), steps=130)
+    assert len(forms) >= 5
+    assert set(forms) == {form}
+
+
+@pytest.mark.parametrize(("views", "form"), [(1, (32, None)), (30, (4, 30 * SIDE * SIDE)), (200, (4, 1 << 14))])
+def test_more_paths_are_more_pixels_and_then_more_launches(views: int, form: Any) -> None:
+    problem, forms = noting(made(views=views))
+    values = problem.start(0)
+    few, many = FreshPictures(problem, 1, 0), FreshPictures(problem, 1, 1 << 16)
+    losses = [pictures.picture(values).loss for pictures in (few, many)]
+    assert forms[-1] == form
+    assert {spp for spp, _ in forms} == {form[0]}
+    assert many.paths > 4 * few.paths
+    assert losses[1][1] < 0.6 * losses[0][1]
+    assert abs(losses[0][0] - losses[1][0]) < 4 * np.hypot(losses[0][1], losses[1][1])
 
 
 # ---------------------------------------------------------------------- what no parameters can explain

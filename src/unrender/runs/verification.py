@@ -27,8 +27,10 @@ _GROUPS = 4
 """Independent images of each fresh picture."""
 _LEAST_PATHS, _MOST_PATHS = 1 << 13, 1 << 22
 """Paths of a fresh picture."""
+_LONGER = 4
+"""Ratio of the allowed paths to the least ones below which a picture has the least: another number of pixels is another recording."""
 _FEW_PIXELS = 1 << 12
-"""Number of pixels of all views up to which all are rendered, whatever the number of paths."""
+"""Number of pixels of all views up to which whole views are rendered, whatever the number of paths."""
 _STREAM = 2
 """Stream of the run's key that fresh pictures draw from; a run's steps use 0, its warm-up 1."""
 _MOST_NON_FINITE = 0.01
@@ -82,10 +84,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class _Frame:
-    """Pixels of one view, or pixels drawn from all views.
+    """Pixels of one view, or a list of pixels of all views.
 
     Attributes:
-        view: index of the view that is rendered whole; None for drawn pixels.
+        view: index of the view that is rendered whole; None for a list of pixels.
         views, pixels: index of each pixel's view, and its row-major index in the film, (N,).
         reference: (N, 3).
         factors: (N, 1), factor of each pixel's loss.
@@ -101,8 +103,12 @@ class _Frame:
 class FreshPictures:
     """Renders fresh pictures of any parameters, all with the same random numbers.
 
-    The random numbers come from a stream of the run's key of their own, so they are independent of the run's. All views are rendered
-    whole where the number of paths allows it. Otherwise it is a random sample of pixels, or of whole views where the loss needs these.
+    The random numbers come from a stream of the run's key of their own, so they are independent of the run's. Few pixels are rendered
+    as whole views. Many are a list of pixels, a random sample of all where the paths do not suffice. Where the loss needs whole views, or
+    cameras move, it is a random sample of views.
+
+    The number of samples per pixel of a launch depends on the problem alone, so all pictures share one compiled kernel, and those of a
+    short run one recording. More paths come from more pixels, and then from more launches.
 
     Args:
         problem: whose views.
@@ -113,15 +119,16 @@ class FreshPictures:
 
     def __init__(self, problem: Problem, seed: int, paths: float, number: int = 0):
         self._problem, self._key = problem, Key(seed, 0, _STREAM).fold(number)
-        allowed = int(min(max(paths, _LEAST_PATHS), _MOST_PATHS)) // _GROUPS
-        self.frames, self.sampled = _frames(problem, allowed, self._key.fold(0))
+        allowed = _LEAST_PATHS if paths < _LONGER * _LEAST_PATHS else int(min(paths, _MOST_PATHS))
+        self.frames, self.sampled = _frames(problem, allowed // _GROUPS, self._key.fold(0))
         self.pixels = sum(len(frame.pixels) for frame in self.frames)
-        self.spp = _GROUPS * (1 << (max(allowed // max(self.pixels, 1), 1).bit_length() - 1))
+        self._spp = _GROUPS * _power_of_two(_LEAST_PATHS // (_GROUPS * max(self.pixels, 1)))
+        self._launches = _power_of_two(allowed // max(self.pixels * self._spp, 1))
 
     @property
     def paths(self) -> int:
         """How many one picture traces."""
-        return self.pixels * self.spp
+        return self.pixels * self._spp * self._launches
 
     def picture(self, parameters: Mapping[str, np.ndarray] | Tree, problem: Problem | None = None) -> Picture:
         """Render the parameters; `problem` where they are those of another mesh."""
@@ -139,9 +146,12 @@ class FreshPictures:
         session = renderer.prepare(list(tree), None, derivatives=False)
         found = []
         for index, frame in enumerate(self.frames):
-            request = self._request(frame, self._key.fold(index + 1).uint32())
-            images = arrays.numpy(session.image(tree, request).images).astype(np.float64)
-            found.append(images.reshape(_GROUPS, -1, 3))
+            key, total = self._key.fold(index + 1), np.zeros((_GROUPS, len(frame.pixels), 3))
+            for launch in range(self._launches):
+                seed = (key.fold(launch) if launch else key).uint32()
+                images = session.image(tree, self._request(frame, seed)).images
+                total += arrays.numpy(images).reshape(total.shape)
+            found.append(total / self._launches)
         return found
 
     def residual(self, images: Sequence[np.ndarray]) -> float:
@@ -175,11 +185,11 @@ class FreshPictures:
 
     def _request(self, frame: _Frame, seed: int) -> SampleRequest:
         if frame.view is not None:
-            return replace(view_request(self._problem, frame.view, self.spp, seed), groups=_GROUPS)
+            return replace(view_request(self._problem, frame.view, self._spp, seed), groups=_GROUPS)
         like = self._problem.renderer.array(np.zeros(1))
         views, pixels = (arrays.like_integers(x, like) for x in (frame.views, frame.pixels))
         sample = PixelSample(views, pixels, self._problem.renderer.array(frame.factors))
-        return PixelBatch(self._problem, sample).request(self.spp, seed, _GROUPS)
+        return PixelBatch(self._problem, sample).request(self._spp, seed, _GROUPS)
 
     def _losses(self, frame: _Frame, images: np.ndarray) -> np.ndarray:
         """The pseudo-values (K, N) of pixels, or of the view (K, 1) where the loss needs whole images."""
@@ -212,10 +222,15 @@ def is_finite(first: Picture, other: Picture) -> bool:
     return broken <= _MOST_NON_FINITE * known
 
 
+def _power_of_two(number: int) -> int:
+    """Return the greatest that is not above `number`; 1 for less than 1."""
+    return 1 << (max(number, 1).bit_length() - 1)
+
+
 def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], bool]:
     """The pixels that are looked at, at most about `allowed` of them, and whether they are a sample."""
     count, total = len(problem.views), problem.pixels
-    if total <= max(allowed, _FEW_PIXELS):
+    if total <= _FEW_PIXELS:
         return [_whole(problem, view) for view in range(count)], False
     generator = np.random.default_rng(key.uint32())
     known = problem.renderer.parameters()
@@ -224,7 +239,7 @@ def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], boo
         many = max(1, min(count, allowed * count // total))
         chosen = np.sort(generator.choice(count, many, replace=False))
         return [_whole(problem, int(view)) for view in chosen], many < count
-    return [_drawn(problem, allowed, generator)], True
+    return [_listed(problem, None if total <= allowed else allowed, generator)], total > allowed
 
 
 def _whole(problem: Problem, view: int) -> _Frame:
@@ -236,18 +251,20 @@ def _whole(problem: Problem, view: int) -> _Frame:
     return _Frame(view, np.full(height * width, view), np.arange(height * width), reference, factors)
 
 
-def _drawn(problem: Problem, count: int, generator: np.random.Generator) -> _Frame:
-    """Pairs of neighbouring pixels, evenly over all pixels of all views."""
+def _listed(problem: Problem, count: int | None, generator: np.random.Generator) -> _Frame:
+    """Pairs of neighbouring pixels, evenly over all pixels of all views; None for all pixels."""
     sizes = np.array([height * width for height, width in problem.sizes])
     starts = np.cumsum([0, *sizes])
-    strata = np.linspace(0, starts[-1], max(count // 2, 1) + 1)
-    place = (strata[:-1] + generator.random(len(strata) - 1) * np.diff(strata)).astype(np.int64)
-    place = np.clip(place, 0, starts[-1] - 1)
+    place = np.arange(starts[-1])
+    if count is not None:
+        strata = np.linspace(0, starts[-1], max(count // 2, 1) + 1)
+        place = (strata[:-1] + generator.random(len(strata) - 1) * np.diff(strata)).astype(np.int64)
+        place = np.clip(place, 0, starts[-1] - 1)
     views = np.searchsorted(starts, place, side="right") - 1
     pixels = place - starts[views]
-    partners = np.where(pixels + 1 < sizes[views], pixels + 1, np.maximum(pixels - 1, 0))
-    pixels = np.stack([pixels, partners], axis=1).reshape(-1)
-    views = np.repeat(views, 2)
+    if count is not None:
+        partners = np.where(pixels + 1 < sizes[views], pixels + 1, np.maximum(pixels - 1, 0))
+        pixels, views = np.stack([pixels, partners], axis=1).reshape(-1), np.repeat(views, 2)
     like = problem.renderer.array(np.zeros(1))
     reference, factors = problem.references.at(arrays.like_integers(views, like), arrays.like_integers(pixels, like))
     weight = starts[-1] / len(pixels)
