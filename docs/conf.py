@@ -49,6 +49,12 @@ python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
 add_module_names = False
 
+
+def setup(app):
+    """Add what the pages need from the records."""
+    app.connect("source-read", site_pages.link_benchmarks)
+
+
 html_theme = "furo"
 html_title = "unrender"
 html_static_path = ["static"]

@@ -38,6 +38,13 @@ def write_pages(docs: Path) -> None:
     (folder / "index.md").write_text(gallery_page(folder))
 
 
+def link_benchmarks(app: Any, docname: str, source: list[str]) -> None:
+    """Make `[name]` of a benchmark a link to its page, in the pages that are committed."""
+    if not docname.startswith("benchmarks/"):
+        named = benchmarks().keys() & set(re.findall(r"\[([\w.]+)\]", source[0]))
+        source[0] += "\n" + "".join(f"\n[{name}]: /benchmarks/{name}.md" for name in sorted(named))
+
+
 def gallery_page(folder: Path) -> str:
     """Return a page with a picture of every problem, and what comes out. The pictures go to `folder`."""
     record = records.read(benchmarks()["suite"].folder) or {"problems": {}}
