@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import reference_pages
 
 from benchmarks.coverage import coverage_page, ranges_page
 from benchmarks.coverage.cli import RECORD
@@ -33,6 +34,8 @@ def write_pages(docs: Path) -> None:
     coverage_page.PAGE.write_text(coverage_page.page(json.loads(RECORD.read_text())))
     ranges_page.PAGE.write_text(ranges_page.page())
     (docs / "reference" / "arguments.md").write_text(arguments_page())
+    (docs / "reference" / "commands.md").write_text(commands_page())
+    reference_pages.write_pages(docs / "reference")
     folder = docs / "gallery"
     folder.mkdir(exist_ok=True)
     (folder / "index.md").write_text(gallery_page(folder))
@@ -105,6 +108,34 @@ def arguments_page() -> str:
         if rows:
             parts.append("| option | default | meaning |\n|---|---|---|\n" + "\n".join(rows))
     return "\n\n".join(parts) + "\n"
+
+
+def commands_page() -> str:
+    """Return a page with each command of `unrender`: its usage, what it does, and a table of its options."""
+    from typer.main import get_command
+
+    from unrender.app.cli.app import app
+
+    parts = [
+        "# Commands",
+        "What `unrender COMMAND -h` prints. [The command line](../guide/command-line.md) has exit statuses, memory and variables.",
+    ]
+    commands: Any = get_command(app)
+    for name, command in commands.commands.items():
+        arguments = " ".join(
+            each.metavar or each.name.upper() for each in command.params if each.param_type_name == "argument"
+        )
+        parts += [f"## unrender {name}", f"`unrender {name} {arguments}`".replace(" `", "`"), _paragraph(command.help)]
+        rows = []
+        for each in command.params:
+            if each.param_type_name == "option" and not getattr(each, "hidden", False):
+                rows.append(f"| {', '.join(f'`{flag}`' for flag in each.opts)} | {_cell(each.help or '')} |")
+        parts.append("| option | meaning |\n|---|---|\n" + "\n".join(rows))
+    return "\n\n".join(parts) + "\n"
+
+
+def _paragraph(text: str) -> str:
+    return "\n\n".join(" ".join(each.split()) for each in inspect.cleandoc(text or "").split("\n\n"))
 
 
 def _rows(component: Any) -> Iterator[str]:

@@ -21,6 +21,9 @@ import unrender as ur
 from tiers import quick
 
 DOCS = ROOT / "docs"
+sys.path.insert(0, str(DOCS / "extensions"))
+import reference_pages  # noqa: E402
+
 # docs/extending has tests of its own, which install its files; the commands of results.md take hours.
 PAGES = [
     ROOT / "README.md",
@@ -151,6 +154,17 @@ def test_every_block_of_a_page_is_true(
             runner.run(block)
 
 
+@pytest.mark.parametrize(
+    "name", quick(reference_pages.PAGES, *(reference_pages.PAGES.keys() - {"problems", "renderer", "grey_box"}))
+)
+@pytest.mark.usefixtures("small_runs")
+def test_the_examples_of_the_reference_run(name: str) -> None:
+    page = reference_pages.PAGES[name]
+    if "torch" in page.example:
+        pytest.importorskip("torch")
+    exec(f"import unrender as ur\n{page.example}", {})
+
+
 def test_few_blocks_are_skipped_and_each_says_why():
     skipped = [block for page in PAGES for block in blocks(page) if block.marker.startswith("skip")]
     for block in skipped:
@@ -228,7 +242,9 @@ PUBLIC_MODULES = {
 
 def test_the_reference_has_every_public_name():
     """By a directive of its own, or by one for its module, which documents what `__all__` lists."""
-    text = "\n".join(page.read_text(encoding="utf-8") for page in (DOCS / "reference").glob("*.md"))
+    pages = [DOCS / "reference" / name for name in ("optimizers.md", "protocols.md")]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    text += "\n".join(page.markdown() for page in reference_pages.PAGES.values())
     single = set(re.findall(r"auto(?:class|function|exception):: (\w+)$", text, re.MULTILINE))
     whole = set(re.findall(r"automodule:: ([\w.]+)$", text, re.MULTILINE))
     for name in ur.__all__:
