@@ -289,7 +289,7 @@ def test_a_second_thread_is_refused_while_a_run_goes_on(tmp_path: Path, whole: u
 
     result = start(None, callbacks=[At(3, beside), At(4, lambda run: ur.render(problem, spp=1))])
     assert len(told) == 6
-    assert all("optimize goes on in another thread" in line and "\n" not in line for line in told)
+    assert all("optimize is running in another thread" in line and "\n" not in line for line in told)
     np.testing.assert_array_equal(result.parameters[RATE], whole.parameters[RATE])
 
 

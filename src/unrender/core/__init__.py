@@ -1,1 +1,1 @@
-"""What every floor uses: arrays, trees, seeds, checks, errors, the registry of components."""
+"""Arrays, parameter trees, seeds, argument checks, errors and the registry of components. Imports no other package of `unrender`."""

@@ -1,4 +1,4 @@
-"""Checks of numbers and text that a user gives; each failure is one line that names the field and what it should be."""
+"""Checks of numbers and text from the user. Each failure is one line with the field's name and the expected value."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from unrender.core.text import printable
 def number(
     owner: str, name: str, value: Any, above: float = -math.inf, below: float = math.inf, inclusive: bool = False
 ) -> float:
-    """`value` as a finite float in (above, below), or in [above, below) with `inclusive`.
+    """Return `value` as a finite float in (above, below), or in [above, below) with `inclusive`.
 
-    Raises `InputError` naming `owner` (the class or section) and `name` (the argument or field).
+    Raises `InputError` that names `owner` (the class or section) and `name` (the argument or field).
     """
-    found = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
-    if math.isfinite(found) and (above < found < below or (inclusive and found == above)):
-        return found
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    if math.isfinite(number) and (above < number < below or (inclusive and number == above)):
+        return number
     limits = [f"{'>=' if inclusive else '>'} {above:g}"] if above > -math.inf else []
     limits += [f"< {below:g}"] if below < math.inf else []
     raise InputError(f"{owner}: {name} must be a finite number {' and '.join(limits)}".rstrip() + f", got {value!r}")
 
 
 def integer(owner: str, name: str, value: Any, at_least: int) -> int:
-    """`value` as an integer >= `at_least`. Raises `InputError`."""
+    """Return `value` as an integer >= `at_least`, else raise `InputError`."""
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
         return int(value)
     raise InputError(f"{owner}: {name} must be a whole number of at least {at_least}, got {value!r}")
@@ -35,7 +35,7 @@ def integer(owner: str, name: str, value: Any, at_least: int) -> int:
 def encode_text(text: str, where: str) -> bytes:
     """Return the text as UTF-8.
 
-    Raises `InputError` for text that is no Unicode: the name of a file whose bytes are not UTF-8, as Python reads it.
+    Raises `InputError` for text with lone surrogates. Python reads file names that are not UTF-8 as such text.
     """
     try:
         return text.encode()

@@ -1,4 +1,4 @@
-"""Truncated conjugate gradients within a trust region: an approximate solution of H s = −g from products of H with vectors."""
+"""Truncated conjugate gradients in a trust region: solve H s = −g approximately, from products of H with vectors."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ def solve(
     tolerance: float = 0.1,
     damping: float = 0.1,
 ) -> np.ndarray:
-    """A step s with ‖s‖ <= `trust_radius` that approximates −H⁻¹ g (Fletcher and Reeves 1964, Steihaug 1983).
+    """Return a step s with ‖s‖ <= `trust_radius` that approximates −H⁻¹ g (Fletcher and Reeves 1964, Steihaug 1983).
 
-    From s = 0 and v = r = −g: α = rᵀr / vᵀHv, s += α v, r −= α H v, and the next v is r + (r'ᵀr' / rᵀr) v. `optimizers.NewtonCG`
-    describes when it ends, and how it treats products that are noisy, not symmetric or of negative curvature.
+    Starts from s = 0 and v = r = −g. Each iteration computes α = rᵀr / vᵀHv, s += α v, r' = r − α H v and v = r' + (r'ᵀr' / rᵀr) v.
+    `optimizers.NewtonCG` documents the stopping rules and the treatment of products that are noisy, asymmetric or of negative curvature.
 
     Args:
         gradient: g, (n,).
-        product: from v (n,) to H v (n,).
-        trust_radius: the longest step, > 0.
-        iterations: products at most, >= 1.
-        tolerance: the residual's ratio to the gradient at which it ends, in [0, 1).
-        damping: the least ratio of a direction's curvature to the greatest one met, in [0, 1).
+            product: function of v (n,) that returns H v (n,).
+            trust_radius: largest length of the step, > 0.
+            iterations: maximum number of products, >= 1.
+            tolerance: ratio of the residual's norm to the gradient's norm at which the iteration stops, in [0, 1).
+            damping: smallest allowed ratio of a direction's curvature to the largest curvature so far, in [0, 1).
 
     Returns:
-        (n,); zeros where the gradient is zero or not finite.
+            The step, (n,); zero where the gradient is zero or not finite.
     """
     step, residual = np.zeros_like(gradient), -gradient
     v, greatest_curvature = residual, 0.0
@@ -63,7 +63,7 @@ def solve(
 
 
 def _alpha_at_radius(step: np.ndarray, v: np.ndarray, radius: float) -> float:
-    """The α >= 0 at which step + α v lies on the sphere of that radius."""
+    """Return the α >= 0 at which step + α v lies on the sphere of this radius."""
     a, b = float(v @ v), float(step @ v)
     c = float(step @ step) - radius**2
     return (-b + math.sqrt(max(b * b - a * c, 0.0))) / a

@@ -1,4 +1,4 @@
-"""The count of values that are left out because they are not finite, and the warning that reports it."""
+"""Count of values that are dropped because they are not finite, with a warning."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ _log = logging.getLogger("unrender")
 
 
 class DropReport:
-    """Count dropped values and log a warning at the first one and at every tenfold count.
+    """Counter of dropped values. Logs a warning at the first one and at every tenfold count.
 
     Attributes:
-        count: values dropped so far.
-        total: values seen so far.
+            count: number of values dropped so far.
+            total: number of values seen so far.
     """
 
     def __init__(self) -> None:
@@ -20,7 +20,7 @@ class DropReport:
         self._reported = 0
 
     def add(self, dropped: int, of: int, reason: str) -> None:
-        """Add `dropped` of `of` values; `reason` says in a few words what was not finite."""
+        """Record that `dropped` of `of` values were not finite; `reason` names them in the warning."""
         self.count += dropped
         self.total += of
         if self.count >= max(1, 10 * self._reported):

@@ -1,12 +1,12 @@
-"""The errors a caller may catch. Each carries one line that says what is wrong and what would be right."""
+"""Errors that a caller may catch. Each message is one line: what is wrong, and what was expected."""
 
 from unrender.core.text import one_line
 
 
 class UnrenderError(Exception):
-    """Base of every error that `unrender` raises on purpose.
+    """Base class of every error that `unrender` raises on purpose.
 
-    Its text is one printable line of bounded length, whatever names went into it: control characters are written as escapes.
+    The message is one printable line of at most `core.text.LONGEST_LINE` characters. Control characters are escaped.
     """
 
     def __init__(self, *arguments: object):
@@ -14,8 +14,8 @@ class UnrenderError(Exception):
 
 
 class InputError(UnrenderError, ValueError):
-    """What the user gave is wrong: a file, a field, a name, a value. The command line exits with 2."""
+    """Invalid input from the user: a file, a field, a name or a value. The command line exits with 2."""
 
 
 class VariantError(UnrenderError, RuntimeError):
-    """This machine cannot run what was asked: no usable LLVM, no GPU, an unknown variant. The command line exits with 3."""
+    """Missing capability of the machine: no usable LLVM, no GPU, an unknown variant. The command line exits with 3."""

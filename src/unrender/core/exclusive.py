@@ -1,4 +1,4 @@
-"""One thread at a time: Dr.Jit and Mitsuba keep state that two threads would share, and abort the process where they meet."""
+"""A lock that serialises calls from several threads. Dr.Jit and Mitsuba share state between threads, and abort on concurrent use."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _Returned = TypeVar("_Returned")
 
 @dataclass
 class _Turn:
-    """Whose turn it is.
+    """Owner of the lock.
 
     Attributes:
-        changed: notified when a turn ends.
-        thread: whose turn it is; None where it is nobody's.
-        doing: what that thread does, the innermost last: a name, and whether it may take long.
+        changed: condition that is notified when the lock is released.
+        thread: thread that holds the lock, or None.
+        doing: stack of the calls in that thread, the innermost last: (function name, whether it may take long).
     """
 
     changed: threading.Condition = field(default_factory=threading.Condition)
@@ -34,31 +34,31 @@ class _Turn:
 _turn = _Turn()
 
 
-def _begin_anew() -> None:
-    """In the child of a fork, whose other threads are gone."""
+def _reset() -> None:
+    """Reset the lock in the child of a fork, where the other threads no longer exist."""
     _turn.__init__()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_begin_anew)
+    os.register_at_fork(after_in_child=_reset)
 
 
 def exclusive(
     what: str, long: bool = False
 ) -> Callable[[Callable[_Parameters, _Returned]], Callable[_Parameters, _Returned]]:
-    """A decorator: calls from different threads take turns, those within one thread may be nested.
+    """Return a decorator that serialises calls from different threads. Calls within one thread may nest.
 
-    A call waits for another thread's, except where that may take `long`: then it raises `InputError`, one line that says so.
+    A call waits for another thread's call to end. If that call is marked `long`, it raises `InputError` instead.
 
     Args:
-        what: the name of the function, for that line.
-        long: whether it may take hours, as a run does.
+        what: name of the function in the message.
+        long: whether the function may take hours, as a run does.
     """
 
     def decorate(function: Callable[_Parameters, _Returned]) -> Callable[_Parameters, _Returned]:
         @functools.wraps(function)
         def call(*arguments: _Parameters.args, **named: _Parameters.kwargs) -> _Returned:
-            with _taking_turns(what, long):
+            with _lock(what, long):
                 return function(*arguments, **named)
 
         return call
@@ -67,14 +67,14 @@ def exclusive(
 
 
 @contextlib.contextmanager
-def _taking_turns(what: str, long: bool) -> Iterator[None]:
+def _lock(what: str, long: bool) -> Iterator[None]:
     me = threading.current_thread()
     with _turn.changed:
         while _turn.thread not in (None, me):
             if slow := next((name for name, takes_long in _turn.doing if takes_long), ""):
                 raise InputError(
-                    f"{what}: {slow} goes on in another thread, and one process computes for one thread at a time; "
-                    "wait until it has ended, or use another process"
+                    f"{what}: {slow} is running in another thread, and one process computes for one thread at a time; "
+                    "wait until it ends, or use another process"
                 )
             _turn.changed.wait()
         _turn.thread = me

@@ -1,4 +1,4 @@
-"""Names of a package that are imported when they are first used."""
+"""Lazy imports: names of a package that are imported on first use."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 
 def attach(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], list[str]]:
-    """Return the `__getattr__` and the `__all__` of a package.
+    """Return the `__getattr__` and the `__all__` of a package with lazy imports.
 
     Args:
-        package: Its dotted name.
+            package: dotted name of the package.
         homes: {public name: module below the package that defines it}.
     """
 

@@ -1,7 +1,7 @@
-"""Arrays whose outer columns repeat the columns of the opposite end, such as the data of Mitsuba's environment maps.
+"""Horizontally periodic arrays with repeated border columns, such as the data of Mitsuba's environment maps.
 
-An array (H, W + 2 k, C) with k repeated columns stands for W columns that continue around: column j repeats column (j - k) mod W of
-those. The repeated columns are no unknowns of their own.
+An array (H, W + 2 k, C) with k repeated columns at each end represents W periodic columns: column j repeats column (j - k) mod W of these.
+The repeated columns are not independent parameters.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ def interior_shape(shape: tuple[int, ...], columns: int) -> tuple[int, ...]:
 
 
 def interior(x: np.ndarray, columns: int) -> np.ndarray:
-    """Return (H, W, ...) of an array (H, W + 2 `columns`, ...)."""
+    """Remove the repeated columns: (H, W + 2 `columns`, ...) -> (H, W, ...)."""
     return x[:, columns : x.shape[1] - columns] if columns else x
 
 
 def pad(x: np.ndarray, columns: int) -> np.ndarray:
-    """Return (H, W + 2 `columns`, ...) of an array (H, W, ...), the inverse of `interior`."""
+    """Add the repeated columns: (H, W, ...) -> (H, W + 2 `columns`, ...). The inverse of `interior`."""
     return np.ascontiguousarray(x[:, _sources(x.shape[1], columns) - columns]) if columns else x
 
 
 def repeat(x: Array, columns: int) -> Array:
-    """Return the array with its outer columns replaced by copies of those that they repeat.
+    """Overwrite the outer columns with copies of the columns that they repeat.
 
     Args:
         x: (H, W + 2 `columns`, C), NumPy or Dr.Jit.
@@ -52,12 +52,12 @@ def repeat(x: Array, columns: int) -> Array:
 
 
 def _sources(width: int, columns: int) -> np.ndarray:
-    """The column that each of `width` + 2 `columns` columns repeats, numbered in the whole array."""
+    """Return, for each of `width` + 2 `columns` columns, the index of the interior column that it repeats."""
     return np.arange(-columns, width + columns) % width + columns
 
 
 @lru_cache(maxsize=16)
 def _elements(shape: tuple[int, ...], columns: int) -> np.ndarray:
-    """The element that each element of an array of this shape repeats."""
+    """Return, for each element of an array of this shape, the flat index of the element that it repeats."""
     numbers = np.arange(int(np.prod(shape)), dtype=np.uint32).reshape(shape)
     return numbers[:, _sources(shape[1] - 2 * columns, columns)].reshape(-1)

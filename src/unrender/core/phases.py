@@ -1,6 +1,6 @@
-"""What a long call is doing: phases with names and progress, and who listens to them.
+"""Phases of a long call, with names and progress, and the listeners that receive them.
 
-Code that takes seconds names what it does, wherever it stands:
+Code that takes seconds reports its phase:
 
     from unrender.core import phases
 
@@ -8,7 +8,7 @@ Code that takes seconds names what it does, wherever it stands:
         for index in range(8):
             advance((index + 1) / 8)
 
-Without a listener that costs next to nothing. A command line or a notebook listens, and shows what is going on.
+Without a listener the cost is negligible. The command line and notebooks register a listener that displays the progress.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from typing import Protocol
 
 
 class Listener(Protocol):
-    """Hears of the phases of all calls within `listening`. Phases may lie within one another."""
+    """Receiver of the phases of all calls within `listening`. Phases may nest."""
 
     def on_phase(self, name: str) -> None:
-        """A phase begins."""
+        """Handle the start of a phase."""
         ...
 
     def on_progress(self, share: float) -> None:
-        """How far the innermost phase is, in [0, 1]."""
+        """Handle the progress of the innermost phase, in [0, 1]."""
         ...
 
     def on_phase_end(self, name: str) -> None:
-        """The phase has ended, by an exception or not."""
+        """Handle the end of the innermost phase, whether it returned or raised."""
         ...
 
 
@@ -41,7 +41,7 @@ _listeners: ContextVar[tuple[Listener, ...]] = ContextVar("listeners", default=(
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Let a listener hear of the phases of everything called within."""
+    """Send the phases of all calls within this context to a listener."""
     token = _listeners.set((*_listeners.get(), listener))
     try:
         yield
@@ -51,7 +51,7 @@ def listening(listener: Listener) -> Iterator[None]:
 
 @contextmanager
 def phase(name: str) -> Iterator[Callable[[float], None]]:
-    """A phase of what is being done. Yields a function that takes how far it is, in [0, 1]."""
+    """Report a phase to the listeners. Yields a function that takes the progress in [0, 1]."""
     listeners = _listeners.get()
 
     def advance(share: float) -> None:
@@ -68,10 +68,10 @@ def phase(name: str) -> Iterator[Callable[[float], None]]:
 
 
 class Stopwatch:
-    """Sums up the seconds of each phase; those of a phase within another count as its own alone.
+    """Listener that sums the seconds of each phase. Time in a nested phase counts for the nested phase only.
 
     Attributes:
-        seconds: {name: seconds}, in the order in which the phases first began.
+            seconds: {name: seconds}, in the order in which the phases first started.
     """
 
     def __init__(self) -> None:
@@ -85,7 +85,7 @@ class Stopwatch:
         self.seconds.setdefault(name, 0.0)
 
     def on_progress(self, share: float) -> None:
-        """See `Listener.on_progress`."""
+        """Ignore the progress."""
 
     def on_phase_end(self, name: str) -> None:
         del name

@@ -13,7 +13,7 @@ _MASK = 0xFFFFFFFFFFFFFFFF
 
 
 def _mix(x: int) -> int:
-    """The SplitMix64 finaliser (Steele, Lea and Flood 2014): a bijection of 64-bit words that scatters every bit."""
+    """Apply the SplitMix64 finaliser (Steele, Lea and Flood 2014), a bijection of 64-bit integers."""
     x = (x + 0x9E3779B97F4A7C15) & _MASK
     x = ((x ^ (x >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
     x = ((x ^ (x >> 27)) * 0x94D049BB133111EB) & _MASK
@@ -21,26 +21,26 @@ def _mix(x: int) -> int:
 
 
 LEAST_SEED, LARGEST_SEED = -(1 << 63), (1 << 63) - 1
-"""Range of a run's seed: what files of every kind hold."""
+"""Range of a run's seed, which every file format can store."""
 
 
 def check_seed(owner: str, seed: Any, runs: int = 1) -> int:
-    """Return `seed` as an integer in range, so that the seeds of that many runs, each one larger, are too. Raises `InputError`."""
-    whole = isinstance(seed, Integral) and not isinstance(seed, bool)
-    if whole and LEAST_SEED <= (value := int(seed)) <= LARGEST_SEED - (runs - 1):
+    """Return `seed` as an integer, after checking that the `runs` consecutive seeds from it are in range. Raises `InputError`."""
+    is_integer = isinstance(seed, Integral) and not isinstance(seed, bool)
+    if is_integer and LEAST_SEED <= (value := int(seed)) <= LARGEST_SEED - (runs - 1):
         return value
-    got = f"an integer of {int(seed).bit_length()} bits" if whole else printable(seed)
+    got = f"an integer of {int(seed).bit_length()} bits" if is_integer else printable(seed)
     raise InputError(f"{owner}: expected a whole number from -2**63 to 2**63 - {max(runs, 1)}, got {got}")
 
 
 @dataclass(frozen=True)
 class Key:
-    """Names one draw of a run.
+    """Identifier of one random draw of a run.
 
     Args:
-        seed: the run's seed, any integer; that of a run is in range of `check_seed`.
+        seed: the run's seed, any integer; `check_seed` gives the range for runs.
         step: the step of the run, from 0.
-        stream: which of the step's independent streams of draws; `fold` derives further ones.
+        stream: the independent stream within the step; `fold` derives further ones.
     """
 
     seed: int = 0
@@ -48,9 +48,9 @@ class Key:
     stream: int = 0
 
     def fold(self, number: int) -> Key:
-        """A key independent of this one and of `fold(other)`. Use one number per view, per purpose."""
+        """Return a key that is independent of this one and of `fold(other)`. Use one number per view and per purpose."""
         return replace(self, stream=_mix(self.stream ^ _mix(number + 1)))
 
     def uint32(self) -> int:
-        """The seed of this draw, in [0, 2**32)."""
+        """Return the seed of this draw, in [0, 2**32)."""
         return _mix(_mix(_mix(self.seed & _MASK) ^ (self.step & _MASK)) ^ self.stream) >> 32

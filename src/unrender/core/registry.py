@@ -1,4 +1,4 @@
-"""The registry of components: what the command line, TOML files, `resume` and the contract suites know by name.
+"""Registry of components: the names that the command line, TOML files, `resume` and the contract tests use.
 
     @unrender.register
     @dataclass(frozen=True)
@@ -10,8 +10,8 @@ A package announces its components by an entry point of the group `unrender.comp
     [project.entry-points."unrender.components"]
     charbonnier = "my_package.losses"
 
-The modules of `unrender` itself are imported when a kind of theirs is first asked for, entry points at the first look-up of any name. No
-module is ever imported because a file names it.
+The modules of `unrender` are imported at the first look-up of their kind, and entry points at the first look-up of any name. The name of
+a module in a file never imports it.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ class Kind:
     """A kind of component.
 
     Attributes:
-        name: in words, as `register(kind=)` takes it.
-        package: whose modules hold those of `unrender`; "" where there are none.
-        protocol: what a class may inherit from to declare its kind, as "module.Name".
-        members: sets of methods by which other classes are known; empty where the protocol must be inherited.
-        in_tables: whether a table {type = "Name", ...} makes one; its fields are those of a frozen dataclass.
+            name: name in messages and in `register(kind=)`.
+            package: package whose modules define the components of `unrender`; "" if there is none.
+            protocol: "module.Name" of the protocol that a class may inherit from to declare its kind.
+            members: sets of methods that identify classes without that base; empty if they must inherit from the protocol.
+            in_tables: whether a table {type = "Name", ...} can describe one; its keys are the fields of a frozen dataclass.
     """
 
     name: str
@@ -90,10 +90,10 @@ class Component:
     """A registered class.
 
     Attributes:
-        name: by which it is found.
-        kind: of `KINDS`.
-        made_by: the class.
-        position: its place in lists; those without one come last, by name.
+            name: registered name.
+            kind: key of `KINDS`.
+            made_by: the class.
+            position: sort key in lists; components without one follow, by name.
     """
 
     name: str
@@ -103,7 +103,7 @@ class Component:
 
 
 _components: dict[tuple[str, str], Component] = {}
-"""By namespace and name: all kinds that stand in tables share a namespace, each other kind has its own."""
+"""Components by (namespace, name). All kinds that occur in tables share one namespace; each other kind has its own."""
 
 _state_modules: set[str] = set()
 _loaded: set[str] = set()
@@ -129,18 +129,17 @@ def register(
     states: str | None = None,
     position: float | None = None,
 ) -> Any:
-    """Decorator: make a class known by name. It stands above `@dataclass(frozen=True)`.
+    """Register a class as a component. Use as a decorator above `@dataclass(frozen=True)`.
 
     Args:
-        name: by which it is found; None takes the class's, for methods and gallery problems in lower case with hyphens ("TwoPlanets" as
-            two-planets).
-        kind: of `registry.KINDS`; None takes that of the protocol which the class inherits from, or whose methods it has.
-        states: the module of its states, where that is not its own. Checkpoints make frozen dataclasses of registered components' modules
-            again, and of no others.
-        position: its place in lists, ascending; None comes last, by name.
+        name: name of the component. None takes the class's name; methods and gallery problems use lower case with hyphens (`TwoPlanets` is
+            "two-planets").
+        kind: key of `registry.KINDS`. None takes the kind of the protocol that the class inherits from or implements.
+        states: module that defines its states, if not its own. Checkpoints restore frozen dataclasses from these modules only.
+        position: sort key in lists, ascending. None sorts last, by name.
 
     Raises:
-        InputError: the kind cannot be told or does not exist; no frozen dataclass, where tables make it from its fields; another component
+        InputError: the kind is unknown or ambiguous; the class is not a frozen dataclass but its kind occurs in tables; another component
             has this name.
     """
     if component is None:
@@ -149,22 +148,22 @@ def register(
 
 
 def components(kind: str) -> dict[str, type]:
-    """{name: class} of every component of a kind, in their order. Raises `InputError` for an unknown kind."""
+    """Return {name: class} of the components of a kind, sorted by position. Raises `InputError` for an unknown kind."""
     _check_kind(kind)
     _load(kind)
-    found = [each for each in _components.values() if each.kind == kind]
-    return {each.name: each.made_by for each in sorted(found, key=lambda each: (each.position, each.name))}
+    members = [each for each in _components.values() if each.kind == kind]
+    return {each.name: each.made_by for each in sorted(members, key=lambda each: (each.position, each.name))}
 
 
 def table_components() -> dict[str, type]:
-    """{name: class} of every component that a table {type = "Name", ...} can make, of all kinds."""
+    """Return {name: class} of the components of all kinds that a table {type = "Name", ...} can describe."""
     return {
         name: made_by for kind in KINDS.values() if kind.in_tables for name, made_by in components(kind.name).items()
     }
 
 
 def find(kind: str, name: str) -> type:
-    """The component of a kind by its name. Raises `InputError` with the nearest known name."""
+    """Return the component of this kind and name. Raises `InputError` that suggests the nearest known name."""
     known = components(kind)
     if name not in known:
         hint = did_you_mean(name, known) or f"; there are {', '.join(known)}"
@@ -173,18 +172,18 @@ def find(kind: str, name: str) -> type:
 
 
 def component_of(made_by: type) -> Component | None:
-    """What a class is registered as, or None."""
+    """Return the registration of a class, or None."""
     return next((each for each in _components.values() if each.made_by is made_by), None)
 
 
 def kind_of_protocol(protocol: Any) -> str | None:
-    """The kind that a protocol stands for, such as "loss" for `losses.Loss`, or None."""
+    """Return the kind of a protocol, such as "loss" for `losses.Loss`, or None."""
     path = f"{getattr(protocol, '__module__', '')}.{getattr(protocol, '__qualname__', '')}"
     return next((kind.name for kind in KINDS.values() if kind.protocol == path), None)
 
 
 def state_modules() -> frozenset[str]:
-    """The modules whose frozen dataclasses a checkpoint may make again: those of the registered components."""
+    """Return the modules whose frozen dataclasses a checkpoint may restore: those of the registered components."""
     _load_entry_points()
     return frozenset(_state_modules)
 
@@ -205,7 +204,7 @@ def _add(made_by: Any, name: str | None, kind: str | None, states: str | None, p
     space = "table" if chosen.in_tables else chosen.name
     with _lock:
         known = _components.get((space, called))
-        # The same class may come again: a module that is reloaded, a notebook's cell that is run twice.
+        # A class may register again: a module is reloaded, or a notebook's cell is run twice.
         if known is not None and (known.made_by.__module__, known.made_by.__qualname__) != (
             made_by.__module__, made_by.__qualname__,
         ):  # fmt: skip
@@ -221,7 +220,7 @@ def _add(made_by: Any, name: str | None, kind: str | None, states: str | None, p
 
 
 def _explain_unknown_arguments(made_by: type) -> None:
-    """Have the constructor refuse unknown keyword arguments by an `InputError` that names the nearest known one."""
+    """Make the constructor raise `InputError` for an unknown keyword argument, with the nearest known name."""
     original: Any = made_by.__dict__.get("__init__")
     if original is None or hasattr(original, "__wrapped__"):
         return
@@ -246,7 +245,7 @@ def _check_kind(kind: str) -> Kind:
 
 
 def _detect(made_by: type, where: str) -> Kind:
-    """The kind of the protocol that a class inherits from, else of the one most of whose members it has."""
+    """Return the kind of the protocol that a class inherits from, else the kind with the largest set of methods that it implements."""
     bases = _bases(made_by)
     if declared := [kind for kind in KINDS.values() if kind.protocol in bases]:
         return declared[0]
@@ -268,7 +267,7 @@ def _hyphenated(name: str) -> str:
 
 
 def _load(kind: str) -> None:
-    """Import the modules of `unrender` that hold components of this kind, then entry points. Once each."""
+    """Import the modules of `unrender` that define components of this kind, then entry points. Does so once."""
     package = KINDS[kind].package
     with _lock:
         if package and package not in _loaded:
@@ -284,7 +283,7 @@ def _load(kind: str) -> None:
 
 
 def _load_entry_points() -> None:
-    """Import what other packages announce. One that fails is one line of the log, and left out."""
+    """Import the entry points of other packages. One that fails is skipped with a warning."""
     with _lock:
         if GROUP in _loaded:
             return
@@ -294,8 +293,8 @@ def _load_entry_points() -> None:
                 point.load()
             except KeyboardInterrupt:
                 raise
-            except BaseException as error:  # whatever a module of others raises
-                # Those of a module whose import failed; other modules that it imported stay, and so do theirs.
+            except BaseException as error:  # a third-party module may raise anything
+                # Remove the components of a module whose import failed; modules that it imported successfully keep theirs.
                 for key in [key for key, each in _components.items() if each.made_by.__module__ not in sys.modules]:
                     del _components[key]
                 words = " ".join(str(error).split())[:200]

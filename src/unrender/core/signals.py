@@ -1,4 +1,4 @@
-"""What those who handle signals agree upon. The standard library's lightest modules alone: the command imports this first of all."""
+"""Signal handling that several modules share. Imports light modules only, because the command imports it first."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import signal
 import sys
 
 GRACEFUL = "unrender_graceful"
-"""Attribute of a handler of SIGTERM in whose place a run may put its own, which ends the run after the present step."""
+"""Attribute of a SIGTERM handler that a run may replace by its own, which ends the run after the current step."""
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 def end_at_once() -> None:
-    """Let Ctrl-C and SIGTERM end the command with one line while it is loaded, if this process is the command.
+    """Make Ctrl-C and SIGTERM end the command with one line while it imports, if this process is the command.
 
-    Nothing is written until then. Without this, Python would show a traceback of whatever it was importing.
+    Nothing is written before that point. Without these handlers Python would print the traceback of an import.
     """
     if not _is_command():
         return

@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Iterable
 
 _MOST, _LONGEST = 1000, 200
-"""Names that are compared and their characters: comparing takes time, and names may come from a file that anybody made."""
+"""Largest number of names to compare, and their largest length. Comparison is slow, and the names may come from an untrusted file."""
 _SYNONYMS = {
     "lr": ("learning_rate",),
     "step_size": ("learning_rate",),
@@ -29,18 +29,18 @@ _SYNONYMS = {
     "relmse": ("RelativeL2",),
     "size": ("resolution",),
 }
-"""What other packages call things, and what they are called here. Only names that are known in a place are suggested there."""
+"""Terms of other packages and their equivalents here. A suggestion needs the equivalent to be among the known names."""
 
 
 def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
-    """The words "; did you mean X?" for the nearest known name, "" where none is similar enough.
+    """Return "; did you mean X?" with the nearest known name, or "" if none is similar.
 
-    A name that differs by case alone is the nearest, then what other packages call it (lr for learning_rate).
+    A name that differs in case only is preferred, then the equivalent of another package's term (lr for learning_rate).
 
     Args:
-        name: as it was given.
-        known: the names there are. The first thousand are compared, those of at most 200 characters.
-        likeness: the least similarity (`difflib`), from 0 for any name to 1 for an equal one.
+            name: the misspelt name.
+            known: the valid names. Only the first 1000 are compared, and only those of at most 200 characters.
+            likeness: smallest similarity (`difflib`), from 0 for any name to 1 for an equal name.
     """
     if len(name) > _LONGEST:
         return ""

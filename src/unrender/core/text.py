@@ -1,7 +1,7 @@
-"""Text that others wrote, made fit for a terminal, a page or a message of one line.
+"""Untrusted text made safe for a terminal, a page or a one-line message.
 
-A terminal obeys what some characters say: ESC and the C1 controls begin commands that move the cursor, set the window's title or write to
-the clipboard, and direction marks (U+202E and the like) show a name in another order than it has.
+Terminals interpret some characters. ESC and the C1 control codes start commands that move the cursor, set the window's title or write to
+the clipboard. Direction marks such as U+202E display a name in a different order.
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 LONGEST_LINE = 1000
-"""Characters of the longest message."""
+"""Largest number of characters of a message."""
 _NAMED = 4
-"""Names of a list that are given where it has more than twice as many."""
+"""Number of names to list from a list of more than twice that length."""
 
 
 def visible(text: str, keep: str = "") -> str:
-    """The text with what does not print as Python writes it in a literal, such as `\\x1b`; what is in `keep` stays as it is."""
+    """Escape the characters that do not print as Python does in a literal, such as `\\x1b`. Characters in `keep` are not escaped."""
     if text.isprintable():
         return text
     return "".join(letter if letter.isprintable() or letter in keep else _escaped(letter) for letter in text)
 
 
 def shorten(text: str, longest: int) -> str:
-    """The text, its middle left out where it has more than `longest` characters (at least 16)."""
+    """Return the text with its middle replaced by " ... " if it has more than `longest` characters (at least 16)."""
     if len(text) <= longest:
         return text
     tail = longest // 3
@@ -31,14 +31,14 @@ def shorten(text: str, longest: int) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names one after another: "a, b"; of more than eight, the first four, and how many there are besides."""
+    """Join names as "a, b". A list of more than eight names is cut after four, with the number of the others."""
     if len(names) <= 2 * _NAMED:
         return ", ".join(names)
     return f"{', '.join(names[:_NAMED])} and {len(names) - _NAMED} more"
 
 
 def grouped(values: Mapping[str, str]) -> str:
-    """{name: words} by words: "0.1 (a, b), 0.05 (c)"."""
+    """Format {name: value} grouped by value: "0.1 (a, b), 0.05 (c)"."""
     names: dict[str, list[str]] = {}
     for name, words in values.items():
         names.setdefault(words, []).append(name)
@@ -46,24 +46,24 @@ def grouped(values: Mapping[str, str]) -> str:
 
 
 def one_line(text: str) -> str:
-    """The text as one printable line of at most `LONGEST_LINE` characters."""
+    """Return the text as one printable line of at most `LONGEST_LINE` characters."""
     return shorten(visible(shorten(text, 4 * LONGEST_LINE)), LONGEST_LINE)
 
 
 def reason_of(error: BaseException, longest: int | None = None) -> str:
-    """What an error says, on one line of at most so many characters; its kind where it says nothing."""
+    """Return an error's message on one line of at most `longest` characters, or the name of its type if it is empty."""
     return " ".join(str(error).split())[:longest] or type(error).__name__
 
 
 def plain(text: str) -> str:
-    """Return the text with what is no Unicode escaped: such text can be written to a file and read again."""
+    """Return the text with lone surrogates escaped, so that it can be encoded as UTF-8."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
 def printable(value: Any) -> str:
-    """Untrusted text on one line: 60 characters at most, what does not print escaped."""
+    """Format an untrusted value on one line of at most 60 characters, with unprintable characters escaped."""
     text = value if isinstance(value, str) and value.isprintable() else "nothing" if value is None else repr(value)
-    text = visible(text[:200])  # a value of another type may write itself as it likes
+    text = visible(text[:200])  # repr of an arbitrary type may be long or unprintable
     return text if len(text) <= 60 else text[:57] + "..."
 
 

@@ -93,7 +93,7 @@ def optimize(
 
     Raises:
         InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
-            cannot be begun, or cannot be written in the end; a run goes on in another thread.
+            cannot be begun, or cannot be written in the end; another thread has a run in progress.
     """
     named = estimator
     plan = components.resolve(problem, estimator, optimizer)
