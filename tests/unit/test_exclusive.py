@@ -57,7 +57,9 @@ def test_what_would_wait_for_hours_is_refused() -> None:
     thread.start()
     begun.wait(10)
     for call, name in ((nested, "render"), (optimize, "optimize")):
-        with pytest.raises(InputError, match=rf"^{name}: optimize is running in another thread, .* use another process$"):
+        with pytest.raises(
+            InputError, match=rf"^{name}: optimize is running in another thread, .* use another process$"
+        ):
             call()
     end.set()
     thread.join()
