@@ -192,7 +192,7 @@ def test_an_old_llvm_loaded_before_us_is_one_line_and_no_abort(path: str, major:
     ("name", "content", "said"),
     [
         ("libLLVM-19.so", None, "{variable} is no such file, "),
-        ("libLLVM.so", "not a library", "{variable} is no LLVM, "),
+        ("libLLVM.so", "not a library", "{variable} is not LLVM, "),
         ("libLLVM-19.so", "not a library", "Dr.Jit cannot load {variable}, "),
     ],
 )

@@ -1,1 +1,1 @@
-"""Which Mitsuba variant runs, and what this machine needs for it."""
+"""Mitsuba's variant, and what this machine must have to run it."""

@@ -1,4 +1,4 @@
-"""Which files and folders other users of this machine can read or change. Nothing here needs Ray."""
+"""Checks whether other users of this machine can read or change files and folders. Independent of Ray."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ _OVERFLOW = Path("/proc/sys/kernel/overflowuid")
 
 
 def can_change(folder: Path, shared: bool = False) -> str:
-    """Return how others could change entries of a folder or replace it, as words for a message; "" where they cannot.
+    """Return how other users could change entries of a folder or replace it, as a phrase for a message; "" if they cannot.
 
     Args:
-        folder: one that exists.
-        shared: whether others may add entries, as in the system's temporary folder. Its sticky bit must be set.
+        folder: existing folder.
+        shared: whether others may add entries, as in the system's temporary folder, whose sticky bit must be set.
     """
     place = Path(os.path.realpath(folder))
     for above in (place, *place.parents):
-        if _shielded(above.parent):  # but the folder that shields it may be replaced, too
+        if _shielded(above.parent):  # the shielding folder itself may still be replaced, so its parents are checked too
             continue
         status = above.stat()
         mode = stat.S_IMODE(status.st_mode)
@@ -32,7 +32,7 @@ def can_change(folder: Path, shared: bool = False) -> str:
 
 
 def can_read(path: Path) -> str:
-    """Return how others can read a file, as words for a message; "" where they cannot."""
+    """Return how other users can read a file, as a phrase for a message; "" if they cannot."""
     path = Path(os.path.realpath(path))
     if _shielded(path.parent):
         return ""
@@ -44,7 +44,7 @@ def can_read(path: Path) -> str:
 
 
 def _shielded(folder: Path) -> bool:
-    """Return whether nobody else can enter the folder: it, or one above it, is closed to them."""
+    """Return whether no other user can enter the folder, because it or a parent is closed to them."""
     for place in (folder, *folder.parents):
         status = place.stat()
         if status.st_uid == os.geteuid() and not stat.S_IMODE(status.st_mode) & 0o011:
@@ -53,11 +53,11 @@ def _shielded(folder: Path) -> bool:
 
 
 def _trusted() -> set[int]:
-    """Return the owners that a folder may have: this user, root, and in a container those who have no number there."""
-    found = {0, os.geteuid()}
+    """Return the accepted owners of a folder: this user, root, and in a container the owner of files without a mapped id."""
+    owners = {0, os.geteuid()}
     try:
         if _UIDS.read_text().split() != ["0", "0", "4294967295"]:
-            found.add(int(_OVERFLOW.read_text()))
-    except (OSError, ValueError):  # no Linux
+            owners.add(int(_OVERFLOW.read_text()))
+    except (OSError, ValueError):  # not Linux
         pass
-    return found
+    return owners

@@ -1,12 +1,11 @@
-"""The user's cache folder: what can be computed again, kept so that it need not be.
+"""The user's cache folder, for results that can be recomputed.
 
-It lies where the system wants such folders, or where the environment variable `UNRENDER_CACHE_DIR` says; an empty one switches it off.
-In it:
+Its place is the system's default, or the environment variable `UNRENDER_CACHE_DIR`. An empty value turns the cache off. It contains:
 
     references/    reference images of the gallery's problems
     kernels/       kernels that Dr.Jit has compiled
 
-Each part is bounded in size: what was not used for longest is removed. A folder that cannot be written is no error: nothing is kept then.
+The size of each part is limited: the least recently used files are removed. If the folder is not writable, nothing is cached.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from unrender.backend import access
 ENVIRONMENT_VARIABLE = "UNRENDER_CACHE_DIR"
 REFERENCES, KERNELS = "references", "kernels"
 LARGEST = {REFERENCES: 1 << 29, KERNELS: 1 << 30}
-"""Bytes of each part at most."""
+"""Maximum size of each part in bytes."""
 
 _DRJIT_VARIABLE = "DRJIT_CACHE_DIR"
-"""Where Dr.Jit keeps compiled kernels; it reads this once, when it is imported."""
+"""Dr.Jit's folder of compiled kernels. Dr.Jit reads the variable once, on import."""
 _STAMP = ".tidied"
 _DAY = 86400.0
 
@@ -34,24 +33,24 @@ _bypassed = False
 
 
 def root() -> Path | None:
-    """Return the cache folder, whether it exists or not; None where it is switched off or the user has no home folder."""
-    given = os.environ.get(ENVIRONMENT_VARIABLE)
-    if given is not None:
-        return Path(given).absolute() if given else None
+    """Return the cache folder, which need not exist; None if the cache is off or the user has no home folder."""
+    setting = os.environ.get(ENVIRONMENT_VARIABLE)
+    if setting is not None:
+        return Path(setting).absolute() if setting else None
     import platformdirs
 
     try:
         return Path(platformdirs.user_cache_dir("unrender", appauthor=False))
-    except (RuntimeError, KeyError):  # HOME is not set, and this user has no entry in the password file
+    except (RuntimeError, KeyError):  # HOME is not set, and the password file has no entry for this user
         return None
 
 
 def folder(part: str) -> Path | None:
-    """A part of the cache, `REFERENCES` or `KERNELS`, made where it is missing.
+    """Return a part of the cache, `REFERENCES` or `KERNELS`, and create its folder.
 
     Returns:
-        None where the cache is switched off or bypassed, or the folder cannot be made or written, or where another user could put files
-        there or replace it: a compiled kernel is code that runs as whoever loads it.
+        The folder. None if the cache is off, bypassed or not writable, or if another user could replace it or add files: a compiled
+        kernel is code that runs with this user's rights.
     """
     top = None if _bypassed else root()
     if top is None:
@@ -69,7 +68,7 @@ def folder(part: str) -> Path | None:
 
 @contextlib.contextmanager
 def bypassed() -> Iterator[None]:
-    """Neither read nor write the cache meanwhile. Compiled kernels are Dr.Jit's own affair and stay."""
+    """Disable reading and writing of the cache within this context. Dr.Jit's kernel cache is not affected."""
     global _bypassed
     before, _bypassed = _bypassed, True
     try:
@@ -79,7 +78,7 @@ def bypassed() -> Iterator[None]:
 
 
 def use_for_kernels() -> None:
-    """Have Dr.Jit keep its kernels here, unless `DRJIT_CACHE_DIR` is set. To be called before Dr.Jit is imported."""
+    """Make Dr.Jit cache its kernels here unless `DRJIT_CACHE_DIR` is set. Must be called before Dr.Jit is imported."""
     if os.environ.get(_DRJIT_VARIABLE):
         return
     place = folder(KERNELS)
@@ -89,7 +88,7 @@ def use_for_kernels() -> None:
 
 
 def tidy(place: Path, largest: int) -> None:
-    """`trim`, at most once a day."""
+    """Call `trim` at most once a day."""
     stamp = place / _STAMP
     with contextlib.suppress(OSError):
         if stamp.exists() and 0 <= time.time() - stamp.stat().st_mtime < _DAY:
@@ -100,19 +99,16 @@ def tidy(place: Path, largest: int) -> None:
 
 
 def trim(place: Path, largest: int) -> None:
-    """Remove the files that were not used for longest until the others have `largest` bytes together at most.
-
-    Whatever cannot be removed stays.
-    """
-    found = []
+    """Remove the least recently used files until the rest have at most `largest` bytes. A file that cannot be removed stays."""
+    entries = []
     with contextlib.suppress(OSError):
         for entry in os.scandir(place):
             if entry.name != _STAMP and entry.is_file(follow_symlinks=False):
                 with contextlib.suppress(OSError):  # another process may have removed it
                     status = entry.stat(follow_symlinks=False)
-                    found.append((max(status.st_mtime, status.st_atime), status.st_size, entry.path))
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
+                    entries.append((max(status.st_mtime, status.st_atime), status.st_size, entry.path))
+    total = sum(size for _, size, _ in entries)
+    for _, size, path in sorted(entries):
         if total <= largest:
             break
         with contextlib.suppress(OSError):
@@ -121,7 +117,7 @@ def trim(place: Path, largest: int) -> None:
 
 
 def size(part: str) -> int:
-    """Bytes of the files in a part of the cache."""
+    """Return the number of bytes of the files in a part of the cache."""
     top = root()
     if top is None:
         return 0

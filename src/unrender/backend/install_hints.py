@@ -1,6 +1,6 @@
-"""Which command installs on this machine what `pip` cannot bring: LLVM, and the C libraries that Dr.Jit links to.
+"""Commands that install what `pip` does not provide: LLVM, and the C libraries that Dr.Jit links to.
 
-Only the standard library, and nothing of `unrender`: the set-up script runs this file before anything is installed.
+Imports the standard library only, because the set-up script runs this file before anything is installed.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import subprocess
 from collections.abc import Mapping, Sequence
 
 NEEDS = ("llvm", "libatomic.so.1", "libstdc++.so.6", "venv")
-"""What can be asked for."""
+"""Names of the requirements."""
 
 APT_LLVM = ("libllvm19", "libllvm20", "libllvm21", "libllvm22", "libllvm18", "libllvm17t64", "libllvm17")
-"""Debian's and Ubuntu's packages of an LLVM that works, best known first."""
+"""Packages of Debian and Ubuntu with a supported LLVM, in order of preference."""
 
 _APT = {"libatomic.so.1": "libatomic1", "libstdc++.so.6": "libstdc++6", "venv": "python3-venv"}
 _DNF = {"llvm": "llvm-libs", "libatomic.so.1": "libatomic", "libstdc++.so.6": "libstdc++", "venv": "python3"}
@@ -25,15 +25,14 @@ _CONDA = {"llvm": "libllvm19", "libatomic.so.1": "libgcc", "libstdc++.so.6": "li
 
 
 def manager(environment: Mapping[str, str] = os.environ) -> str | None:
-    """The package manager to name: conda inside one of its environments, else the system's; None where none is
-    known."""
+    """Return the package manager: conda in a conda environment, else the system's; None if none is known."""
     if environment.get("CONDA_PREFIX"):
         return "conda"
     return next((name for name in ("apt-get", "dnf", "pacman", "brew") if shutil.which(name)), None)
 
 
 def command(needs: Sequence[str], by: str | None = None) -> str:
-    """The one shell command that installs `needs` (of `NEEDS`) with the package manager `by` (default: `manager()`)."""
+    """Return one shell command that installs `needs` (from `NEEDS`) with the package manager `by` (default: `manager()`)."""
     by = by or manager()
     sudo = "" if is_root() else "sudo "
     if by == "apt-get":
@@ -52,8 +51,7 @@ def command(needs: Sequence[str], by: str | None = None) -> str:
 
 
 def apt_packages(needs: Sequence[str]) -> list[str] | None:
-    """Debian's packages for `needs`; None where apt knows no LLVM that works (its lists are empty, or the release is
-    old)."""
+    """Return Debian's packages for `needs`; None if apt offers no supported LLVM (no package lists, or an old release)."""
     packages = [_APT[need] for need in needs if need != "llvm"]
     if "llvm" in needs:
         llvm = _known_to_apt(APT_LLVM)
@@ -64,14 +62,14 @@ def apt_packages(needs: Sequence[str]) -> list[str] | None:
 
 
 def is_root() -> bool:
-    """Whether this process may install packages as it is."""
+    """Return whether this process has root rights."""
     return hasattr(os, "geteuid") and os.geteuid() == 0
 
 
 def _apt_command(needs: Sequence[str], sudo: str) -> str:
     packages = apt_packages(needs)
     if packages is None and _known_to_apt(("coreutils",)) is None:
-        # No lists at all, as in a fresh container: the first choice is what all current releases have.
+        # Without package lists, as in a fresh container, name the package that all current releases have.
         packages = [APT_LLVM[0]] + [_APT[need] for need in needs if need != "llvm"]
     if packages is not None:
         return f"{sudo}apt-get update && {sudo}apt-get install -y {' '.join(packages)}"
@@ -81,7 +79,7 @@ def _apt_command(needs: Sequence[str], sudo: str) -> str:
 
 
 def _known_to_apt(packages: Sequence[str]) -> str | None:
-    """The first of `packages` that apt could install now."""
+    """Return the first of `packages` that apt can install, or None."""
     try:
         answer = subprocess.run(
             ["apt-cache", "policy", *packages],

@@ -1,4 +1,4 @@
-"""How much of the machine this process may use: processor cores and memory, within a container's limits too."""
+"""Limits of this process: processor cores and memory, including a container's limits."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ from pathlib import Path
 _GROUPS, _MOUNT, _MEMORY = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup"), Path("/proc/meminfo")
 _STATUS = Path("/proc/self/status")
 _UNLIMITED = 1 << 60
-"""Bytes from which on version 1 of control groups means no limit."""
+"""Smallest value that version 1 of control groups uses for "no limit", in bytes."""
 
 
 def cores() -> int:
-    """Return how many of the processor's cores this process may use, >= 1: a container's share is rounded up."""
+    """Return the number of processor cores that this process may use, >= 1. A container's fractional share is rounded up."""
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     shares = [math.ceil(share) for share in _processor_shares()]
     return max(1, min([available, *shares]))
 
 
 def free_memory() -> int:
-    """Return the bytes that this machine, or this container, has left; 0 where that is unknown."""
-    found = list(_memory_left())
+    """Return the available memory of this machine or container in bytes; 0 if unknown."""
+    candidates = list(_memory_left())
     try:
         lines = _MEMORY.read_text().splitlines()
-        found += [int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable")]
+        candidates += [int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable")]
     except (OSError, ValueError, IndexError):
         pass
-    return min(found, default=0)
+    return min(candidates, default=0)
 
 
 def group_memory() -> int:
-    """Return the bytes that this process's control groups may use; 0 where none has a limit."""
+    """Return the memory limit of this process's control groups in bytes; 0 if there is none."""
     return min((limit for limit, _ in _group_memory()), default=0)
 
 
 def address_space() -> int:
-    """Return the bytes of addresses that this process may use (`ulimit -v`); 0 where that is not limited."""
+    """Return the limit of this process's address space in bytes (`ulimit -v`); 0 if there is none."""
     try:
         import resource
     except ImportError:  # Windows
@@ -47,7 +47,7 @@ def address_space() -> int:
 
 
 def most_address_space() -> int:
-    """Return the most bytes of addresses that this process has used so far; 0 where that is unknown."""
+    """Return the peak size of this process's address space in bytes; 0 if unknown."""
     try:
         lines = _STATUS.read_text().splitlines()
         return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmPeak:")), 0)
@@ -56,7 +56,7 @@ def most_address_space() -> int:
 
 
 def _processor_shares() -> Iterator[float]:
-    """Processor seconds per second, of each group that has a limit."""
+    """Yield the processor seconds per second of each control group that has a limit."""
     for folder in _groups("cpu"):
         words = _words(folder / "cpu.max")  # version 2: "max 100000" or "150000 100000"
         if not words:
@@ -67,12 +67,12 @@ def _processor_shares() -> Iterator[float]:
 
 
 def _memory_left() -> Iterator[int]:
-    """Bytes, of each group that has a limit."""
+    """Yield the available bytes of each control group that has a limit."""
     return (max(limit - used, 1) for limit, used in _group_memory())
 
 
 def _group_memory() -> Iterator[tuple[int, int]]:
-    """The limit and the bytes in use, of each group that has a limit."""
+    """Yield (limit, bytes in use) of each control group that has a limit."""
     for limit, used in (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes")):
         for folder in _groups("memory"):
             words = [*_words(folder / limit), *_words(folder / used)]
@@ -81,7 +81,7 @@ def _group_memory() -> Iterator[tuple[int, int]]:
 
 
 def _groups(controller: str) -> Iterator[Path]:
-    """The folders of this process's group and of those above it, whose limits hold too. A container may see the topmost alone."""
+    """Yield the folders of this process's control group and its parents, whose limits also apply. A container may see only the topmost."""
     try:
         lines = _GROUPS.read_text().splitlines()
     except OSError:
@@ -91,7 +91,7 @@ def _groups(controller: str) -> Iterator[Path]:
         controllers, _, name = rest.partition(":")
         if controllers and controller not in controllers.split(","):
             continue
-        # Version 2 has no controllers there. Version 1 mounts each set of them, by its name or by that of one of them.
+        # Version 2 lists no controllers. Version 1 mounts each set of controllers under the set's name or that of one member.
         mounts = [_MOUNT, _MOUNT / "unified"] if not controllers else [_MOUNT / controllers, _MOUNT / controller]
         for mount in dict.fromkeys(mounts):
             group = Path(os.path.normpath(f"{mount}/{name}"))

@@ -1,10 +1,9 @@
-"""The LLVM library that compiles Dr.Jit's CPU kernels: which are installed here, and which of them is safe.
+"""Choice of the LLVM library that compiles Dr.Jit's CPU kernels, among those that are installed.
 
-Dr.Jit takes whatever `libLLVM` it finds first, already when it is imported, and one that is too old aborts the
-process at the first differentiable render. So the choice is made here, before Dr.Jit is imported, and without loading
-any candidate.
+Dr.Jit loads the first `libLLVM` it finds, on import, and one that is too old aborts the process at the first differentiable render. So
+the choice is made here, before Dr.Jit is imported, and no candidate is loaded into this process.
 
-Only the standard library, and nothing of `unrender`: the set-up script runs this file before anything is installed.
+Imports the standard library only, because the set-up script runs this file before anything is installed.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
-"""What Dr.Jit reads, once, when it is imported."""
+"""Environment variable with the path of the library. Dr.Jit reads it once, on import."""
 
 OLDEST = 17
-"""The oldest major version that works. 14 is refused by Dr.Jit; 15 and 16 abort on processors with AVX-512 ("Cannot
-select: fminimum") at the first gradient; 17, 18, 19 and 22 were run on one and gave the same gradient."""
+"""Oldest supported major version. Dr.Jit refuses 14. Versions 15 and 16 abort on processors with AVX-512 at the first gradient ("Cannot
+select: fminimum"). On such a processor 17, 18, 19 and 22 gave equal gradients."""
 
 NEWEST = 22
-"""The newest major version that was tried. A newer one is used where there is no other."""
+"""Newest tested major version. A newer one is used only if there is no other."""
 
 _FILE_NAME = re.compile(r"^libLLVM(-\d|\.\d|\.so|\.dylib)")
 _VERSION_IN_NAME = re.compile(r"^libLLVM(?:-|\.so\.|\.)(\d+)")
@@ -40,8 +39,8 @@ class Library:
     """An installed LLVM library.
 
     Attributes:
-        path: the file.
-        major: its major version, or None where neither its name nor the library itself tells.
+        path: path of the file.
+        major: major version, or None if neither the file's name nor the library reports it.
     """
 
     path: Path
@@ -49,7 +48,7 @@ class Library:
 
 
 def folders(environment: Mapping[str, str] = os.environ, root: Path = Path("/")) -> list[Path]:
-    """Where such libraries live: the active conda environment, then the system's and Homebrew's folders."""
+    """Return the folders to search: the active conda environment, then the system's and Homebrew's."""
     conda = [Path(prefix) / "lib" for prefix in (environment.get("CONDA_PREFIX"), sys.prefix) if prefix]
     patterns = [
         f"usr/lib/{platform.machine()}-linux-gnu",
@@ -68,7 +67,7 @@ def folders(environment: Mapping[str, str] = os.environ, root: Path = Path("/"))
 
 
 def candidates(places: Iterable[Path] | None = None) -> Iterator[Path]:
-    """Every LLVM library in `places` (default: `folders()`), each file once, links followed."""
+    """Yield the LLVM libraries in `places` (default: `folders()`). Links to one file count once."""
     seen: set[Path] = set()
     for folder in folders() if places is None else places:
         try:
@@ -83,7 +82,7 @@ def candidates(places: Iterable[Path] | None = None) -> Iterator[Path]:
 
 
 def version_by_name(path: Path) -> int | None:
-    """The major version as the file's name, what it links to, or the folders above tell it; else None."""
+    """Return the major version according to the file's name, its link target or its parent folders; None if they do not contain it."""
     for file in (path, path.resolve()):
         if match := _VERSION_IN_NAME.match(file.name):
             return int(match[1])
@@ -95,8 +94,10 @@ def version_by_name(path: Path) -> int | None:
 
 @functools.cache
 def version_by_asking(path: Path) -> int | None:
-    """The major version as the library itself tells it, in a process of its own: two LLVMs in one process collide.
-    None where it cannot be loaded or is older than 16, which cannot tell."""
+    """Return the major version that the library reports; None if it cannot be loaded or is older than 16.
+
+    A separate process loads it, because two LLVM libraries in one process collide.
+    """
     ask = (
         "import ctypes, sys; v = [ctypes.c_uint() for _ in range(3)]; "
         "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, v)); print(v[0].value)"
@@ -111,8 +112,8 @@ def version_by_asking(path: Path) -> int | None:
 
 
 def identify(path: Path) -> Library:
-    """The library at `path` with its version, by name where that tells. A bare name, which the loader would search for,
-    is taken at its word."""
+    """Return the library at `path` with its version, by its name if possible. A bare file name, which the loader resolves, is not checked
+    for existence."""
     if path.parent != Path() and not path.is_file():
         return Library(path, None)
     major = version_by_name(path)
@@ -120,11 +121,11 @@ def identify(path: Path) -> Library:
 
 
 def choose(paths: Iterable[Path] | None = None) -> Library | None:
-    """The library to use among `paths` (default: `candidates()`): the newest one that was tried, else the oldest of
-    those that are newer still, else None. Those for another processor (32-bit ones beside 64-bit ones) are passed
-    over.
+    """Choose a library among `paths` (default: `candidates()`).
 
-    Libraries are only asked for their version where no name tells of a usable one: asking takes a second.
+    The newest tested version is preferred, then the oldest of the newer ones; None if none is usable. Libraries for another processor, such
+    as 32-bit ones on a 64-bit system, are skipped. A library is asked for its version only if no file name shows a usable one, because that
+    takes a second.
     """
     paths = [path for path in (candidates() if paths is None else paths) if _is_for_this_machine(path)]
     named = [Library(path, version_by_name(path)) for path in paths]
@@ -133,21 +134,20 @@ def choose(paths: Iterable[Path] | None = None) -> Library | None:
 
 
 def is_usable(major: int | None) -> bool:
-    """Whether that version works: known, and not too old."""
+    """Return whether the version is known and not too old."""
     return major is not None and major >= OLDEST
 
 
 def _best(libraries: Iterable[Library]) -> Library | None:
     usable = sorted((each for each in libraries if is_usable(each.major)), key=lambda each: each.major or 0)
     tried = [each for each in usable if (each.major or 0) <= NEWEST]
-    # Among equals the first found, so that a conda environment's own goes before the system's.
+    # The first of equal versions wins, so that a conda environment's library precedes the system's.
     tried = [each for each in tried if each.major == tried[-1].major]
     return next(iter(tried or usable), None)
 
 
 def _is_for_this_machine(path: Path) -> bool:
-    """Whether the file's ELF header names the same word size and processor as the running Python's; True where there
-    is none."""
+    """Return whether the file's ELF header has the word size and processor of the running Python; True if Python has no ELF header."""
     try:
         with open(path, "rb") as library, open(sys.executable, "rb") as python:
             ours, theirs = python.read(20), library.read(20)
@@ -159,8 +159,8 @@ def _is_for_this_machine(path: Path) -> bool:
 
 
 def missing_companions() -> list[str]:
-    """The system libraries that Dr.Jit's wheel links to, does not bring, and that are missing here: a minimal Debian
-    has no libatomic, without which Dr.Jit cannot be imported."""
+    """Return the missing system libraries that Dr.Jit's wheel links to and does not contain. Minimal Debian systems lack libatomic, without
+    which Dr.Jit cannot be imported."""
     if sys.platform != "linux":
         return []
     missing = []

@@ -1,12 +1,12 @@
-"""Which plugins Mitsuba may load: its own, and no library that lies beside a scene.
+"""Control over the plugins that Mitsuba loads: only its own, never a library next to a scene.
 
-Mitsuba makes an object of type T by loading the shared library `plugins/T.so` from the first folder of its file resolver that has one.
-The resolver begins with the current directory, and `mitsuba.load_file` puts the scene's folder before that: a scene that someone mailed
-would run the code that lies beside it. A name that no folder has is looked up from the current directory once more, and a type such
-as `../x` or `/tmp/x` leads out of the folder `plugins` altogether.
+Mitsuba creates an object of type T by loading the shared library `plugins/T.so` from the first folder of its file resolver that has one.
+The resolver starts with the current directory, and `mitsuba.load_file` puts the scene's folder first. A scene from an untrusted source
+could thus execute code in its own folder. A name that no folder has is looked up once more in the current directory, and a type such as
+`../x` or `/tmp/x` leaves the folder `plugins`.
 
-So Mitsuba's own folder comes first for the whole process (`prefer_own`), scenes are made where there is no other (`only`), and the
-names of types are checked before Mitsuba sees them (`check_type`).
+So Mitsuba's own folder comes first for the entire process (`prefer_own`), scenes are loaded with no other folder (`only`), and the names
+of types are checked before Mitsuba reads them (`check_type`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ENDING = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
 
 @cache
 def own_folder() -> Path:
-    """Where Mitsuba's own plugins and data are. Mitsuba must be importable."""
+    """Return the folder of Mitsuba's own plugins and data. Mitsuba must be importable."""
     import mitsuba as mi
 
     places = [Path(str(mi.__file__)).parent, *map(Path, mi.__path__)]
@@ -37,7 +37,7 @@ def own_folder() -> Path:
 
 
 def search_paths() -> list[Path]:
-    """Return the folders where Mitsuba's file resolver looks for files, first to last. Raises `InputError` for names that are not UTF-8."""
+    """Return the folders of Mitsuba's file resolver in search order. Raises `InputError` for names that are not UTF-8."""
     try:
         return [Path(str(place)) for place in _mitsuba().file_resolver()]
     except UnicodeDecodeError as error:  # the current folder is one of them
@@ -45,7 +45,7 @@ def search_paths() -> list[Path]:
 
 
 def prefer_own() -> None:
-    """Have Mitsuba look into its own folder first, for the whole process. Again does nothing."""
+    """Put Mitsuba's own folder first in its file resolver for the entire process. Idempotent."""
     resolver = _mitsuba().file_resolver()
     if search_paths()[:1] != [own_folder()]:
         resolver.prepend(str(own_folder()))
@@ -53,7 +53,7 @@ def prefer_own() -> None:
 
 @contextmanager
 def only(folder: Path) -> Iterator[None]:
-    """Have Mitsuba look into one folder alone meanwhile. Relative names that it does not have count from the current directory."""
+    """Restrict Mitsuba's file resolver to one folder within this context. Other relative names resolve against the current directory."""
     mi = _mitsuba()
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
@@ -67,9 +67,9 @@ def only(folder: Path) -> Iterator[None]:
 
 
 def check_type(name: str) -> None:
-    """Raise `InputError` for the type of an object that would have Mitsuba load a library that is not its own.
+    """Raise `InputError` for an object type for which Mitsuba would load a library other than its own.
 
-    Types that were registered in Python are no libraries and pass, and so do types that do not exist: Mitsuba says so.
+    Types that were registered in Python have no library and pass. Types that do not exist pass too: Mitsuba reports them.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"type {name[:60]!r}: expected the name of a plugin, of letters, digits, '_' and '-'")

@@ -1,7 +1,6 @@
-"""Which Mitsuba variant runs: a GPU where one really works, else the CPU with an LLVM that is safe.
+"""Choice of the Mitsuba variant: a GPU if one works, else the CPU with a supported LLVM.
 
-The only caller of `mitsuba.set_variant`. Nothing in `unrender` reaches a kernel before `ensure()` or `use()` has
-answered.
+Only this module calls `mitsuba.set_variant`. `unrender` runs no kernel before `ensure()` or `use()` has returned.
 """
 
 from __future__ import annotations
@@ -26,17 +25,17 @@ from unrender.core.text import reason_of
 CUDA = "cuda_ad_rgb"
 LLVM = "llvm_ad_rgb"
 VARIANTS = (CUDA, LLVM)
-"""Three colour channels, with derivatives, unpolarised: what every formula here is written for."""
+"""Supported variants: RGB, differentiable, unpolarised."""
 
 _INITIALISATION = 0.5
-"""Seconds that Dr.Jit takes at most to find that a library will not do."""
+"""Maximum time in seconds that Dr.Jit takes to reject a library."""
 
 _THREADS = 4
-"""Threads for each core at most."""
+"""Maximum number of threads per core."""
 
-_kept = False
+_threads_limited = False
 _setting = threading.RLock()
-"""Mitsuba's names are half there while another thread sets its variant."""
+"""Lock: Mitsuba's module attributes are incomplete while another thread sets the variant."""
 
 _GPU_TRIAL = """
 import os, sys
@@ -51,15 +50,15 @@ assert dr.allclose(scene.ray_intersect_preliminary(rays).t, 2)
 
 
 def prepare() -> None:
-    """Choose the LLVM library that Dr.Jit will load. Call it before the first `import drjit` of the process.
+    """Choose the LLVM library that Dr.Jit will load. Must be called before the first `import drjit` of the process.
 
-    Dr.Jit reads `DRJIT_LIBLLVM_PATH` once, when it is imported, and without it takes the first library it finds, even
-    one that aborts later. So the variable is set here, to the newest one known to work. One that the user has set is
-    left alone (and judged by `use`). Likewise `DRJIT_CACHE_DIR`, the folder
-    of compiled kernels. Nothing is loaded, no kernel runs. Does nothing once Dr.Jit is imported.
+    Dr.Jit reads `DRJIT_LIBLLVM_PATH` once, on import. Without it, Dr.Jit loads the first library it finds, even one that aborts later. So
+    this function sets the variable to the newest supported library, unless the user has set it (`use` checks that one). It sets
+    `DRJIT_CACHE_DIR`, the folder of compiled kernels, in the same manner. It loads no library and runs no kernel, and does nothing once
+    Dr.Jit is imported.
 
     Raises:
-        VariantError: a system library without which Dr.Jit cannot be imported at all is missing.
+        VariantError: a system library is missing without which Dr.Jit cannot be imported.
     """
     if "drjit" in sys.modules:
         return
@@ -76,30 +75,29 @@ def prepare() -> None:
         if library is not None:
             os.environ[llvm.ENVIRONMENT_VARIABLE] = str(library.path)
     if not usable and sys.platform == "linux":
-        # Dr.Jit will say so on standard error as it is imported, before our one line that also says what to do.
-        # Whatever goes wrong here is told by the import that follows.
+        # Dr.Jit prints its own message on import, before the one-line error that also says what to do. The later import reports any
+        # failure of this one.
         with _silent_stderr(), contextlib.suppress(Exception):
             import drjit  # noqa: F401
 
-            time.sleep(_INITIALISATION)  # goes on in a thread after the import
+            time.sleep(_INITIALISATION)  # a thread continues after the import
 
 
 def use(variant: str = "auto") -> str:
-    """Select the Mitsuba variant that everything runs on from now on.
+    """Select the Mitsuba variant for all later computation.
 
-    May be called again, also with another variant: scenes and arrays made before stay with the old one and cannot be
-    mixed with new ones.
+    A later call may select another variant. Existing scenes and arrays stay with the old variant and cannot be mixed with new ones.
 
     Args:
-        variant: "cuda_ad_rgb", "llvm_ad_rgb", or "auto": CUDA where a GPU works, else LLVM. Whether it works is tried
-            once per process, in a process of its own (a few seconds, and only where a driver is installed).
+        variant: "cuda_ad_rgb", "llvm_ad_rgb" or "auto", which is CUDA if a GPU works and LLVM otherwise. A GPU is tested once per
+            process, in a separate process. The test takes a few seconds, and only runs if a driver is installed.
 
     Returns:
-        The variant in use.
+        The selected variant.
 
     Raises:
-        VariantError: there is no such variant, or this machine cannot run it: no working GPU, no LLVM, or one so old
-            that it would abort the process. One line, with the command that installs what is missing.
+        VariantError: the variant does not exist, or this machine cannot run it: no working GPU, no LLVM, or an LLVM that is so old
+            that it would abort the process. The message contains the command that installs what is missing.
     """
     if variant not in ("auto", *VARIANTS):
         hint = did_you_mean(variant, VARIANTS, likeness=0.3)
@@ -118,16 +116,16 @@ def use(variant: str = "auto") -> str:
                 mi.set_variant(chosen)
             except ImportError as error:
                 raise VariantError(f"Mitsuba cannot use {chosen}: {reason_of(error)}") from error
-            _keep_to_container()
+            _limit_threads()
     return chosen
 
 
-def _keep_to_container() -> None:
-    """Let Dr.Jit have no more threads than a container has cores. By itself it counts those of the machine."""
-    global _kept
-    if _kept:
+def _limit_threads() -> None:
+    """Limit Dr.Jit's threads to the container's cores. Dr.Jit counts the cores of the machine."""
+    global _threads_limited
+    if _threads_limited:
         return
-    _kept = True
+    _threads_limited = True
     import drjit as dr
 
     if (cores := limits.cores()) < dr.thread_count():
@@ -135,7 +133,7 @@ def _keep_to_container() -> None:
 
 
 def check_threads(count: int) -> None:
-    """Raise `InputError` for more threads than a few for each core: they take those of all other processes of the machine."""
+    """Raise `InputError` for more than four threads per core, which would slow down all processes of the machine."""
     cores = limits.cores()
     if count > _THREADS * cores:
         raise InputError(
@@ -144,10 +142,10 @@ def check_threads(count: int) -> None:
 
 
 def use_threads(count: int) -> None:
-    """Let that many threads of the processor work, >= 1. Before the first kernel of the process: later, Dr.Jit may crash.
+    """Set the number of Dr.Jit's CPU threads, >= 1. Call it before the first kernel of the process; later, Dr.Jit may crash.
 
     Raises:
-        InputError: they are far more than this process has cores.
+        InputError: more than four threads per core.
     """
     check_threads(count)
     ensure()
@@ -159,7 +157,10 @@ def use_threads(count: int) -> None:
 
 @contextlib.contextmanager
 def two_threads() -> Iterator[None]:
-    """Let Dr.Jit have a second thread meanwhile where it has one alone: Mitsuba's OpenEXR would wait for ever to read or write a file."""
+    """Give Dr.Jit at least two threads within this context.
+
+    With one thread, Mitsuba's OpenEXR deadlocks when it reads or writes a file.
+    """
     ensure()
     import drjit as dr
 
@@ -176,17 +177,18 @@ def two_threads() -> Iterator[None]:
 
 
 def current() -> str | None:
-    """The variant that Mitsuba is set to, whoever set it; None before any was chosen. Imports nothing."""
+    """Return Mitsuba's current variant, or None if none is set. Imports nothing."""
     mi = sys.modules.get("mitsuba")
     return None if mi is None else mi.variant()
 
 
 def ensure() -> str:
-    """What library code calls before it touches Mitsuba: keep the variant that is set, once it is known to be safe;
-    choose one as `use("auto")` does where none is. Cheap to call again.
+    """Return the current variant after checking that it is supported, or select one as `use("auto")` does.
+
+    Library code calls this before it uses Mitsuba. Repeated calls are cheap.
 
     Raises:
-        VariantError: as `use`; or a variant is set that `unrender` cannot work with, such as "scalar_rgb".
+        VariantError: as in `use`, or the current variant is one that `unrender` does not support, such as "scalar_rgb".
     """
     name = current()
     if name is None:
@@ -198,9 +200,10 @@ def ensure() -> str:
 
 @functools.cache
 def gpu_problem() -> str | None:
-    """Why no GPU can be used, in one line; None if one works: it traced a few rays against a rectangle just now.
+    """Return the reason why no GPU can be used, in one line; None if a GPU works.
 
-    The trial runs in a process of its own, so that a broken driver cannot take this one down. Cached for the process.
+    The test traces a few rays against a rectangle in a separate process, so that a broken driver cannot crash this one. Cached for the
+    process.
     """
     if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
         return "CUDA_VISIBLE_DEVICES hides every GPU"
@@ -210,7 +213,7 @@ def gpu_problem() -> str | None:
 
 
 def has_cuda_driver() -> bool:
-    """Whether the driver's library is there, loaded or not. Says nothing about whether it works."""
+    """Return whether the CUDA driver's library is installed. It need not work."""
     if os.environ.get("DRJIT_LIBCUDA_PATH"):
         return True
     places = ("/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib/wsl/lib", "/usr/lib64")
@@ -220,10 +223,10 @@ def has_cuda_driver() -> bool:
 
 
 def llvm_version() -> tuple[int, ...] | None:
-    """The version of the LLVM that Dr.Jit has loaded, such as (19, 1, 7); None where it has none.
+    """Return the version of the LLVM that Dr.Jit has loaded, such as (19, 1, 7); None if there is none.
 
-    Where the library that it was told to load cannot work, or there is none that could, Dr.Jit is not asked: it would wait for its own
-    initialisation, whose thread waits in turn, to report the failure, for the interpreter that this call holds.
+    Dr.Jit is not asked if the configured library is unusable or no usable one exists. It would deadlock: it waits for its own
+    initialisation, whose thread waits for the interpreter lock of this call to report the failure.
     """
     given = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
     if given and not llvm.is_usable(major := llvm.identify(Path(given)).major):
@@ -257,14 +260,14 @@ def _trial_problem(variant: str) -> str | None:
 
 
 def _mitsuba() -> Any:
-    """Mitsuba, imported with the right LLVM at hand, and with its own plugins before all others."""
+    """Import Mitsuba with the chosen LLVM library, and put its own plugins first."""
     prepare()
     try:
         import mitsuba
     except ModuleNotFoundError as error:
         raise VariantError(f"{error.name} is not installed; install: pip install 'mitsuba>=3.9.1,<3.10'") from error
     except (ImportError, OSError, NameError) as error:
-        # Where a library is missing, Dr.Jit's own import trips over a name while it handles that.
+        # If a library is missing, Dr.Jit's import raises NameError while it handles the original error.
         cause = error.__context__ if isinstance(error, NameError) and error.__context__ else error
         raise VariantError(f"Mitsuba cannot be imported: {reason_of(cause)}") from error
     plugins.prefer_own()
@@ -272,12 +275,12 @@ def _mitsuba() -> Any:
 
 
 def _check_llvm() -> None:
-    """Raise `VariantError` unless Dr.Jit has loaded an LLVM that works."""
+    """Raise `VariantError` unless Dr.Jit has loaded a supported LLVM."""
     version = llvm_version()
     if version is not None and llvm.is_usable(version[0]):
         return
     given = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
-    what = f"{_llvm_found(version, given)}, unrender needs LLVM {llvm.OLDEST} or newer"
+    what = f"{_describe_llvm(version, given)}, unrender needs LLVM {llvm.OLDEST} or newer"
     library = llvm.choose()
     if library is None or (given and Path(given).resolve() == library.path.resolve()):
         raise VariantError(f"{what}; install: {install_hints.command(['llvm'])}")
@@ -285,15 +288,15 @@ def _check_llvm() -> None:
     raise VariantError(f"{what}; {first}set {llvm.ENVIRONMENT_VARIABLE}={library.path}")
 
 
-def _llvm_found(version: tuple[int, ...] | None, given: str | None) -> str:
-    """What there is instead of an LLVM that works: loaded as `version`, asked for by the path `given`."""
+def _describe_llvm(version: tuple[int, ...] | None, given: str | None) -> str:
+    """Describe the unusable LLVM: loaded as `version`, or configured by the path `given`."""
     if given:
         path = Path(given)
         major = version[0] if version else llvm.identify(path).major
         if version is None and llvm.is_usable(major):
             return f"Dr.Jit cannot load {llvm.ENVIRONMENT_VARIABLE}={given}"
-        found = f"LLVM {major}" if major else ("no LLVM" if path.exists() else "no such file")
-        return f"{llvm.ENVIRONMENT_VARIABLE}={given} is {found}"
+        actual = f"LLVM {major}" if major else ("not LLVM" if path.exists() else "no such file")
+        return f"{llvm.ENVIRONMENT_VARIABLE}={given} is {actual}"
     if version is not None and llvm.choose():
         return f"Dr.Jit was imported before unrender and loaded LLVM {version[0]}"
     newest = max((llvm.version_by_name(path) or 0 for path in llvm.candidates()), default=0)
@@ -302,9 +305,9 @@ def _llvm_found(version: tuple[int, ...] | None, given: str | None) -> str:
 
 @contextlib.contextmanager
 def _silent_stderr() -> Iterator[None]:
-    """Nothing reaches file descriptor 2 meanwhile, from C++ either."""
+    """Discard what is written to file descriptor 2 within this context, including output from C++."""
     try:
-        kept = os.dup(2)
+        original = os.dup(2)
     except OSError:  # closed, so silent already
         yield
         return
@@ -313,5 +316,5 @@ def _silent_stderr() -> Iterator[None]:
             os.dup2(sink.fileno(), 2)
         yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(original, 2)
+        os.close(original)

@@ -226,9 +226,9 @@ def segment_sums(x: Array, starts: Array, numbers: Array) -> Array:
     """Return the sums of consecutive rows of `x` (N, C) for P segments, (P, C). The order of summation is fixed.
 
     Args:
-            x: rows (N, C); each row is in exactly one segment.
-            starts: index of the first row of each segment, (P,), ascending integers.
-            numbers: number of rows of each segment, (P,), >= 1.
+        x: rows (N, C); each row is in exactly one segment.
+        starts: index of the first row of each segment, (P,), ascending integers.
+        numbers: number of rows of each segment, (P,), >= 1.
     """
     if not is_drjit(x):
         return np.add.reduceat(x, starts, axis=0)

@@ -23,14 +23,14 @@ def solve(
 
     Args:
         gradient: g, (n,).
-            product: function of v (n,) that returns H v (n,).
-            trust_radius: largest length of the step, > 0.
-            iterations: maximum number of products, >= 1.
-            tolerance: ratio of the residual's norm to the gradient's norm at which the iteration stops, in [0, 1).
-            damping: smallest allowed ratio of a direction's curvature to the largest curvature so far, in [0, 1).
+        product: function of v (n,) that returns H v (n,).
+        trust_radius: largest length of the step, > 0.
+        iterations: maximum number of products, >= 1.
+        tolerance: ratio of the residual's norm to the gradient's norm at which the iteration stops, in [0, 1).
+        damping: smallest allowed ratio of a direction's curvature to the largest curvature so far, in [0, 1).
 
     Returns:
-            The step, (n,); zero where the gradient is zero or not finite.
+        The step, (n,); zero where the gradient is zero or not finite.
     """
     step, residual = np.zeros_like(gradient), -gradient
     v, greatest_curvature = residual, 0.0

@@ -11,8 +11,8 @@ class DropReport:
     """Counter of dropped values. Logs a warning at the first one and at every tenfold count.
 
     Attributes:
-            count: number of values dropped so far.
-            total: number of values seen so far.
+        count: number of values dropped so far.
+        total: number of values seen so far.
     """
 
     def __init__(self) -> None:

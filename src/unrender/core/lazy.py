@@ -11,7 +11,7 @@ def attach(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any]
     """Return the `__getattr__` and the `__all__` of a package with lazy imports.
 
     Args:
-            package: dotted name of the package.
+        package: dotted name of the package.
         homes: {public name: module below the package that defines it}.
     """
 

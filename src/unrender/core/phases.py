@@ -71,7 +71,7 @@ class Stopwatch:
     """Listener that sums the seconds of each phase. Time in a nested phase counts for the nested phase only.
 
     Attributes:
-            seconds: {name: seconds}, in the order in which the phases first started.
+        seconds: {name: seconds}, in the order in which the phases first started.
     """
 
     def __init__(self) -> None:

@@ -45,11 +45,11 @@ class Kind:
     """A kind of component.
 
     Attributes:
-            name: name in messages and in `register(kind=)`.
-            package: package whose modules define the components of `unrender`; "" if there is none.
-            protocol: "module.Name" of the protocol that a class may inherit from to declare its kind.
-            members: sets of methods that identify classes without that base; empty if they must inherit from the protocol.
-            in_tables: whether a table {type = "Name", ...} can describe one; its keys are the fields of a frozen dataclass.
+        name: name in messages and in `register(kind=)`.
+        package: package whose modules define the components of `unrender`; "" if there is none.
+        protocol: "module.Name" of the protocol that a class may inherit from to declare its kind.
+        members: sets of methods that identify classes without that base; empty if they must inherit from the protocol.
+        in_tables: whether a table {type = "Name", ...} can describe one; its keys are the fields of a frozen dataclass.
     """
 
     name: str
@@ -90,10 +90,10 @@ class Component:
     """A registered class.
 
     Attributes:
-            name: registered name.
-            kind: key of `KINDS`.
-            made_by: the class.
-            position: sort key in lists; components without one follow, by name.
+        name: registered name.
+        kind: key of `KINDS`.
+        made_by: the class.
+        position: sort key in lists; components without one follow, by name.
     """
 
     name: str
