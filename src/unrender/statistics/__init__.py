@@ -1,4 +1,4 @@
-"""Formulas on arrays by operators alone: the same code runs on NumPy and on Dr.Jit."""
+"""Statistical formulas made of operators: the same code runs on NumPy and on Dr.Jit arrays."""
 
 from unrender.statistics import gaussian, meta, recursion, welford
 from unrender.statistics.control_weight import control_variate_variance, control_weight

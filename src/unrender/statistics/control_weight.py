@@ -1,8 +1,7 @@
-"""The optimal weight of a control variate, and the variance of the result (Nicolet et al. 2023, Eqs 8 and 10).
+"""Optimal weight of a control variate, and the variance of the resulting estimate (Nicolet et al. 2023, Eqs 8 and 10).
 
-F is the current state's estimate, H the previous state's from the same samples, and ⟨·⟩_CV the recursion
-⟨F_n⟩_CV = F + w (⟨F_{n-1}⟩_CV − H). ⟨F_{n-1}⟩_CV is independent of F and H. All arguments are arrays of one shape, or
-numbers.
+F is the estimate for the current state and H the estimate for the previous state from the same samples. ⟨·⟩_CV denotes the recursion
+⟨F_n⟩_CV = F + w (⟨F_{n-1}⟩_CV − H), where ⟨F_{n-1}⟩_CV is independent of F and H. All arguments are arrays of one shape, or numbers.
 """
 
 from __future__ import annotations
@@ -12,10 +11,10 @@ from unrender.core.arrays import Array
 
 
 def control_weight(cov: Array, var_previous: Array, var_cv: Array) -> Array:
-    """w = Cov[F, H] / (Var[H] + Var[⟨F_{n-1}⟩_CV]), clamped to [0, 1]: Eq. 8, the w of least variance.
+    """Return the weight of least variance, w = Cov[F, H] / (Var[H] + Var[⟨F_{n-1}⟩_CV]), clamped to [0, 1] (Eq. 8).
 
-    0 before there are statistics: where the denominator is 0, or anything is NaN. The three may be scaled by one
-    common factor.
+    Returns 0 where the denominator is 0 or an argument is NaN, as before any statistics exist. A common factor of the three arguments
+    cancels.
 
     Args:
         cov: Cov[F, H].
@@ -29,13 +28,12 @@ def control_weight(cov: Array, var_previous: Array, var_cv: Array) -> Array:
 
 
 def control_variate_variance(w: Array, var_current: Array, var_previous: Array, cov: Array, var_cv: Array) -> Array:
-    """Var[⟨F_n⟩_CV] = Var[F] + w² Var[H] − 2 w Cov[F, H] + w² Var[⟨F_{n-1}⟩_CV], never negative: Eq. 10.
+    """Return Var[⟨F_n⟩_CV] = Var[F] + w² Var[H] − 2 w Cov[F, H] + w² Var[⟨F_{n-1}⟩_CV], clamped to >= 0 (Eq. 10).
 
-    Exact for exact statistics and a weight independent of them. With estimates from different windows the sum can fall
-    below 0, and is clamped.
+    Exact for exact statistics and a weight that is independent of them. Estimates from different windows can make the sum negative.
 
     Args:
-        w: the weight that was used, in [0, 1].
+        w: weight in use, in [0, 1].
         var_current: Var[F].
         var_previous: Var[H].
         cov: Cov[F, H].

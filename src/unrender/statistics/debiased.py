@@ -1,4 +1,4 @@
-"""The error of a rendered picture without the noise of its own rendering."""
+"""Errors of rendered images without the bias from their Monte Carlo noise."""
 
 from __future__ import annotations
 
@@ -13,25 +13,27 @@ from unrender.core.errors import InputError
 def rmse(
     first: np.ndarray, second: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None
 ) -> tuple[float, float]:
-    """The root mean square difference between what a picture converges to and its reference, from two independent renderings of it.
+    """Return the root mean square error of an image's expectation, from two independent renderings of it.
 
-    With renderings A and B of expectation I, the mean of (A - R)(B - R) over pixels and channels is an unbiased estimate of the mean of
-    (I - R)², where the error of their mean alone would be larger by its variance. Noise of the reference counts as error.
+    For renderings A and B with expectation I, the mean of (A − R)(B − R) over pixels and channels is an unbiased estimate of the mean of
+    (I − R)². The squared error of (A + B)/2 would be larger by its variance. Noise of the reference R counts as error.
 
     Args:
-        first, second: (H, W, C), equally noisy and independent; the noise of a pixel is independent of other pixels'.
+        first, second: (H, W, C), independent renderings of equal noise; noise is independent between pixels.
         reference: (H, W, C).
-        mask: (H, W), in [0, 1]: by how much each pixel counts. None for all alike.
+        mask: weight of each pixel, (H, W), in [0, 1]; None for equal weights.
 
     Returns:
-        The root of that mean, 0 where it is negative or no pixel counts, and its standard error; both infinite where a value is not
-        finite. The variance of the mean is estimated in two ways, neither of which is low, and the smaller one is taken: from
-        ((A + B)/2 - R)·(A - B) of each pixel, too large where noise has heavy tails, and from the spread of (A - R)·(B - R) over pixels,
-        too large where errors differ from pixel to pixel. Where the error is within two standard errors of 0, the second number is the
-        root of two standard errors of the mean square: what the error may well be.
+        The root of that mean and its standard error. The root is 0 where the mean is negative or no pixel counts. Both are infinite if a
+        value is not finite.
+
+        The variance of the mean is the smaller of two estimates, both of which are conservative. The first uses ((A + B)/2 − R)·(A − B)
+        of each pixel and is too large for heavy-tailed noise. The second uses the spread of (A − R)·(B − R) over pixels and is too large
+        if errors differ between pixels. If the mean square is within two standard errors of 0, the second returned number is the root of
+        two of its standard errors, an upper bound of the error.
 
     Raises:
-        InputError: the pictures, or the mask, have different sizes.
+        InputError: the images, or an image and the mask, differ in size.
     """
     a, b, r = (np.asarray(x, np.float64) for x in (first, second, reference))
     if not (a.shape == b.shape == r.shape and a.ndim == 3 and a.size):
@@ -55,6 +57,6 @@ def rmse(
 
 
 def mean(errors: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """The mean of independent values, each with its standard error, and the mean's own; at least one."""
+    """Return the mean of independent values (value, standard error), and its standard error. Needs at least one value."""
     values, own = np.array(errors, float).T
     return float(values.mean()), float(np.sqrt((own**2).sum())) / len(values)

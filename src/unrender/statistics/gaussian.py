@@ -1,18 +1,17 @@
-"""Derivatives of a Gaussian as convolution kernels, the densities that sample them, and how (Wang et al.,
-"Stochastic Gradient Estimation for Higher-order Differentiable Rendering", section 3).
+"""Derivatives of a Gaussian as convolution kernels, their sampling densities and sampling routines.
 
-Everything is in units of σ: z = τ / σ, per dimension, so that S f(θ) = E[f(θ − σ z)] for standard normal z. With
-φ(z) the standard normal density of n dimensions,
+Follows Wang et al., "Stochastic Gradient Estimation for Higher-order Differentiable Rendering", section 3. Coordinates are in units of σ:
+z = τ / σ per dimension, so that S f(θ) = E[f(θ − σ z)] for standard normal z. With φ(z) the standard normal density in n dimensions,
 
     ∂ᵢ S f(θ)  = ∫ gᵢ(z) φ(z) f(θ − σ z) dz,     gᵢ  = −zᵢ / σᵢ                                            (Eq. 17)
     ∂ᵢⱼ S f(θ) = ∫ hᵢⱼ(z) φ(z) f(θ − σ z) dz,    hᵢᵢ = (zᵢ² − 1) / σᵢ²,   hᵢⱼ = zᵢ zⱼ / (σᵢ σⱼ)              (Eq. 20)
 
-A kernel is sampled in proportion to its magnitude: its own dimensions by the positivised kernel, the others as standard normals. The
-*aggregate* samples the mixture of the densities of all elements with equal chances, and every element is weighted by the mixture's
-density: one draw, and one evaluation of f, for all of them.
+A kernel is sampled in proportion to its magnitude: the dimensions it depends on by the positivised kernel, the others as standard
+normals. The *aggregate* samples the mixture of the densities of all elements with equal probabilities and weights every element by the
+mixture's density. One sample, and one evaluation of f, then serves all elements.
 
-The paper's Eq. 18 as printed has a logarithm of the wrong sign in its second branch and lacks a factor; the inverse is
-∓√(−2 log(2 ξ)) and, for ξ > 1/2, ±√(−2 log(2 (1 − ξ))). Eq. 21 is right.
+Eq. 18 as printed has a logarithm of the wrong sign in its second branch and lacks a factor. The inverse is ∓√(−2 log(2 ξ)) and, for ξ >
+1/2, ±√(−2 log(2 (1 − ξ))). Eq. 21 is correct.
 """
 
 from __future__ import annotations
@@ -43,36 +42,39 @@ _TABLE_REACH = 10.0
 _TABLE_SIZE = 20_001
 
 GRADIENT_MASS = float(np.sqrt(2 / np.pi))
-"""∫ |z| φ(z) dz."""
+"""Normalisation constant of the positivised first-derivative kernel, ∫ |z| φ(z) dz."""
 
 CURVATURE_MASS = float(4 * np.exp(-0.5) / np.sqrt(2 * np.pi))
-"""∫ |z² − 1| φ(z) dz."""
+"""Normalisation constant of the positivised second-derivative kernel, ∫ |z² − 1| φ(z) dz."""
 
 
 def gradient_density(z: np.ndarray) -> np.ndarray:
-    """|z| φ(z) / ∫ |z| φ: what samples −z φ(z), per element."""
+    """Return |z| φ(z) / ∫ |z| φ, the density that samples −z φ(z), per element."""
     return 0.5 * np.abs(z) * np.exp(-0.5 * z * z)
 
 
 def gradient_sample(u: np.ndarray) -> np.ndarray:
-    """The inverse of its distribution function, for u in (0, 1)."""
+    """Return the inverse distribution function of `gradient_density` at u in (0, 1)."""
     tail = np.minimum(u, 1 - u)
     return np.sign(u - 0.5) * np.sqrt(-2 * np.log(np.maximum(2 * tail, np.finfo(float).tiny)))
 
 
 def curvature_density(z: np.ndarray) -> np.ndarray:
-    """|z² − 1| φ(z) / ∫ |z² − 1| φ: what samples the diagonal of the Hessian kernel."""
+    """Return |z² − 1| φ(z) / ∫ |z² − 1| φ, the density that samples the diagonal of the Hessian kernel, per element."""
     return 0.25 * np.abs(z * z - 1) * np.exp(0.5 - 0.5 * z * z)
 
 
 def curvature_distribution(z: np.ndarray) -> np.ndarray:
-    """Its distribution function (Eq. 21)."""
+    """Return the distribution function of `curvature_density` (Eq. 21)."""
     part = 0.25 * z * np.exp(0.5 - 0.5 * z * z)
     return np.where(z < -1, -part, np.where(z > 1, 1 - part, 0.5 + part))
 
 
 def curvature_sample(u: np.ndarray) -> np.ndarray:
-    """Its inverse for u in (0, 1), which has no closed form: linear between 20 001 tabulated values on [−10, 10]."""
+    """Return the inverse of `curvature_distribution` at u in (0, 1), by linear interpolation of 20 001 values on [−10, 10].
+
+    It has no closed form.
+    """
     z, distribution = _table()
     return np.interp(u, distribution, z)
 
@@ -84,23 +86,23 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
 
 
 def gradient_kernel(z: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """gᵢ(z) of all i: z (B, n), σ (n,) to (B, n)."""
+    """Return gᵢ(z) for all i: z (B, n), σ (n,) -> (B, n)."""
     return -z / sigma
 
 
 def hessian_kernel(z: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """hᵢⱼ(z) of all i and j: z (B, n), σ (n,) to (B, n, n)."""
+    """Return hᵢⱼ(z) for all i and j: z (B, n), σ (n,) -> (B, n, n)."""
     scaled = z / sigma
     return scaled[:, :, None] * scaled[:, None, :] - np.diag(1 / sigma**2)
 
 
 def gradient_ratio(z: np.ndarray) -> np.ndarray:
-    """The mixture over the gradient's elements divided by φ(z): (B, n) to (B,)."""
+    """Return the mixture density over the gradient's elements divided by φ(z): (B, n) -> (B,)."""
     return np.mean(np.abs(z), axis=-1) / GRADIENT_MASS
 
 
 def hessian_ratio(z: np.ndarray) -> np.ndarray:
-    """The mixture over the n² elements of the Hessian divided by φ(z): (B, n) to (B,), in O(n) a draw."""
+    """Return the mixture density over the n² Hessian elements divided by φ(z): (B, n) -> (B,), in O(n) per sample."""
     n = z.shape[-1]
     square = z * z
     diagonal = np.abs(square - 1).sum(-1) / CURVATURE_MASS
@@ -110,12 +112,12 @@ def hessian_ratio(z: np.ndarray) -> np.ndarray:
 
 
 def gradient_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Draws from the mixture over the gradient's elements.
+    """Sample the mixture over the gradient's elements; returns z (B, n).
 
     Args:
-        chosen: (B,) uniform numbers that choose the element.
-        u: (B, n) uniform numbers; those of the chosen dimension are used.
-        normal: (B, n) standard normals for the others.
+        chosen: (B,), uniform numbers that select the element.
+        u: (B, n), uniform numbers, of which those of the selected dimension are used.
+        normal: (B, n), standard normals for the other dimensions.
     """
     n = normal.shape[1]
     z, rows = normal.copy(), np.arange(len(normal))
@@ -125,7 +127,7 @@ def gradient_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> n
 
 
 def hessian_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Draws from the mixture over the n² elements of the Hessian; the arguments are those of `gradient_mixture`."""
+    """Sample the mixture over the n² Hessian elements; arguments and result are those of `gradient_mixture`."""
     n = normal.shape[1]
     z, rows = normal.copy(), np.arange(len(normal))
     element = np.minimum((chosen * n * n).astype(int), n * n - 1)
@@ -137,12 +139,12 @@ def hessian_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np
 
 
 def joint_ratio(z: np.ndarray) -> np.ndarray:
-    """The mixture of both aggregates, half of each, divided by φ(z): (B, n) to (B,)."""
+    """Return the density of the equal mixture of both aggregates divided by φ(z): (B, n) -> (B,)."""
     return 0.5 * (gradient_ratio(z) + hessian_ratio(z))
 
 
 def joint_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Draws from the mixture of both aggregates; the arguments are those of `gradient_mixture`."""
+    """Sample the equal mixture of both aggregates; arguments and result are those of `gradient_mixture`."""
     first = chosen < 0.5
     rest = np.where(first, 2 * chosen, 2 * chosen - 1)
     return np.where(first[:, None], gradient_mixture(rest, u, normal), hessian_mixture(rest, u, normal))

@@ -1,29 +1,30 @@
-"""Meta-estimation: a gradient estimate updated from step to step, with its own variance (Balint et al. 2023, sections 3 and 4).
+"""Meta-estimation: a recursive gradient estimate with its own variance (Balint et al. 2023, sections 3 and 4).
 
-F_i is a *proportional* estimate of the quantity at step i, ΔF_i a *finite-difference* estimate of its change since step i − 1,
-independent of F_i. The meta-estimate is their combination of least variance with all that came before,
+F_i is a *proportional* estimate of the quantity at step i. ΔF_i is a *finite-difference* estimate of its change since step i − 1,
+independent of F_i. The meta-estimate combines both with the previous meta-estimate at least variance,
 
     M_i = α_i (M_{i-1} + ΔF_i) + (1 − α_i) F_i,        M_0 = F_0                              (Eq. 7)
     α_i = Var F / (Var F + Var M_{i-1} + Var ΔF)                                              (Eq. 8)
     Var M_i = α_i² (Var M_{i-1} + Var ΔF) + (1 − α_i)² Var F                                  (Eq. 15)
 
-with Var F the running mean of F² (Eq. 9), Var ΔF that of (ΔF / ‖Δπ‖)² times ‖Δπ‖² of the present step (Eqs 13 and 14), and α_i held
-below 1 / (2 − α_{i-1}) (Eq. 17, which from α_0 = 0 on is the bound i / (i + 1) of Eq. 16).
+Var F is the running mean of F² (Eq. 9). Var ΔF is the running mean of (ΔF / ‖Δπ‖)² times ‖Δπ‖² of the current step (Eqs 13 and 14). α_i
+is at most 1 / (2 − α_{i-1}) (Eq. 17), which from α_0 = 0 equals the bound i / (i + 1) of Eq. 16.
 
-The *coupled* form, which the paper does not have, takes F_i and the previous state's H_i from the same samples, so that ΔF_i = F_i − H_i
-is not independent of F_i. Its recursion M_i = F_i + w_i (M_{i-1} − H_i) is the same one (put F − ΔF for H in Eq. 7), its weight and
-variance are those of a control variate (`control_weight.py`) with Cov[F, H] = Var F − Var[F − H] / 2, taking Var H for Var F.
+The *coupled* form is not in the paper. It takes F_i and the estimate H_i of the previous state from the same samples, so ΔF_i = F_i − H_i
+is not independent of F_i. Its recursion M_i = F_i + w_i (M_{i-1} − H_i) equals Eq. 7 with H = F − ΔF. Its weight and variance are those
+of a control variate (`control_weight.py`) with Cov[F, H] = Var F − Var[F − H] / 2, where Var H is approximated by Var F.
 
-Where this departs from the paper's text: the running means are divided by the sum of their weights, as Adam does, since Eqs 9 and
-13 say nothing of their start; and an element whose samples have all been zero so far, such as a texel that no path has met, counts
-its zeros: α is at its bound, and when the first other sample comes the memory of i zeros has the variance Var F / i. With a weight
-of 0 it would start anew from that sample, and be i times too large. Where M is not zero though no sample of F was seen to be (a
-difference was non-zero first, or the summed samples before the observed ones), Var M is at least M² / n after n steps, where it
-would be 0 otherwise.
+Deviations from the paper:
 
-Bias. α depends on F_i and ΔF_i (Var F is updated before use), so large samples weigh less: a bias toward zero, strongest at the start and
-never quite gone, since the present sample has the weight 1 − β_F in Var F (section 6 of the paper, "sample reuse"). With statistics from
-other samples (`observed`), on parameters that do not depend on the samples, every M_i is unbiased.
+- The running means are divided by the sum of their weights, as in Adam. Eqs 9 and 13 do not define their start.
+- An element whose samples have all been zero, such as a texel that no path has hit, counts these zeros: α is at its bound, and M has the
+  variance Var F / i at the first non-zero sample after i zeros. A weight of 0 would restart from that sample, which is i times too large.
+- M can be non-zero although every observed sample of F was zero: a difference was non-zero first, or the summed samples were non-zero
+  before the observed ones. Var M is then at least M² / n after n steps, not 0.
+
+Bias. Var F is updated before use, so α depends on F_i and ΔF_i, and large samples get smaller weights. The bias toward zero is strongest
+at the start and never vanishes, because the current sample has the weight 1 − β_F in Var F (section 6 of the paper, "sample reuse"). With
+statistics from other samples (`observed`), and parameters that do not depend on the samples, every M_i is unbiased.
 """
 
 from __future__ import annotations
@@ -49,16 +50,18 @@ __all__ = [
 ]
 
 BETA_PROPORTIONAL = 0.99
-"""β_F: large, since Var F is stable and should hardly depend on any one sample."""
+"""β_F: large, because Var F is stable and should hardly depend on one sample."""
 
 BETA_DIFFERENCE = 0.9
-"""β_Δ: small, since the decoupled variance of ΔF has little noise and follows the scene."""
+"""β_Δ: small, because the decoupled variance of ΔF has little noise and follows changes of the scene."""
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Exponentially weighted sums of a sample and of its square, and of their weights, 1 − βⁿ (a device number). The mean is the number 0
-    where variances are not about it."""
+    """Exponentially weighted sums of a sample and of its square, and the sum of the weights, 1 − βⁿ (a device number).
+
+    `mean` is the number 0 if variances are not centred.
+    """
 
     mean: Array
     square: Array
@@ -66,22 +69,23 @@ class Moments:
 
     @property
     def has_mean(self) -> bool:
-        """Whether the mean is one of each element."""
+        """Whether `mean` is an array with one value per element."""
         return not isinstance(self.mean, float) and arrays.shape(self.mean) == arrays.shape(self.square)
 
 
 @dataclass(frozen=True)
 class State:
-    """State between steps. Every array has the shape given to `init`, but for the count of steps, the moments' weights and means that are
-    not asked for, which are numbers.
+    """State between steps.
+
+    Arrays have the shape of the samples. `steps`, the weights of the moments and unused means are numbers.
 
     Attributes:
         gradient: M.
         variance: Var M.
-        alpha: the last weight of the past.
-        proportional: of F.
-        difference: of ΔF / ‖Δπ‖.
-        steps: how many there were (a device number).
+        alpha: the last α.
+        proportional: moments of F.
+        difference: moments of ΔF / ‖Δπ‖.
+        steps: number of steps so far (a device number).
     """
 
     gradient: Array
@@ -93,7 +97,7 @@ class State:
 
 
 def init(like: Array) -> State:
-    """Before the first sample. `like` gives shape and type of the samples."""
+    """Return the state before the first sample; `like` has the shape and type of the samples."""
     zeros, zero = arrays.zeros_like(like) * 1.0, arrays.scalar(0.0, like)
     empty = Moments(zero, zeros, zero)
     return State(zeros, zeros, zeros, empty, empty, zero)
@@ -113,20 +117,20 @@ def update(
     decouple: bool = True,
     observed: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array, Array, State]:
-    """One step of the paper's form, whose F and ΔF are independent.
+    """Perform one step of the paper's form, with independent F and ΔF.
 
     Args:
         state: from `init` or `update`.
         proportional: F_i.
-        difference: ΔF_i = F_i − F_{i-1}; without effect at the first step.
-        step_norm: ‖π_i − π_{i-1}‖₂ over all parameters, a number or a device number. Where it is 0 the statistics of ΔF are not updated.
+        difference: ΔF_i = F_i − F_{i-1}; ignored at the first step.
+        step_norm: ‖π_i − π_{i-1}‖₂ over all parameters, a number or a device number. The statistics of ΔF are not updated where it is 0.
         beta_proportional: β_F of Eq. 9, in [0, 1).
         beta_difference: β_Δ of Eq. 13, in [0, 1).
-        clip: hold α below Eq. 17.
-        max_weight: upper bound of α, in (0, 1]; 1 in the paper. Below, an error is forgotten after some 1 / (1 − max_weight) steps.
-        centred: take variances about the mean in place of mean squares. For comparison (Fig. 5): unreliable.
-        decouple: divide differences by the step before averaging (Eq. 13). For comparison.
-        observed: (F, ΔF) to estimate the variances from in place of those that are summed; independent ones leave M unbiased.
+        clip: whether Eq. 17 bounds α.
+        max_weight: upper bound of α, in (0, 1]; 1 in the paper. A smaller bound forgets an error after about 1 / (1 − max_weight) steps.
+        centred: whether variances are about the mean, instead of mean squares. For comparison with Fig. 5: unreliable.
+        decouple: whether differences are divided by the step before averaging (Eq. 13). For comparison.
+        observed: (F, ΔF) from which variances are estimated in place of the summed ones. Independent samples make M unbiased.
 
     Returns:
         (M_i, Var M_i, α_i, the next state).
@@ -154,14 +158,14 @@ def update_coupled(
     decouple: bool = True,
     observed: tuple[Array, Array] | None = None,
 ) -> tuple[Array, Array, Array, State]:
-    """One step of the coupled form, whose two states share all samples.
+    """Perform one step of the coupled form, where both states share all samples.
 
     Args:
         current: F_i.
-        previous: H_i, of the state of step i − 1, from the samples of F_i; without effect at the first step.
-        observed: (F, H) to estimate the variances from in their place.
+        previous: H_i, the estimate for step i − 1 from the samples of F_i; ignored at the first step.
+        observed: (F, H) from which variances are estimated in place of the summed ones.
 
-    The others, and what is returned, are those of `update`.
+        The other arguments and the result are those of `update`.
     """
     F, H = observed or (current, previous)
     state, var_f, var_d, var_m, started = _observe(
@@ -174,18 +178,18 @@ def update_coupled(
 
 
 def optimal_alpha(var_proportional: Array, var_memory: Array, var_difference: Array) -> Array:
-    """Eq. 8: the weight of the past that leaves the least variance, in [0, 1]; 0 where all three are 0."""
+    """Return the weight of the past with least variance, in [0, 1]; 0 where all three variances are 0 (Eq. 8)."""
     total = var_proportional + var_memory + var_difference
     return arrays.where(total > 0, var_proportional, 0.0) / arrays.where(total > 0, total, 1.0)
 
 
 def clip_alpha(alpha: Array, before: Array) -> Array:
-    """Eq. 17: at most 1 / (2 − α_{i-1}), the weight that an average of equal samples would give the past."""
+    """Bound α by 1 / (2 − α_{i-1}), the weight of the past in an average of equal samples (Eq. 17)."""
     return arrays.minimum(alpha, 1.0 / (2.0 - before))
 
 
 def meta_variance(alpha: Array, var_proportional: Array, var_memory: Array, var_difference: Array) -> Array:
-    """Eq. 15: the variance of M for independent F and ΔF and a weight that is independent of them."""
+    """Return the variance of M for independent F and ΔF, and a weight that is independent of them (Eq. 15)."""
     rest = 1.0 - alpha
     return alpha * alpha * (var_memory + var_difference) + rest * rest * var_proportional
 
@@ -200,11 +204,15 @@ def _observe(
     centred: bool,
     decouple: bool,
 ) -> tuple[State, Array, Array, Array, Array]:
-    """The state with statistics of F and ΔF, Var F, Var ΔF, Var M of the last step, and 1 where there was a last step, else 0."""
+    """Update the statistics of F and ΔF.
+
+    Returns:
+        (state, Var F, Var ΔF, Var M of the last step, 1 if there was a last step else 0).
+    """
     if isinstance(step_norm, (int, float)):
         step_norm = arrays.scalar(float(step_norm), F)
     only_zeros = state.proportional.square == 0.0
-    # Two masks: the first step has no difference, and a step of length 0 has no information on it.
+    # Two masks: the first step has no difference, and a step of length 0 carries no information about it.
     started = arrays.where(state.steps > 0.0, 1.0, 0.0)
     changed = started * arrays.where(step_norm > 0.0, 1.0, 0.0)
     unit = arrays.where(step_norm > 0.0, step_norm, 1.0) if decouple else step_norm * 0.0 + 1.0
@@ -215,7 +223,7 @@ def _observe(
     scale_f = 1.0 / weight_f
     scale_d = arrays.where(weight_d > 0.0, 1.0, 0.0) / arrays.where(weight_d > 0.0, weight_d, 1.0)
     length = step_norm * step_norm if decouple else changed * 1.0
-    # Numbers must be in memory before they meet arrays: Dr.Jit resizes an unevaluated number in place to the array's size.
+    # Numbers must be evaluated before they are combined with arrays: Dr.Jit resizes an unevaluated number in place to the array's size.
     arrays.evaluate(started, unit, past, gain_f, gain_d, weight_f, weight_d, scale_f, scale_d, length)
     proportional = _average(state.proportional, F, gain_f, weight_f, centred)
     changes = _average(state.difference, difference / unit, gain_d, weight_d, centred)
@@ -226,7 +234,7 @@ def _observe(
 
 
 def _average(moments: Moments, sample: Array, gain: Array, weight: Array, centred: bool) -> Moments:
-    """The moments with one more sample; as they were where `gain` is 0."""
+    """Return the moments with one more sample; unchanged where `gain` is 0."""
     return Moments(
         moments.mean + gain * (sample - moments.mean) if centred else moments.mean,
         moments.square + gain * (sample * sample - moments.square),
@@ -241,11 +249,14 @@ def _variance(moments: Moments, scale: Array, centred: bool) -> Array:
     about = square - mean * mean
     return arrays.where(
         about > 1e-4 * square, about, 0.0
-    )  # below is rounding error of equal samples in single precision
+    )  # a smaller value is rounding error of equal samples in single precision
 
 
 def _bounded_alpha(state: State, alpha: Array, var_f: Array, started: Array, clip: bool, max_weight: float) -> Array:
-    """α of this step: 0 at the first; bounded by Eq. 17 where all samples were zero, and everywhere with `clip`; at most `max_weight`."""
+    """Return α of this step: 0 at the first step, otherwise at most `max_weight`.
+
+    Eq. 17 bounds α where all samples were zero, and everywhere if `clip` is true.
+    """
     bound = clip_alpha(var_f * 0.0 + 1.0, state.alpha)
     alpha = arrays.where(var_f > 0.0, alpha, bound)
     return arrays.minimum(arrays.minimum(alpha, bound) if clip else alpha, max_weight) * started
@@ -258,5 +269,5 @@ def _next(
     arrays.evaluate(steps)
     floor = gradient * gradient / steps
     variance = arrays.where(var_f > 0.0, variance, arrays.maximum(variance, floor))
-    after = replace(state, gradient=gradient, variance=variance, alpha=alpha, steps=steps)
-    return gradient, variance, alpha, after
+    next_state = replace(state, gradient=gradient, variance=variance, alpha=alpha, steps=steps)
+    return gradient, variance, alpha, next_state

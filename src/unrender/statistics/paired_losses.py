@@ -1,4 +1,4 @@
-"""Statistics that compare two pictures, or a remembered picture with a fresh one, by their noise alone."""
+"""Tests whether two images, or an image of a control variate and a new one, differ by more than their noise."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from scipy.special import stdtrit
 
 _TILES, _ROBUST = 48, 1.8
-"""Most tiles of a picture; most that the sharp score may exceed the robust one by."""
+"""Maximum number of tiles of an image; maximum ratio of the sharp score to the robust one."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """The difference of two losses.
+    """Difference of two losses.
 
     Attributes:
         value: the second loss minus the first.
-        standard_error: of `value`; infinite where it cannot be estimated.
+        standard_error: standard error of `value`; infinite if it cannot be estimated.
         degrees: degrees of freedom of the standard error (Welch and Satterthwaite).
     """
 
@@ -27,7 +27,7 @@ class Difference:
     degrees: float
 
     def exceeds_noise(self, level: float) -> bool:
-        """Return whether the difference is positive by a one-sided t-test whose false positive rate is `level`."""
+        """Return whether the difference is positive, by a one-sided t-test with false positive rate `level`."""
         if math.isnan(self.value) or math.isinf(self.standard_error):
             return False
         if math.isinf(self.value):
@@ -37,14 +37,14 @@ class Difference:
 
 @dataclass(frozen=True)
 class SystematicDifference:
-    """The part of the difference of two pictures that neighbouring pixels share.
+    """The part of the difference of two images that neighbouring pixels share.
 
     Attributes:
         mean_square: unbiased estimate of its mean square per channel; may be negative.
-        score: the sum of the tiles' products in units of its standard deviation, which is estimated in two ways: from the contrast
-            within pairs of pixels, and from the products themselves. The first is sharp. The second is large where single tiles have
-            most of the sum, and bounds the score to 1.8 times itself. Noise that is independent from pixel to pixel scores above 4.5
-            less than once in 10,000, also with heavy tails.
+        score: sum of the tiles' products, in units of its standard deviation. Two estimates of that deviation exist. The sharp one comes
+            from the contrast within pairs of pixels. The robust one comes from the products and is large if a few tiles dominate the sum;
+            it limits the score to 1.8 times the robust score. Noise that is independent between pixels scores above 4.5 with probability
+            below 1/10,000, even with heavy tails.
     """
 
     mean_square: float
@@ -52,37 +52,37 @@ class SystematicDifference:
 
 
 def leave_one_out(images: np.ndarray) -> np.ndarray:
-    """Return for each of K >= 2 images (K, ...) the mean of the others."""
+    """Return, for each of K >= 2 images (K, ...), the mean of the others."""
     count = len(images)
     return (images.mean(axis=0) * count - images) / (count - 1)
 
 
 def pseudo_values(whole: np.ndarray, left_out: np.ndarray) -> np.ndarray:
-    """Return the jackknife's pseudo-values (K, N) of N losses.
+    """Return the jackknife pseudo-values (K, N) of N losses.
 
-    Their mean over K is the loss without the noise of the image: exactly where the loss is quadratic, to second order otherwise.
+    Their mean over K is the loss without the bias from image noise: exactly for a quadratic loss, to second order otherwise.
 
     Args:
-        whole: (N,), the losses of the mean of K images.
-        left_out: (K, N), the losses of the mean of all images but one.
+        whole: losses at the mean of K images, (N,).
+        left_out: losses at the mean of all images but one, (K, N).
     """
     count = len(left_out)
     return count * whole - (count - 1) * left_out
 
 
 def mean_and_error(pseudo: np.ndarray) -> tuple[float, float]:
-    """Return the sum of N losses from pseudo-values (K, N), and its standard error from the spread of each over K."""
-    found = difference(np.zeros_like(pseudo), pseudo)
-    return found.value, found.standard_error
+    """Return the sum of N losses from pseudo-values (K, N), and its standard error from their spread over K."""
+    total = difference(np.zeros_like(pseudo), pseudo)
+    return total.value, total.standard_error
 
 
 def difference(first: np.ndarray, second: np.ndarray, sampled: bool = False) -> Difference:
-    """Return how much larger the sum of the second losses is, from pseudo-values (K, N) on equal random numbers.
+    """Return the sum of the second losses minus that of the first, from pseudo-values (K, N) on equal random numbers.
 
     Args:
-        first, second: pseudo-values of N independent parts of a loss.
-        sampled: whether the N parts are a random sample of many. The standard error is then that of their sum, from the spread of all
-            parts; otherwise it is from the spread of each part over its K pseudo-values.
+        first, second: pseudo-values of N independent parts of a loss, (K, N).
+        sampled: whether the N parts are a random sample from many. The standard error then comes from the spread over all parts,
+            otherwise from the spread of each part over its K pseudo-values.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         changes = second - first
@@ -105,22 +105,23 @@ def difference(first: np.ndarray, second: np.ndarray, sampled: bool = False) -> 
 def systematic(
     values: np.ndarray, weights: np.ndarray | None = None, earlier: np.ndarray | None = None
 ) -> SystematicDifference:
-    """Return the part of differences that neighbouring pixels share.
+    """Estimate the part of the differences that neighbouring pixels share.
 
-    Two interleaved halves of each tile have independent noise, so the product of their means has none on average.
+    Each tile is divided into two interleaved halves with independent noise, so the noise in the product of their means has expectation
+    zero.
 
     Args:
-        values: (N, C), differences of pixels in an order where neighbours in the picture are mostly neighbours.
-        earlier: (N, C), the same at an earlier step, from which the second halves are taken: what changes from step to step is not
-            counted. None takes them from `values`.
-        weights: (N,), how much each pixel counts, in [0, 1]; None for all alike.
+        values: differences of pixels, (N, C), in an order that mostly keeps neighbours in the image adjacent.
+        weights: weight of each pixel, (N,), in [0, 1]; None for equal weights.
+        earlier: the same at an earlier step, (N, C). The second halves are taken from it, which excludes what changes between the steps.
+            None takes them from `values`.
     """
     count = len(values) // 2 * 2
     weight = np.ones(len(values)) if weights is None else np.asarray(weights, np.float64)
-    kept = weight[:count].reshape(-1, 2).min(axis=1) > 0
+    used = weight[:count].reshape(-1, 2).min(axis=1) > 0
 
     def paired(differences: np.ndarray) -> np.ndarray:
-        return (np.asarray(differences, np.float64) * weight[:, None])[:count].reshape(-1, 2, values.shape[1])[kept]
+        return (np.asarray(differences, np.float64) * weight[:, None])[:count].reshape(-1, 2, values.shape[1])[used]
 
     pairs = paired(values)
     if earlier is not None:

@@ -1,9 +1,10 @@
-"""Normal distributions of isotropic rough surfaces, and the parts in which they grow and shrink with their roughness.
+"""Microfacet normal distributions of isotropic rough surfaces, and their derivative with respect to roughness.
 
-Symbols: α roughness, D density of normals per solid angle and projected area, θ a normal's angle, t = tan²θ / α² its squared slope in
-units of α. D cosθ is a density of directions: its integral is 1 whatever α, so that of ∂D/∂α cosθ is 0. The derivative is negative
-for t < 1, the inner part, and positive beyond, the outer part, which has as much mass (Belhe et al. 2024, the same cut at the sign change).
-Of u in (0, 1] both parts have the same share of their mass between t(u) and 1: pairs of normals, one in each part, that belong together.
+Symbols: roughness α; normal distribution D; angle θ between microfacet normal and surface normal; t = tan²θ / α², the squared slope in
+units of α. D cosθ is a density over directions with integral 1 for every α, so (∂D/∂α) cosθ has integral 0. The derivative is negative in
+the inner part, t < 1, and positive in the outer part, t > 1. Both parts have the same mass. Belhe et al. 2024 cut at the same sign
+change. For u in (0, 1], both parts have the same fraction of their mass between t(u) and 1, which pairs each inner normal with an outer
+one.
 """
 
 from __future__ import annotations
@@ -16,32 +17,34 @@ from unrender.core.arrays import Array
 
 
 class NormalDistribution(ABC):
-    """One family of isotropic distributions. Arrays of any kind, per element; α > 0, t >= 0."""
+    """A family of isotropic normal distributions. Methods act per element on arrays of any type, with α > 0 and t >= 0."""
 
     @abstractmethod
     def density(self, alpha: Array, t: Array) -> Array:
-        """D, per steradian."""
+        """Return D, per steradian."""
 
     @abstractmethod
     def log_derivative(self, alpha: Array, t: Array) -> Array:
-        """∂ log D / ∂α at a normal that stays where it is: negative for t < 1, positive for t > 1."""
+        """Return ∂ log D / ∂α at a fixed normal: negative for t < 1, positive for t > 1."""
 
     @abstractmethod
     def mass(self, alpha: Array) -> Array:
-        """∫ |∂D/∂α| cosθ dω over the inner part, and over the outer."""
+        """Return ∫ |∂D/∂α| cosθ dω over the inner part, which equals that over the outer part."""
 
     @abstractmethod
     def parts(self, u: Array) -> tuple[Array, Array]:
-        """t of a normal of the inner part, and of one of the outer, in proportion to |∂D/∂α| cosθ, from one uniform number in (0, 1];
-        near 1 for u near 1."""
+        """Sample t of an inner and of an outer normal in proportion to |∂D/∂α| cosθ, from one uniform number u in (0, 1].
+
+        Both are near 1 for u near 1.
+        """
 
     def share(self, t: Array) -> Array:
-        """|∂ log D / ∂α| / mass, which does not depend on α: D cosθ times it is the density that `parts` samples either part with."""
+        """Return |∂ log D / ∂α| / mass, which is independent of α. Times D cosθ it is the density of `parts` for either part."""
         return arrays.absolute(self.log_derivative(1.0, t)) / self.mass(1.0)
 
 
 class GGX(NormalDistribution):
-    """D = 1 / (π α² cos⁴θ (1 + t)²)."""
+    """GGX distribution, D = 1 / (π α² cos⁴θ (1 + t)²)."""
 
     def density(self, alpha: Array, t: Array) -> Array:
         squared = alpha * alpha
@@ -52,17 +55,17 @@ class GGX(NormalDistribution):
         return 2.0 * (t - 1.0) / ((t + 1.0) * alpha)
 
     def mass(self, alpha: Array) -> Array:
-        """See `NormalDistribution.mass`: the share of the normals up to t is t / (1 + t), its derivative -2 t / (α (1 + t)²)."""
+        # The cumulative distribution in t is t / (1 + t), with derivative -2 t / (α (1 + t)²) with respect to α.
         return 0.5 / alpha
 
     def parts(self, u: Array) -> tuple[Array, Array]:
-        """See `NormalDistribution.parts`: the roots of 4 t = u (1 + t)², one the inverse of the other."""
+        # The roots of 4 t = u (1 + t)²; one is the inverse of the other.
         root = 1.0 + arrays.sqrt(arrays.maximum(1.0 - u, 0.0))
         return u / (root * root), root * root / arrays.maximum(u, 1e-12)
 
 
 class Beckmann(NormalDistribution):
-    """D = exp(-t) / (π α² cos⁴θ)."""
+    """Beckmann distribution, D = exp(-t) / (π α² cos⁴θ)."""
 
     def density(self, alpha: Array, t: Array) -> Array:
         squared = alpha * alpha
@@ -73,15 +76,15 @@ class Beckmann(NormalDistribution):
         return 2.0 * (t - 1.0) / alpha
 
     def mass(self, alpha: Array) -> Array:
-        """See `NormalDistribution.mass`: the share of the normals up to t is 1 - exp(-t), its derivative -2 t exp(-t) / α."""
+        # The cumulative distribution in t is 1 - exp(-t), with derivative -2 t exp(-t) / α with respect to α.
         return 2.0 / (math.e * alpha)
 
     def parts(self, u: Array) -> tuple[Array, Array]:
-        """See `NormalDistribution.parts`: the roots of t exp(1 - t) = u, both branches of Lambert's W. Relative error of u below 2e-5."""
+        # The roots of t exp(1 - t) = u, by both branches of Lambert's W. The relative error of u is below 2e-5.
         y = -arrays.log(arrays.clip(u, 1e-12, 1.0))  # t - 1 - log t
         s = arrays.sqrt(2.0 * y)
         near = s < 0.8
-        # Newton's steps away from t = 1, where they lose their digits: on log t within, on t beyond.
+        # Newton's method away from t = 1, where it loses precision: on log t for the inner root, on t for the outer one.
         inner = arrays.minimum(-1.0 - y + arrays.exp(-1.0 - y), -0.5)
         outer = arrays.maximum(1.0 + s + y * (2.0 / 3.0), 1.5)
         for _ in range(3):
@@ -95,9 +98,9 @@ class Beckmann(NormalDistribution):
 
 
 def _around_one(s: Array) -> Array:
-    """t where t - 1 - log t = s² / 2 and t - 1 has the sign of s, |s| <= 0.8: its power series."""
+    """Return the solution t of t - 1 - log t = s² / 2 where t - 1 has the sign of s, for |s| <= 0.8, by its power series."""
     terms = (1.0, 1.0, 1.0 / 3.0, 1.0 / 36.0, -1.0 / 270.0, 1.0 / 4320.0, 1.0 / 17010.0)
-    found = s * 0.0 + terms[-1]
+    result = s * 0.0 + terms[-1]
     for term in reversed(terms[:-1]):
-        found = found * s + term
-    return found
+        result = result * s + term
+    return result

@@ -1,28 +1,26 @@
 """Exponentially weighted running covariance in one pass (after Nicolet et al. 2023, Appendix A).
 
-What is computed. Let m_k be the exponentially weighted mean of x_1 … x_k, weights a_{k,j} ∝ α^{k−j} that sum to one,
-likewise for y. Each sample from the second on leaves an innovation, its distance to the mean of the samples before
-it, and
+Definition. Let m_k be the exponentially weighted mean of x_1 … x_k, with weights a_{k,j} ∝ α^{k−j} that sum to one, and m^y_k that of y.
+Each sample from the second on has an innovation, its difference from the mean of the earlier samples. The covariance is
 
     cov_n = Σ_{k=2..n} b_k (x_k − m^x_{k−1}) (y_k − m^y_{k−1}) / (1 + s_{k−1}),     s_k = Σ_j a_{k,j}²,
 
-with weights b_k ∝ β^{n−k} that sum to one. An innovation holds the noise of the sample and of the mean, which are
-independent: its expected product is Cov[x, y] (1 + s). So for independent, identically distributed pairs cov_n is
-**unbiased from the second sample on**, whatever α and β.
+with weights b_k ∝ β^{n−k} that sum to one. An innovation contains the independent noise of the sample and of the mean, so its expected
+product is Cov[x, y] (1 + s). For independent, identically distributed pairs cov_n is therefore **unbiased from the second sample on**,
+for every α and β.
 
-How it differs from the paper's listing 2. The listing multiplies x_n − m^x_n (the mean with the sample) by y_n −
-m^y_{n−1} (the mean without it) and debiases the two means at n and n − 1. As x_n − m_n = α (1−α^{n−1})/(1−α^n) · (x_n
-− m_{n−1}), that product has the expectation 2α/(1+α) · Cov for every n >= 2, 5 % too little at α = 0.9. Its first
-sample has no mean before it, contributes 0/0 or at best 0, yet is counted by the divisor 1 − β^n: another factor
-(1−β^{n−1})/(1−β^n), one half at n = 2. Both factors are removed here. They are common to the variances and the
-covariance of a pair, so control weights are the listing's own, but the statistic is a covariance at every step.
+Difference from the paper's listing 2. The listing multiplies x_n − m^x_n (the mean with the sample) by y_n − m^y_{n−1} (the mean without
+it), and debiases the two means at n and n − 1. Because x_n − m_n = α (1−α^{n−1})/(1−α^n) · (x_n − m_{n−1}), that product has the
+expectation 2α/(1+α) · Cov for every n >= 2, which is 5 % too small at α = 0.9. Its first sample has no earlier mean and contributes 0/0,
+or 0, but the divisor 1 − β^n counts it. This gives another factor (1−β^{n−1})/(1−β^n), one half at n = 2. This module removes both
+factors. Variances and covariance share them, so the control weights equal those of the listing, but here the statistic is a covariance at
+every step.
 
-Drift. Identically distributed is what an optimisation's images are not: the mean lags 1/(1−α) steps behind. Means
-that move by δx and δy a step add δx δy (1+α) / (2 (1−α)²) to the covariance, 95 δx δy at α = 0.9. Two states of one
-scene drift alike, so Var F, Var H and Cov are raised by the same amount. The recursion stays as unbiased as it was, but
-its weight grows too large once the drift of a step exceeds about a tenth of the standard deviation, up to an image
-noisier than a plain one. A smaller α follows faster (α = 0.5 adds 3 δx δy) and costs little: noise of the mean is
-divided out on average, and β decides how many innovations count.
+Drift. The images of an optimisation are not identically distributed: the mean lags 1/(1−α) steps behind. Means that move by δx and δy per
+step add δx δy (1+α) / (2 (1−α)²) to the covariance, 95 δx δy at α = 0.9. Two states of one scene drift equally, so Var F, Var H and Cov
+increase by the same amount. The recursion stays unbiased, but its weight becomes too large once the drift per step exceeds about a tenth
+of the standard deviation; the image can then be noisier than a plain one. A smaller α follows faster (α = 0.5 adds 3 δx δy) at little
+cost: the division by 1 + s removes the noise of the mean on average, and β determines the number of innovations.
 """
 
 from __future__ import annotations
@@ -39,15 +37,14 @@ __all__ = ["State", "covariance", "init", "update"]
 class State:
     """Running statistics of a stream of pairs (x, y).
 
-    The three weights are device numbers, not Python's: they change from step to step and must not become literals of
-    a kernel.
+    The three weights change at every step. They are device numbers, because Python numbers would become literals of a kernel.
 
     Attributes:
-        mean_x: weighted mean of x so far, its shape.
-        mean_y: of y.
-        moment: sum of the weighted innovation products, not yet divided by `moment_weight`.
+        mean_x: weighted mean of x, with the shape of x.
+        mean_y: weighted mean of y.
+        moment: weighted sum of the innovation products, not yet divided by `moment_weight`.
         mean_weight: 1 − α^n after n samples.
-        mean_weight_squares: sum of the squares of the weights that `mean_weight` sums.
+        mean_weight_squares: sum of the squared weights whose sum is `mean_weight`.
         moment_weight: 1 − β^(n−1).
     """
 
@@ -60,7 +57,7 @@ class State:
 
 
 def init(like: Array) -> State:
-    """Before the first sample. `like` gives shape and type of the samples."""
+    """Return the state before the first sample; `like` has the shape and type of the samples."""
     zeros, zero = arrays.zeros_like(like) * 1.0, arrays.scalar(0.0, like)
     return State(zeros, zeros, zeros, zero, zero, zero)
 
@@ -68,14 +65,14 @@ def init(like: Array) -> State:
 def update(
     state: State, x: Array, y: Array, alpha: float = 0.9, beta: float = 0.999, count: Array | float = 1.0
 ) -> State:
-    """The state after one more pair.
+    """Return the state after one more pair.
 
     Args:
         state: from `init` or `update`.
-        x, y: one sample each, of the shape given to `init`; the same array twice gives a variance.
+        x, y: one sample each, with the shape given to `init`; the same array twice gives a variance.
         alpha: decay of the means, in [0, 1).
         beta: decay of the covariance, in [0, 1).
-        count: of how many samples each is the mean, where the covariance of a single one is wanted; exact where it stays the same.
+        count: number of samples of which x and y are means, if the covariance of single samples is wanted. Exact for a constant count.
     """
     seen = state.mean_weight > 0
     inflation = 1.0 + state.mean_weight_squares / arrays.where(seen, state.mean_weight * state.mean_weight, 1.0)
@@ -94,9 +91,9 @@ def update(
 
 
 def covariance(state: State) -> Array:
-    """The covariance of x and y, per element; 0 before two samples.
+    """Return the covariance of x and y per element; 0 before the second sample.
 
-    Unbiased for independent, identically distributed pairs; see the module for what drift adds. Never negative where
-    x and y are the same, and at most the geometric mean of the two variances (equal α and β).
+    Unbiased for independent, identically distributed pairs; the module describes the effect of drift. For equal x and y it is never
+    negative. With equal α and β it is at most the geometric mean of the two variances.
     """
     return state.moment / arrays.where(state.moment_weight > 0, state.moment_weight, 1.0)
