@@ -271,7 +271,7 @@ def gradient_of(
         parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch, emitters=request
     ).carry_out(problem)
     coordinates = problem.coordinates
-    moved = coordinates.pull_back(coordinates.by_u(found.gradient, parameters), {})
+    moved = coordinates.pull_back(coordinates.wrt_u(found.gradient, parameters), {})
     return [arrays.numpy(value) for value in moved.values()]
 
 

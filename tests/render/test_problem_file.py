@@ -157,7 +157,7 @@ MISTAKES = [
         "[[views]]",
         "bounds = [\n0,\n'x']\n[[views]]",
         5,
-        "parameters[0].bounds: expected two numbers [low, high] (inf is open), got 'x'",
+        "parameters[0].bounds: expected two numbers [low, high] (inf is unbounded), got 'x'",
     ),
     ("[[views]]", "[[views]]\nsensor = 1.5", 6, "views[0].sensor: expected the index of a sensor"),
     # values

@@ -66,8 +66,8 @@ def test_mini_batches_of_whole_views_are_damped_as_these_are() -> None:
     targets = SimpleNamespace(at=lambda views, pixels: (reference, np.ones((len(views), 1))))
     problem: Any = SimpleNamespace(sizes=sizes, loss=L1(), references=targets)
     frame = PixelBatch(problem, PixelSample(views, pixels, np.ones((23, 1))))
-    assert frame.whole == ((slice(0, 12), (3, 4)), (slice(12, 22), (5, 2)))
-    around = [smoothed_variance(variance[rows].reshape(*size, 3)).reshape(-1, 3) for rows, size in frame.whole]
+    assert frame.complete_views == ((slice(0, 12), (3, 4)), (slice(12, 22), (5, 2)))
+    around = [smoothed_variance(variance[rows].reshape(*size, 3)).reshape(-1, 3) for rows, size in frame.complete_views]
     expected = damping(image - reference, np.concatenate([*around, np.zeros((1, 3))]), 2.0)
     np.testing.assert_allclose(_derivative(problem, frame, variance, 2.0)(image), np.sign(image - reference) * expected)
     order = random.permutation(23)

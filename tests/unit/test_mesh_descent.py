@@ -273,7 +273,7 @@ def test_unusual_meshes_have_a_line() -> None:
     fin = np.concatenate([FACES, [[FACES[0, 0], FACES[0, 1], 80]], [[0, 0, 1], [3, 4, 3]]])
     (line,) = mesh_notices("ball.vertex_positions", POINTS, fin)
     assert line.endswith(
-        "its mesh has 1 edges of more than two faces and 2 triangles without area, which count as borders"
+        "its mesh has 1 edges of more than two faces and 2 triangles without area, which are treated as borders"
     )
 
 
@@ -306,7 +306,7 @@ def test_what_to_do_with_self_intersections_is_checked() -> None:
     check_self_intersection("warn", None)
     with pytest.raises(ur.InputError, match='expected "warn", "prevent" or "ignore", got \'never\''):
         check_self_intersection("never", (POINTS, FACES))
-    with pytest.raises(ur.InputError, match="it is of the vertex positions of a mesh"):
+    with pytest.raises(ur.InputError, match="this option is for the vertex positions of a mesh"):
         check_self_intersection("prevent", None)
 
 

@@ -128,7 +128,7 @@ def test_references_are_float32_and_alpha_is_dropped():
     np.testing.assert_array_equal(made.views[0].reference, REFERENCE)
     np.testing.assert_array_equal(made.views[1].reference, np.repeat(REFERENCE[..., :1], 3, axis=2))
     (notice,) = made.notices
-    assert notice.startswith("view 1: reference of one channel")
+    assert notice.startswith("view 1: reference has one channel")
 
 
 def test_eight_bit_values_are_linearised_and_it_says_so():
@@ -149,7 +149,7 @@ def test_a_reference_with_saturated_pixels_says_so():
     """Of integers alone: floating-point values have no white."""
     levels = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     levels[1, 2, 0] = 255
-    told = "view 0: 5.0% of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
+    told = "view 0: 5.0% of the reference's pixels are saturated; the loss Censored treats them as lower bounds"
     assert told in problem(views=View(levels)).notices
     assert told not in problem(views=View(levels), loss=losses.Censored()).notices
     elsewhere = np.ones((HEIGHT, WIDTH), np.float32)

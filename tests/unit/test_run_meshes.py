@@ -70,8 +70,8 @@ def test_a_run_folder_tells_distances_of_surfaces(tmp_path: Path) -> None:
     ("name", "value", "message"),
     [
         ("faces", FACES + 1, "names vertex 42 of 42"),
-        ("faces", FACES[:, :2], "whole numbers of vertices"),
-        ("faces", np.where(FACES == 3, np.nan, FACES), "whole numbers of vertices"),
+        ("faces", FACES[:, :2], "vertex indices"),
+        ("faces", np.where(FACES == 3, np.nan, FACES), "vertex indices"),
         ("true_faces", FACES - 1, "names vertex"),
         ("true_vertices", np.full((42, 3), np.inf), "finite vertices"),
     ],

@@ -49,8 +49,8 @@ def variance(problem: ur.Problem, sampler: PixelSampler, spp: int, repetitions: 
         if step < _LEARNING:
             state = after
         else:
-            by_u = problem.coordinates.by_u(estimate.gradient, start)
-            found.append(np.array(problem.coordinates.pull_back(by_u, {})[key], np.float64).ravel())
+            wrt_u = problem.coordinates.wrt_u(estimate.gradient, start)
+            found.append(np.array(problem.coordinates.pull_back(wrt_u, {})[key], np.float64).ravel())
     return float(np.var(found, axis=0, ddof=1).sum())
 
 

@@ -344,7 +344,7 @@ class MetaEstimator:
         request = GradientRequest(parameters, self.image, state.image, spp, key, pair_request=pair_request, batch=batch)
         step = problem.executor.estimate_gradient(problem, request)
         if first:
-            pixels = self.pixels.observe(problem, pixels, problem.coordinates.by_u(step.gradient, parameters))
+            pixels = self.pixels.observe(problem, pixels, problem.coordinates.wrt_u(step.gradient, parameters))
             pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
             if drawn and batch.sample is None:
                 step = replace(step, image=problem.executor.prepare_images(problem, self.image, step.image))

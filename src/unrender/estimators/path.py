@@ -193,10 +193,10 @@ class PathGradient:
             emitters=asked,
         )
         step = problem.executor.estimate_gradient(problem, request)
-        by_u = problem.coordinates.by_u(step.gradient, parameters)
-        pixels = self.pixels.observe(problem, pixels, by_u)
+        wrt_u = problem.coordinates.wrt_u(step.gradient, parameters)
+        pixels = self.pixels.observe(problem, pixels, wrt_u)
         if emitters is not None:
-            emitters = emitter_selection.learned(emitter_selection.observed(problem, emitters, by_u), step.connections)
+            emitters = emitter_selection.learned(emitter_selection.observed(problem, emitters, wrt_u), step.connections)
         pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
         whole, image = batch.sample is None, step.image
         if whole and drawn:

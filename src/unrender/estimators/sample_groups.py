@@ -303,18 +303,18 @@ def _derivative(problem: Problem, frame: Frame, variance: Array | None, toleranc
         return frame.loss_derivative
     match frame:
         case WholeView():
-            around, reference = (frame.laid(x) for x in (smoothed_variance(variance), problem.reference(frame.view)))
-        case PixelBatch(whole=whole) if whole:
-            around, reference = _variance_by_views(variance, whole), frame.targets[0]
+            around, reference = (frame.expand(x) for x in (smoothed_variance(variance), problem.reference(frame.view)))
+        case PixelBatch(complete_views=complete) if complete:
+            around, reference = _variance_by_views(variance, complete), frame.targets[0]
         case _:
             return frame.loss_derivative
     return lambda images: frame.loss_derivative(images) * damping(images - reference, around, tolerance)
 
 
-def _variance_by_views(variance: Array, whole: Sequence[tuple[slice, tuple[int, int]]]) -> Array:
-    """`smoothed_variance` of the pixels (N, 3) of whole views; 0 for what comes after these, which fills a batch up."""
-    parts = [arrays.rows(smoothed_variance(arrays.reshape(variance[rows], (*size, 3)))) for rows, size in whole]
-    rest = variance[whole[-1][0].stop :]
+def _variance_by_views(variance: Array, complete: Sequence[tuple[slice, tuple[int, int]]]) -> Array:
+    """Return `smoothed_variance` of the pixels (N, 3) of complete views; 0 for the pixels that fill up the batch after them."""
+    parts = [arrays.rows(smoothed_variance(arrays.reshape(variance[rows], (*size, 3)))) for rows, size in complete]
+    rest = variance[complete[-1][0].stop :]
     return arrays.concatenate([*parts, rest * 0.0] if int(arrays.shape(rest)[0]) else parts)
 
 
@@ -331,7 +331,7 @@ def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, others: 
     fresh = found.fresh_others()
     if problem.loss.linear or not isinstance(frame, WholeView):
         return frame.loss_derivative(fresh)
-    reference = frame.laid(problem.reference(frame.view))
+    reference = frame.expand(problem.reference(frame.view))
     residual = others - reference
     square = residual * residual
     return weights * residual * (fresh - reference) / (square + 1e-12)

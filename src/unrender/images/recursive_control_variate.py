@@ -284,7 +284,7 @@ class RecursiveControlVariate:
         mean = arrays.mean_over_first if counts is None else counts.means
         F, H = mean(rendering.images), mean(rendering.previous)
         past, weight = memory.relative_variance, self._weight(memory, number)
-        image, of_each = frame.laid(memory.image), frame.laid(weight)
+        image, of_each = frame.expand(memory.image), frame.expand(weight)
         current = advance(image, rendering.images, rendering.previous, of_each)
         observed = self._observe(memory, F, H, number)
         var_current, var_previous = welford.covariance(observed.current), welford.covariance(observed.previous)

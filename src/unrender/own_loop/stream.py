@@ -215,7 +215,7 @@ class Stream:
         gradient = reduce(trees.add, parts)
         arrays.evaluate(gradient)
         if not self._options.all_pixels:
-            moved = self.problem.coordinates.by_u(gradient, rendered.parameters)
+            moved = self.problem.coordinates.wrt_u(gradient, rendered.parameters)
             pixels = self._options.pixels.observe(self.problem, self.state.pixels, moved)
             self.state = replace(self.state, pixels=pixels)
         return gradient

@@ -1,4 +1,4 @@
-"""What is to be recovered, and from which images."""
+"""The inverse problem: a scene, its unknown parameters and the reference images."""
 
 from typing import TYPE_CHECKING
 

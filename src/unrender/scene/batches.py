@@ -1,4 +1,4 @@
-"""The pixels that one launch renders, a whole view or a mini-batch from all views, and the loss on them."""
+"""Pixels of one launch, either a full view or a mini-batch from all views, and the loss on them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from unrender.scene.sample_counts import SampleCounts, SampleShares
 
 @dataclass(frozen=True)
 class PixelSample:
-    """A mini-batch of pixels, drawn with replacement from the pixels of all views.
+    """A mini-batch of pixels, sampled with replacement from the pixels of all views.
 
     Attributes:
-        views: index of the view of each, (N,), integer array of the renderer.
-        pixels: row-major index within the view's film, (N,).
-        weights: 1 / (N p), (N, 1): weighted sums over the mini-batch are unbiased sums over all pixels.
-        positions: of each in the mini-batch that this is a part of, (N,); None for a whole one. See `SampleRequest`.
+        views: index of each pixel's view, (N,), integer array of the renderer.
+        pixels: row-major index in the view's film, (N,).
+        weights: 1 / (N p), (N, 1). Weighted sums over the mini-batch are unbiased estimates of sums over all pixels.
+        positions: index of each pixel in the complete mini-batch, (N,), if this is a part of one; else None. See `SampleRequest`.
     """
 
     views: Array
@@ -33,32 +33,35 @@ class PixelSample:
 
 
 class Frame(Protocol):
-    """Some pixels of the problem, and their part of the loss. Images are (groups, *shape) or (*shape)."""
+    """Pixels of the problem that one launch renders, and their part of the loss. Images are (groups, *shape) or (*shape)."""
 
     @property
     def pixels(self) -> int:
-        """How many there are, with multiplicity."""
+        """Number of pixels, with multiplicity."""
         ...
 
     def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
-        """The request for these pixels with `spp` samples each."""
+        """Return the request for these pixels with `spp` samples each."""
         ...
 
     def loss_value(self, image: Array) -> Array:
-        """Their part of the loss, a lazy scalar; for a mini-batch an unbiased estimate of the total where the image is exact."""
+        """Return the loss of these pixels, a lazy scalar.
+
+        For a mini-batch and an exact image it estimates the total loss without bias.
+        """
         ...
 
     def loss_derivative(self, image: Array) -> Array:
-        """∂(total loss)/∂(pixel), times the pixel's weight."""
+        """Return ∂(total loss)/∂(pixel) times the pixel's weight."""
         ...
 
 
 @dataclass(frozen=True)
 class WholeView:
-    """All pixels of one view: images (H, W, 3).
+    """All pixels of one view, with images (H, W, 3).
 
-    With `counts` each pixel has a number of samples of its own. These are images of one group then, (1, N, 3), and so are the
-    derivatives, each divided by its pixel's number of samples. `emitters`: see `SampleRequest`.
+    With `counts`, pixels have different numbers of samples. Images and loss derivatives then have one entry per sample, (1, N, 3), in a
+    single group, and each derivative is divided by its pixel's number of samples. For `emitters` see `SampleRequest`.
     """
 
     problem: Problem
@@ -78,25 +81,25 @@ class WholeView:
         return SampleRequest(sensor, spp, seed, groups, emitters=self.emitters)
 
     def loss_value(self, image: Array) -> Array:
-        """The view's part of the loss, exactly."""
+        """Return the loss of the view, without approximation."""
         return self.problem.loss_value(self.view, image)
 
     def loss_derivative(self, image: Array) -> Array:
-        """See `Frame.loss_derivative`; with `counts`, of (1, N, 3)."""
+        """Return ∂(total loss)/∂(pixel): (H, W, 3), or (1, N, 3) with `counts`."""
         if self.counts is None:
             return self.problem.loss_derivative(self.view, image)
         pixels = self.counts.pixels
         reference, factor = self.problem.references.at(pixels * 0 + self.view, pixels)
         return self.problem.loss.derivative(image, reference) * (factor / self.counts.spread(self.counts.divisors))
 
-    def laid(self, image: Array) -> Array:
-        """An image (H, W, C) as the loss derivative takes it; with `counts`, the pixel of each sample, (1, N, C)."""
+    def expand(self, image: Array) -> Array:
+        """Return an image (H, W, C) in the layout of the loss derivative: with `counts`, the pixel of each sample, (1, N, C)."""
         return image if self.counts is None else self.counts.spread(image)
 
 
 @dataclass(frozen=True)
 class PixelBatch:
-    """A mini-batch of pixels of all views: images (N, 3). `emitters`: see `SampleRequest`."""
+    """A mini-batch of pixels from all views, with images (N, 3). For `emitters` see `SampleRequest`."""
 
     problem: Problem
     sample: PixelSample
@@ -108,23 +111,23 @@ class PixelBatch:
 
     @cached_property
     def targets(self) -> tuple[Array, Array]:
-        """Their reference values (N, 3), and the factor of each one's loss (N, 1): view weight * mask / (H * W * 3)."""
+        """Reference values (N, 3), and the factor of each pixel's loss (N, 1): view weight * mask / (H * W * 3)."""
         return self.problem.references.at(self.sample.views, self.sample.pixels)
 
     @cached_property
-    def whole(self) -> tuple[tuple[slice, tuple[int, int]], ...]:
-        """Of views all of whose pixels are here one after the other, as of `pixels.Views`: where they are, and (height, width)."""
+    def complete_views(self) -> tuple[tuple[slice, tuple[int, int]], ...]:
+        """Slice and (height, width) of each view whose pixels are all in this batch, in order, as `pixels.Views` selects them."""
         views, pixels = (arrays.numpy(x).astype(np.int64) for x in (self.sample.views, self.sample.pixels))
-        sizes, found, start = self.problem.sizes, [], 0
+        sizes, views_found, start = self.problem.sizes, [], 0
         while start < len(views):
             height, width = sizes[views[start]]
             stop = start + height * width
-            of_one = views[start:stop] == views[start]
-            if len(of_one) < height * width or not of_one.all() or not (np.diff(pixels[start:stop]) == 1).all():
+            same = views[start:stop] == views[start]
+            if len(same) < height * width or not same.all() or not (np.diff(pixels[start:stop]) == 1).all():
                 break
-            found.append((slice(start, stop), (height, width)))
+            views_found.append((slice(start, stop), (height, width)))
             start = stop
-        return tuple(found)
+        return tuple(views_found)
 
     def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
         sensors = [view.sensor for view in self.problem.views]
@@ -146,7 +149,7 @@ class PixelBatch:
 def whole_views(
     problem: Problem, shares: SampleShares | None = None, spp: int = 1, emitters: np.ndarray | None = None
 ) -> list[Frame]:
-    """One frame per view; with `shares`, each pixel has a number of samples of its own, `spp` on average."""
+    """Return one frame per view. With `shares`, pixels have different numbers of samples, `spp` on average."""
     views, array = range(len(problem.views)), problem.renderer.array
     counts = [None if shares is None else shares.counts(view, spp, array) for view in views]
     return [WholeView(problem, view, counts[view], emitters) for view in views]

@@ -1,4 +1,4 @@
-"""Bounds of parameters: checked, narrowed to one side of a singular value, and projected onto."""
+"""Bounds of parameters: validation, restriction to one side of a singular value, and projection."""
 
 from __future__ import annotations
 
@@ -15,41 +15,42 @@ from unrender.parameterisations.base import Bounds
 from unrender.rendering.renderer import ParameterInfo
 
 MARGIN = 1e-4
-"""Distance from a bound at which parameters are clamped, as a fraction of their range (of 1 where it is open). At a reflectance of
-exactly 0 no light arrives through a surface and its gradient is 0 for ever; a lobe of probability exactly 0 is never sampled again."""
+"""Margin that `project` keeps from a bound, as a fraction of the range (of 1 if the range is unbounded).
+
+At reflectance 0 no light passes a surface, so its gradient stays 0. A lobe of probability 0 is never sampled again.
+"""
 _CLEARANCE = 0.01
-"""Distance that values keep from a singular value, as a share of it: at most half of the initial distance."""
+"""Distance to a singular value that bounds keep, relative to that value; at most half of the initial distance."""
 
 
 def check_bounds(given: Any, info: ParameterInfo, start: np.ndarray) -> tuple[Bounds, str]:
-    """Return the bounds of a parameter, and a notice of how they were narrowed, "" for not at all.
+    """Return the bounds of a parameter, and a notice of how they were narrowed; "" if they were not.
 
     Args:
-        given: (low, high), either may be None or infinite; None for the physical range.
-        info: what the renderer says of the parameter.
-        start: initial values; they decide on which side of a singular value the bounds are.
-
+        given: (low, high), where either may be None or infinite; None for the physical range.
+        info: the renderer's description of the parameter.
+        start: initial values, which determine the side of a singular value.
     Raises:
         InputError: the bounds are malformed, or the initial values are at a singular value or on both sides of it.
     """
     low, high = (info.lowest, info.highest) if given is None else _read(given)
     if info.singular is None or not (_below(low, info.singular) and _below(info.singular, high)):
         return (low, high), ""
-    middle = info.singular
-    if (start == middle).any() or ((start < middle).any() and (start > middle).any()):
+    singular = info.singular
+    if (start == singular).any() or ((start < singular).any() and (start > singular).any()):
         raise InputError(
-            f"images are singular at {middle:g}: expected initial values on one side of it, got {_span(start)}"
+            f"images are singular at {singular:g}: expected initial values on one side of it, got {_span(start)}"
         )
-    gap = min(_CLEARANCE * abs(middle), float(np.min(np.abs(start - middle), initial=np.inf)) / 2)
-    side = (middle + gap, high) if start.flat[0] > middle else (low, middle - gap)
+    gap = min(_CLEARANCE * abs(singular), float(np.min(np.abs(start - singular), initial=np.inf)) / 2)
+    side = (singular + gap, high) if start.flat[0] > singular else (low, singular - gap)
     if given is None:
         return side, ""
     shown = ", ".join("open" if end is None else f"{end:g}" for end in side)
-    return side, f"bounds narrowed to [{shown}]: images are singular at {middle:g}"
+    return side, f"bounds narrowed to [{shown}]: images are singular at {singular:g}"
 
 
 def clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
-    """Return `start` inside the bounds, and a notice of how many values changed, "" for none."""
+    """Return `start` clamped to the bounds, and a notice with the number of changed values; "" if none changed."""
     low, high = bounds
     moved = sum(
         int(np.count_nonzero(outside(start, end)))
@@ -59,11 +60,11 @@ def clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
     if not moved:
         return start, ""
     notice = f"{moved} of {start.size} initial values moved into the bounds [{low}, {high}]"
-    return np.asarray(np.clip(start, low, high), np.float32), notice  # of a number, clip returns no array
+    return np.asarray(np.clip(start, low, high), np.float32), notice  # clip returns a scalar for a scalar
 
 
 def project(x: Array, low: float | None, high: float | None) -> Array:
-    """The nearest point inside the bounds, less the margin. A projection, not a sigmoid: the gradient inside is untouched."""
+    """Project onto the bounds, with a margin. A projection, unlike a sigmoid, does not change the gradient inside the bounds."""
     margin = MARGIN * (high - low if low is not None and high is not None else 1.0)
     if low is not None:
         x = arrays.maximum(x, low + margin)
@@ -88,7 +89,7 @@ def _read(given: Any) -> Bounds:
 
 
 def _below(low: float | None, high: float | None) -> bool:
-    """Whether one end is at most the other; None is open."""
+    """Return whether one limit is at most the other; None is unbounded."""
     return low is None or high is None or low <= high
 
 

@@ -1,4 +1,4 @@
-"""A parameter that is coarse at first and becomes finer at given steps."""
+"""Parameters with a coarse initial resolution that is refined at given steps."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from unrender.core.errors import InputError
 from unrender.io import resampling
 
 NEVER = 1 << 40
-"""A step that no run comes to: `CoarseToFine((NEVER,), 4)` is four times as coarse throughout."""
+"""A step that no run reaches: `CoarseToFine((NEVER,), 4)` uses a quarter of the resolution in the entire run."""
 
 
 @dataclass(frozen=True)
 class CoarseToFine:
-    """The resolutions of a texture (H, W, C) or grid (Z, Y, X, C) during a descent.
+    """Resolutions of a texture (H, W, C) or grid (Z, Y, X, C) during an optimisation.
 
-    The last resolution is the scene's own. Before step `steps[-1]` each axis has `factor` times fewer texels (rounded up), before the
-    step in front of it `factor` times fewer again: `steps=(200, 400)` takes a grid of 64³ through 16³, 32³ and 64³. The start is
-    averaged over the coarse texels (`resampling.downsample`); at each change the parameter becomes its linear interpolant
-    (`resampling.upsample`), which shows the same up to the kinks of linear interpolation.
+    The last resolution is the scene's. Before step `steps[-1]` each axis has `factor` times fewer texels (rounded up), before step
+    `steps[-2]` `factor` times fewer again: `steps=(200, 400)` takes a grid of 64³ through 16³, 32³ and 64³. The initial value is averaged
+    over the coarse texels (`resampling.downsample`). At each refinement the parameter becomes its linear interpolant
+    (`resampling.upsample`), which renders the same image except at the kinks of linear interpolation.
 
-    What optimizer, estimator and pixel sampler remember is either carried through a change or starts anew (`states`), see
-    `unrender.scene.upsampling`. Learning rates and their schedules go on in any case.
+    `states` determines whether the states of optimizer, estimator and pixel sampler are interpolated or restarted, see
+    `unrender.scene.upsampling`. Learning rates and their schedules always continue.
 
     Args:
-        steps: before which of the run's steps the resolution grows, counted from 0: ascending, each at least 1.
-        factor: how many times more texels along each axis, >= 2.
-        wrap: whether opposite borders are neighbours, as for a tiling texture (Mitsuba's `repeat`); for all axes or one truth value per
-            axis. Otherwise values are constant beyond the border (`clamp`).
-        states: "estimator" carries what the estimator remembers, its pixel sampler's state included, and the optimizer starts anew;
-            "carry" carries all; with "reset" all start anew.
+        steps: steps of the run at which the resolution increases, counted from 0: ascending, each at least 1.
+        factor: ratio of the numbers of texels along each axis, >= 2.
+        wrap: whether opposite borders are neighbours, as in a tiling texture (Mitsuba's `repeat`): one truth value, or one per axis.
+            Otherwise values are constant beyond the border (`clamp`).
+        states: "estimator" keeps the estimator's state, including its pixel sampler's, and restarts the optimizer; "carry" keeps all
+            states; "reset" restarts all.
     """
 
     steps: tuple[int, ...]
@@ -53,7 +53,7 @@ class CoarseToFine:
             raise InputError(f'CoarseToFine: states must be "estimator", "carry" or "reset", got {self.states!r}')
 
     def check(self, shape: tuple[int, ...]) -> None:
-        """Raise `InputError` where a parameter of this (full) shape cannot be coarse at first."""
+        """Raise `InputError` for a parameter of this (full) shape that cannot have coarser resolutions."""
         if len(shape) not in (3, 4):
             raise InputError(f"expected a texture (H, W, C) or a grid (Z, Y, X, C), got shape {shape}")
         if isinstance(self.wrap, tuple) and len(self.wrap) != len(shape) - 1:
@@ -62,26 +62,26 @@ class CoarseToFine:
             raise InputError(f"shape {shape} is too small to be coarser {len(self.steps)} times by {self.factor}")
 
     def shape(self, full: tuple[int, ...], step: int) -> tuple[int, ...]:
-        """The parameter's shape at a step, where `full` is that of the scene."""
+        """Return the parameter's shape at a step; `full` is its shape in the scene."""
         coarser = self.factor ** sum(step < change for change in self.steps)
         return (*(-(-size // coarser) for size in full[:-1]), full[-1])
 
     def shapes(self, full: tuple[int, ...]) -> set[tuple[int, ...]]:
-        """All that it has in the course of a run."""
+        """Return all shapes of the parameter during a run."""
         return {self.shape(full, step) for step in (0, *self.steps)}
 
     def coarsened(self, values: np.ndarray, step: int) -> np.ndarray:
-        """Values at the scene's resolution, at that of a step."""
+        """Downsample values from the scene's resolution to that of a step."""
         return resampling.downsample(values, self.shape(values.shape, step)[:-1])
 
     def refined(self, values: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-        """Values at a coarser resolution, at that of `shape`. Linear in the values."""
+        """Upsample values from a coarser resolution to that of `shape`. Linear in the values."""
         wrap = self.wrap if isinstance(self.wrap, tuple) else (self.wrap,) * (values.ndim - 1)
         return resampling.upsample(values, shape[:-1], wrap)
 
 
 def checked_steps(owner: str, given: Any) -> tuple[int, ...]:
-    """Steps before which something changes. Raises `InputError` for what are none."""
+    """Return the steps at which something changes, after checking them. Raises `InputError`."""
     steps = tuple(given) if isinstance(given, (list, tuple)) else ()
     if not steps or not all(type(step) is int and step >= 1 for step in steps) or list(steps) != sorted(set(steps)):
         what = "whole numbers of at least 1 that ascend, such as [200, 400]"
@@ -90,7 +90,7 @@ def checked_steps(owner: str, given: Any) -> tuple[int, ...]:
 
 
 def of(given: Any) -> CoarseToFine:
-    """What a parameter was given: one, its steps alone, or a table of its options. Raises `InputError`."""
+    """Return the resolutions of a parameter from an instance, a list of steps or a table of options. Raises `InputError`."""
     if isinstance(given, CoarseToFine):
         return given
     table = dict(given) if isinstance(given, Mapping) else {"steps": given}

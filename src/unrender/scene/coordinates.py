@@ -1,4 +1,4 @@
-"""The coordinates of the descent: the variables that an optimizer moves in place of the parameters."""
+"""Coordinates of the optimisation: the variables that an optimizer updates in place of the parameters."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from unrender.preconditioners.base import Preconditioner
 
 @dataclass(frozen=True)
 class Coordinates:
-    """x = φ(u), u = S v: φ of a parameter's parameterisation, S its preconditioner, each the identity where there is none.
+    """The change of variables x = φ(u), u = S v, with parameterisation φ and preconditioner S; each is the identity if absent.
 
-    An optimizer is given u, and the gradient by v; its steps are of v. φ is known by its slope at the present parameters: {key: φ'} of the
-    parameters that have one. Outer columns that repeat others are no unknowns: gradients and steps there are copies.
+    An optimizer gets u and the gradient with respect to v; its steps are in v. φ enters by its derivative at the current parameters,
+    {key: φ'}. In arrays with repeated border columns, gradients and steps of those columns are copies.
 
     Attributes:
         transforms: {key: φ}.
         preconditioners: {key: S}.
-        repeated: {key: number of columns at each end that repeat those of the opposite end}, see `core.periodic`.
+        repeated: {key: number of repeated columns at each end}, see `core.periodic`.
     """
 
     transforms: Mapping[str, Transform]
@@ -29,32 +29,32 @@ class Coordinates:
     repeated: Mapping[str, int] = field(default_factory=dict)
 
     def of(self, parameters: Tree) -> Tree:
-        """u."""
+        """Return u = φ⁻¹(x)."""
         maps = self.transforms
         return {key: maps[key].inverse(x) if key in maps else x for key, x in parameters.items()}
 
     def slopes(self, parameters: Tree) -> Tree:
-        """{key: φ'} where there is a φ."""
+        """Return {key: φ'} for the parameters that have a φ."""
         return {key: φ.slope(parameters[key]) for key, φ in self.transforms.items()}
 
     def curvatures(self, parameters: Tree) -> Tree:
-        """{key: φ''} where there is a φ."""
+        """Return {key: φ''} for the parameters that have a φ."""
         return {key: φ.curvature(parameters[key]) for key, φ in self.transforms.items()}
 
-    def by_u(self, gradient: Tree, parameters: Tree) -> Tree:
-        """The gradient by u, of that by x: φ' g."""
+    def wrt_u(self, gradient: Tree, parameters: Tree) -> Tree:
+        """Return the gradient with respect to u, φ' g, from the gradient g with respect to x."""
         return _times(gradient, self.slopes(parameters))
 
     def pull_back(self, gradient: Tree, slopes: Tree) -> Tree:
-        """The gradient by v, of that by x: S (φ' g)."""
+        """Return the gradient with respect to v, S (φ' g), from the gradient g with respect to x."""
         return self._smoothed(_times(gradient, slopes))
 
     def push_forward(self, tangent: Tree, slopes: Tree) -> Tree:
-        """The tangent of x, of one of v: φ' (S t)."""
+        """Return the tangent of x, φ' (S t), from a tangent t of v."""
         return _times(self._smoothed(tangent), slopes)
 
     def moved(self, parameters: Tree, steps: Tree) -> tuple[Tree, Tree]:
-        """u after steps of v, and the parameters there; elements without a step are exactly as before."""
+        """Return u and x after steps of v. Elements of x whose change is zero keep their exact value."""
         changes = self._smoothed(steps)
         reached = trees.add(self.of(parameters), changes)
 
@@ -65,10 +65,10 @@ class Coordinates:
 
         return reached, {key: values(key) for key in reached}
 
-    def _smoothed(self, tree: Tree) -> Tree:
+    def _precondition(self, tree: Tree) -> Tree:
         maps = self.preconditioners
-        found = {key: maps[key].apply(x) if key in maps else x for key, x in tree.items()}
-        return {key: periodic.repeat(x, self.repeated.get(key, 0)) for key, x in found.items()}
+        result = {key: maps[key].apply(x) if key in maps else x for key, x in tree.items()}
+        return {key: periodic.repeat(x, self.repeated.get(key, 0)) for key, x in result.items()}
 
 
 def _times(tree: Tree, factors: Tree) -> Tree:

@@ -1,4 +1,4 @@
-"""An error that knows which field of a problem it is about, so that a file's reader can name the line."""
+"""An error with the path of a field of a problem, so that the reader of a file can name its line."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from unrender.io.toml_lines import Place, dotted
 
 
 class FieldError(InputError):
-    """What is wrong with one field of a problem.
+    """An invalid field of a problem.
 
     Args:
-        place: the way to the field, e.g. ("parameters", 0, "bounds").
-        what: one line: what is wrong and what would be right.
-        owner: what people call the field, e.g. "parameter wall.data: bounds"; None writes the place.
+        place: path of the field, e.g. ("parameters", 0, "bounds").
+        what: what is wrong and what was expected, in one line.
+        owner: name of the field in the message, e.g. "parameter wall.data: bounds"; None for the dotted path.
     """
 
     def __init__(self, place: Place, what: str, owner: str | None = None):

@@ -1,4 +1,4 @@
-"""Where the gradients of a problem are computed: in this process, or elsewhere."""
+"""Execution of gradient requests, in this process or in worker processes."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 
 class Executor(Protocol):
-    """Carries out the requests of an estimator.
+    """Executor of an estimator's requests.
 
-    A request is data: `estimators.sample_groups.GradientRequest` or `pixels.pixel_statistics.PilotRequest`. Its
+    A request is plain data: `estimators.sample_groups.GradientRequest` or `pixels.pixel_statistics.PilotRequest`. Its method
     `carry_out(problem)` computes it in this process.
     """
 
     @property
     def variant(self) -> str | None:
-        """Mitsuba's variant in the worker processes; None where there are none."""
+        """Mitsuba's variant in the worker processes; None without workers."""
         ...
 
     def check(self, estimator: Any) -> None:
@@ -24,11 +24,11 @@ class Executor(Protocol):
         ...
 
     def estimate_gradient(self, problem: Any, request: Any) -> Any:
-        """Return the `GradientSample` of a `GradientRequest`. Its image state may stand in for states that workers keep."""
+        """Return the `GradientSample` of a `GradientRequest`. Its image state may be a placeholder for states in the workers."""
         ...
 
     def trace_pilot(self, problem: Any, request: Any) -> list[np.ndarray]:
-        """Return the paths of a `PilotRequest`, arrays (N, 3)."""
+        """Return the paths of a `PilotRequest` as arrays (N, 3)."""
         ...
 
     def prepare_images(self, problem: Any, image: Any, state: Any) -> Any:
@@ -36,20 +36,20 @@ class Executor(Protocol):
         ...
 
     def collect(self, state: Any) -> Any:
-        """Return a state with the workers' own states in place of what stands in for them. For checkpoints."""
+        """Replace placeholders in a state by the workers' states, for checkpoints."""
         ...
 
     def snapshot(self) -> Any:
-        """Return what the next steps depend on besides the states, for checkpoints; None for nothing."""
+        """Return what the next steps depend on apart from the states, for checkpoints; None if nothing."""
         ...
 
     def restore(self, saved: Any) -> None:
-        """Continue from what `snapshot` returned."""
+        """Continue from the result of `snapshot`."""
         ...
 
 
 class LocalExecutor:
-    """Computes everything in this process."""
+    """Executor that computes everything in this process."""
 
     variant = None
 

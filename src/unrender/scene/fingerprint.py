@@ -1,4 +1,4 @@
-"""Hashes of a problem, part by part: two problems can be compared, and their differences named."""
+"""Hashes of the parts of a problem, to compare two problems and list their differences."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _known: weakref.WeakKeyDictionary[Problem, dict[str, str]] = weakref.WeakKeyDict
 
 
 def fingerprint(problem: Problem) -> dict[str, str]:
-    """{part of the problem: its text, or the SHA-256 of its numbers}.
+    """Return {part of the problem: its text, or the SHA-256 of its numbers}.
 
-    Parts: the loss, the longest path, each unknown with its start, each view, the numbers of the scene (but for the unknown ones) by
-    object, and, for a scene in XML, every file that it is made of. Computed once per problem and cached.
+    Parts are the loss, the maximum path length, each unknown with its initial value, each view, the numbers of each scene object without
+    the unknowns and, for an XML scene, every file that it consists of. The result is cached per problem.
     """
     if problem not in _known:
         _known[problem] = _take(problem)
@@ -34,23 +34,23 @@ def fingerprint(problem: Problem) -> dict[str, str]:
 
 
 def differences(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """What changed, one phrase each: "loss was L1(), is L2()", "file room.xml has changed"."""
-    found = []
+    """Return one phrase per difference, such as "loss was L1(), is L2()" or "file room.xml has changed"."""
+    changes = []
     for part in dict.fromkeys([*before, *now]):
         old, new = before.get(part), now.get(part)
         if old == new:
             continue
         if old is None or new is None:
-            found.append(f"{part} is {'gone' if new is None else 'new'}")
+            changes.append(f"{part} is {'gone' if new is None else 'new'}")
         elif old.startswith(_DIGEST) or new.startswith(_DIGEST):
-            found.append(f"{part} has changed")
+            changes.append(f"{part} has changed")
         else:
-            found.append(f"{part} was {old}, is {new}")
-    return found
+            changes.append(f"{part} was {old}, is {new}")
+    return changes
 
 
 def digest(*parts: bytes) -> str:
-    """The SHA-256 of bytes, in words that `differences` knows."""
+    """Return the SHA-256 of bytes, in the format that `differences` recognises."""
     state = hashlib.sha256()
     for part in parts:
         state.update(part)
@@ -58,26 +58,26 @@ def digest(*parts: bytes) -> str:
 
 
 def _take(problem: Problem) -> dict[str, str]:
-    found = {"loss": repr(problem.loss), "max_depth": str(problem.max_depth)}
+    parts = {"loss": repr(problem.loss), "max_depth": str(problem.max_depth)}
     start = problem.initial()
     for key, unknown in problem.unknowns.items():
-        found[f"parameter {key}: initial"] = _of_array(arrays.numpy(start[key]))
-        found[f"parameter {key}: bounds"] = str(unknown.bounds)
-        found[f"parameter {key}: learning_rate"] = str(unknown.learning_rate)
-        found[f"parameter {key}: preconditioner"] = repr(unknown.preconditioner)
+        parts[f"parameter {key}: initial"] = _of_array(arrays.numpy(start[key]))
+        parts[f"parameter {key}: bounds"] = str(unknown.bounds)
+        parts[f"parameter {key}: learning_rate"] = str(unknown.learning_rate)
+        parts[f"parameter {key}: preconditioner"] = repr(unknown.preconditioner)
         for name in ("parameterisation", "regularizer", "prior", "remeshing", "coarse_to_fine"):
             if (setting := getattr(unknown, name)) is not None:
-                found[f"parameter {key}: {name}"] = repr(setting)
+                parts[f"parameter {key}: {name}"] = repr(setting)
         if unknown.given.keys is not None:
-            found[f"parameter {key}: keys"] = repr(ties_of([unknown.given])[0].factors)
+            parts[f"parameter {key}: keys"] = repr(ties_of([unknown.given])[0].factors)
         if unknown.given.self_intersection == "prevent":
-            found[f"parameter {key}: self_intersection"] = "prevent"
+            parts[f"parameter {key}: self_intersection"] = "prevent"
     for index, view in enumerate(problem.views):
-        found[f"view {index}: sensor"] = str(view.sensor)
-        found[f"view {index}: weight"] = str(view.weight)
-        found[f"view {index}: reference"] = _of_array(np.asarray(view.reference))
-        found[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
-    return found | _of_scene(problem) | _of_files(problem)
+        parts[f"view {index}: sensor"] = str(view.sensor)
+        parts[f"view {index}: weight"] = str(view.weight)
+        parts[f"view {index}: reference"] = _of_array(np.asarray(view.reference))
+        parts[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
+    return parts | _of_scene(problem) | _of_files(problem)
 
 
 def _of_array(array: np.ndarray) -> str:

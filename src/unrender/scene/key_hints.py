@@ -1,4 +1,4 @@
-"""What to write in place of a parameter's key that a scene does not have, or that cannot be recovered."""
+"""Suggestions for parameter keys that a scene does not have, or that cannot be recovered."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from unrender.core.suggestions import did_you_mean
 from unrender.rendering.renderer import ParameterInfo
 
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")
-"""Ids that Mitsuba makes up for objects that were given none."""
+"""Ids that Mitsuba generates for objects without one."""
 _TRANSFORM = "to_world"
 _PLACES = (
     _TRANSFORM,
@@ -25,14 +25,14 @@ _PLACES = (
     "rotate",
     "radius",
 )
-"""What people call that which a pose changes."""
+"""Names that users may try for the parameters of a pose."""
 _POSE = ("translation", "rotation", "scale")
 
 
 def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
-    """A hint at the key that may have been meant, to be put after "the scene has no parameter KEY"; "" where there is none.
+    """Return a hint at the intended key, to follow "the scene has no parameter KEY"; "" if there is none.
 
-    An object without an `id` cannot be named: where the scene has one with a parameter of that name, the hint says so.
+    An object without an `id` has no usable key. If the scene has such an object with a parameter of that name, the hint asks for an id.
     """
     able = [name for name, info in known.items() if info.differentiable or info.perturbable]
     owner, _, rest = key.partition(".")
@@ -49,7 +49,7 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
         for near in (owner, *difflib.get_close_matches(owner, {name.partition(".")[0] for name in known}, n=1)):
             if poses := _poses(near, known):
                 return f"; a pose is {poses} (--method smoothed)"
-    # Mitsuba may call an owner by its shape where people think of its material: the rest of the key tells as much.
+    # Mitsuba may name the owner after its shape, where a user expects the material: the rest of the key then decides.
     alike = [name for name in able if name.endswith("." + rest) and not _is_nameless(name)] if rest else []
     named = [name for name in able if not _is_nameless(name)]
     if near := did_you_mean(key, alike, 0.0) or did_you_mean(key, named) or did_you_mean(key, known):
@@ -59,24 +59,24 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
 
 
 def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
-    """A hint at what may be recovered in place of a key that cannot, "" where there is none: poses in place of transformations."""
+    """Return a hint at a recoverable key in place of one that is not: a pose in place of a transformation. "" if there is none."""
     owner, _, rest = key.rpartition(".")
     if rest != _TRANSFORM:
         return ""
     if poses := _poses(owner, known):
         return f"; its pose can be: {poses} (--method smoothed)"
-    return "" if _no_pose(owner, known) else "; beside participating media, a shape has no pose"
+    return "" if _no_pose(owner, known) else "; a shape in a scene with participating media has no pose"
 
 
 def _no_pose(owner: str, known: Mapping[str, ParameterInfo]) -> str:
-    """Return why an object has no pose, as far as the reason given for its transformation tells; else ""."""
+    """Return why an object has no pose, if the reason of its transformation states it; else ""."""
     info = known.get(f"{owner}.{_TRANSFORM}")
     return f"{owner}.{_TRANSFORM}: {info.reason}" if info is not None and "pose" in info.reason else ""
 
 
 def _poses(owner: str, known: Mapping[str, ParameterInfo]) -> str:
-    found = [f"{owner}.{part}" for part in _POSE]
-    return ", ".join(key for key in found if key in known and known[key].rigid)  # an emitter's scale is its brightness
+    keys = [f"{owner}.{part}" for part in _POSE]
+    return ", ".join(key for key in keys if key in known and known[key].rigid)  # an emitter's scale is its brightness
 
 
 def _is_nameless(key: str) -> bool:

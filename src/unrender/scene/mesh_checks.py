@@ -1,4 +1,4 @@
-"""What the user gives of meshes among a problem's parameters, checked."""
+"""Validation of the settings for meshes among a problem's parameters."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.remeshing import Remeshing
 from unrender.scene.surfaces import Surface, area_normals
 
-_NO_MESH = "expected none: it is of the vertex positions of a mesh"
+_NO_MESH = "expected no value: this option is for the vertex positions of a mesh"
 
 _Mesh = tuple[np.ndarray, np.ndarray]
 _SELF_INTERSECTIONS = ("warn", "prevent", "ignore")
@@ -32,24 +32,24 @@ def check_regularizer(given: Any, mesh: _Mesh | None) -> MeshRegularizer | None:
 
 
 def check_remeshing(given: Any, mesh: _Mesh | None, uv: Callable[[], np.ndarray | None]) -> Remeshing | None:
-    """Return when a mesh gets other triangles; None for never. Raises `InputError` where that does not suit the mesh.
+    """Return the remeshing of a mesh; None for none. Raises `InputError` if it does not suit the mesh.
 
     Args:
-        given: by the user.
-        mesh: (positions, faces); None for what is no vertex positions.
-        uv: returns its texture coordinates, or None.
+        given: the user's setting.
+        mesh: (positions, faces); None if the parameter is not the vertex positions of a mesh.
+        uv: function that returns the texture coordinates, or None if there are none.
     """
     if given is None:
         return None
     if mesh is None:
         raise InputError(_NO_MESH)
-    found = remeshing.of(given)
-    found.check(*mesh, uv())
-    return found
+    setting = remeshing.of(given)
+    setting.check(*mesh, uv())
+    return setting
 
 
 def check_self_intersection(given: Any, mesh: _Mesh | None) -> None:
-    """Raise `InputError` for what is not to be done where a mesh passes through itself; see `Parameter`."""
+    """Raise `InputError` for an invalid treatment of self-intersections; see `Parameter`."""
     if given not in _SELF_INTERSECTIONS:
         raise InputError(f'expected "warn", "prevent" or "ignore", got {given!r}')
     if given != "warn" and mesh is None:
@@ -57,8 +57,13 @@ def check_self_intersection(given: Any, mesh: _Mesh | None) -> None:
 
 
 def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str]:
-    """A line on what is unusual about the mesh of vertex positions: edges of more than two faces, and triangles without area; none where
-    nothing is. Positions as loaded, (V, 3), faces (F, 3)."""
+    """Return a notice about unusual topology: edges of more than two faces, and triangles without area. Empty if there is none.
+
+    Args:
+        key: key of the vertex positions.
+        positions: vertex positions as loaded, (V, 3).
+        faces: vertex indices, (F, 3).
+    """
     _, places = np.unique(positions, axis=0, return_inverse=True)
     joined = places.reshape(-1)[faces]
     flat = np.linalg.norm(area_normals(positions.astype(np.float64), faces), axis=1) == 0
@@ -66,11 +71,11 @@ def mesh_notices(key: str, positions: np.ndarray, faces: np.ndarray) -> list[str
     crowded = int(np.sum(np.unique(sides, axis=0, return_counts=True)[1] > 2)) if len(sides) else 0
     words = [f"{crowded} edges of more than two faces"] if crowded else []
     words += [f"{int(flat.sum())} triangles without area"] if flat.any() else []
-    return [f"parameter {key}: its mesh has {' and '.join(words)}, which count as borders"] if words else []
+    return [f"parameter {key}: its mesh has {' and '.join(words)}, which are treated as borders"] if words else []
 
 
 def check_surfaces(surfaces: Mapping[str, Surface], faces: Mapping[str, np.ndarray]) -> None:
-    """Raise `FieldError` for a surface of what is no mesh among the parameters."""
+    """Raise `FieldError` for a true surface of a parameter that is not the vertex positions of a mesh."""
     for key, surface in surfaces.items():
         if not isinstance(surface, Surface):
             what = f"expected an unrender.scene.surfaces.Surface, got {type(surface).__name__}"

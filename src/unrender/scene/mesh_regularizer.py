@@ -1,4 +1,4 @@
-"""What is added to the loss to keep a mesh smooth, or its edges alike."""
+"""Regularisation terms that keep a mesh smooth, or its edges of equal length."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from unrender.preconditioners.mesh import MeshTopology
 
 @dataclass(frozen=True)
 class MeshRegularizer:
-    """Two terms of the loss, of vertex positions x alone, both without units:
+    """Regularisation of vertex positions x by two dimensionless terms of the loss:
 
         b mean_i |x_i − mean_{j ~ i} x_j|² / ℓ²  +  e (mean |x_i − x_j|² / (mean |x_i − x_j|)² − 1)
 
-    The first (bi-Laplacian: its gradient is L² x) is small where the surface is smooth and its triangles are regular; ℓ is the mean length
-    of an edge of the mesh as loaded. It pulls a closed mesh together a little. The second is the squared relative deviation of the
-    lengths of edges, whatever their mean is. Large steps (`preconditioners.LargeSteps`) smooth the way; these change where it leads to.
-    Vertices at the same place count as one.
+    The first term (bi-Laplacian: its gradient is L² x) is small for a smooth surface of regular triangles; ℓ is the mean edge length of
+    the mesh as loaded. It shrinks a closed mesh slightly. The second term is the squared relative deviation of the edge lengths from
+    their mean. Large steps (`preconditioners.LargeSteps`) smooth the path of the optimisation, whereas these terms change its minimum.
+    Vertices at the same position count as one.
 
     Args:
-        bilaplacian: b, >= 0. An L2 loss of pictures is 0.01 to 0.1 at the start: 0.01 is a lot.
-        edges: e, >= 0; likewise.
+        bilaplacian: b, >= 0. An L2 loss of images starts at 0.01 to 0.1, so 0.01 is large.
+        edges: e, >= 0; the same scale applies.
     """
 
     bilaplacian: float = 0.0
@@ -38,16 +38,16 @@ class MeshRegularizer:
             checks.number("regularizer", name, getattr(self, name), above=0.0, inclusive=True)
 
     def on_mesh(self, positions: np.ndarray, faces: np.ndarray) -> MeshRegularizer:
-        """The same for the vertex positions (3 V,) of a mesh: positions as loaded (V, 3), faces (F, 3)."""
+        """Return the regularizer for the vertex positions (3 V,) of a mesh with initial positions (V, 3) and faces (F, 3)."""
         bound = MeshRegularizer(self.bilaplacian, self.edges)
         object.__setattr__(bound, "_mesh", _Mesh.of(positions, faces))
         return bound
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """The two terms together, and their gradient by x, (3 V,)."""
+        """Return the sum of both terms, and its gradient with respect to x, (3 V,)."""
         mesh = self._mesh
         if mesh is None:
-            raise InputError("regularizer: it is of no mesh yet (on_mesh)")
+            raise InputError("regularizer: no mesh is attached; call on_mesh first")
         first, i, j = mesh.first, *mesh.neighbours.T
         places = x.reshape(-1, 3).astype(np.float64)[first]
         gradient, value = np.zeros_like(places), 0.0
@@ -55,11 +55,11 @@ class MeshRegularizer:
             total = np.zeros_like(places)
             np.add.at(total, i, places[j])
             np.add.at(total, j, places[i])
-            bend = places - total / mesh.valence[:, None]
+            laplacian = places - total / mesh.valence[:, None]
             factor = self.bilaplacian / (len(places) * mesh.length**2)
-            value += factor * float(np.sum(bend * bend))
-            shared = bend / mesh.valence[:, None]
-            gradient += 2 * factor * bend
+            value += factor * float(np.sum(laplacian * laplacian))
+            shared = laplacian / mesh.valence[:, None]
+            gradient += 2 * factor * laplacian
             np.add.at(gradient, i, -2 * factor * shared[j])
             np.add.at(gradient, j, -2 * factor * shared[i])
         if self.edges:
@@ -71,13 +71,14 @@ class MeshRegularizer:
             push = (slope / lengths)[:, None] * along
             np.add.at(gradient, i, push)
             np.add.at(gradient, j, -push)
-        # What a place is pulled by, its vertices share.
+        # The gradient of a position is divided equally among its vertices.
         return value, (gradient / mesh.copies[:, None])[mesh.places].reshape(-1)
 
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """What the terms need of a mesh: its places, one vertex of each, how many are there, its edges, and its mean length of an edge."""
+    """Topology that the terms need: position index of each vertex, first vertex and number of vertices of each position, edges, valence
+    and mean edge length."""
 
     places: np.ndarray
     first: np.ndarray
@@ -100,7 +101,7 @@ class _Mesh:
 
 
 def of(given: Any) -> MeshRegularizer:
-    """What a parameter was given: one, or a table of its options. Raises `InputError`."""
+    """Return a regularizer from an instance or a table of options. Raises `InputError`."""
     if isinstance(given, MeshRegularizer):
         return given
     if not isinstance(given, Mapping):

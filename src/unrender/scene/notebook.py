@@ -1,4 +1,4 @@
-"""How a problem is shown: one line of text, and a block of HTML in a notebook."""
+"""Display of a problem as one line of text, and as HTML in a notebook."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _VIEWS, _MAPS = 4, 3
 
 
 def line(problem: Problem) -> str:
-    """Problem('indirect-room': back.bsdf.reflectance.data (64, 64, 3); 1 view of 128x128; L1())."""
+    """Return a summary: Problem('indirect-room': back.bsdf.reflectance.data (64, 64, 3); 1 view of 128x128; L1())."""
     shapes = problem.shapes()
     keys = [f"{key} {shapes[key]}" for key in shapes]
     more = [f"and {len(keys) - 3} more"] if len(keys) > 3 else []
@@ -24,7 +24,7 @@ def line(problem: Problem) -> str:
 
 
 def html(problem: Problem) -> str:
-    """References, starts and truths as pictures; the unknowns; what is to be known of the input."""
+    """Return HTML with references, initial and true values as images, the unknowns, and the notices on the input."""
     shown = {
         f"reference {index}": shown_image(np.asarray(view.reference))
         for index, view in enumerate(problem.views[:_VIEWS])
@@ -49,7 +49,7 @@ def html(problem: Problem) -> str:
 
 
 def describe_views(problem: Problem) -> str:
-    """How many views there are, and of which sizes: 2 views of 128x128."""
+    """Return the number and sizes of the views: 2 views of 128x128."""
     sizes = sorted({(width, height) for height, width in problem.sizes})
     size = ", ".join(f"{width}x{height}" for width, height in sizes)
     return f"{len(problem.views)} view{'s' if len(problem.views) > 1 else ''} of {size}"

@@ -1,4 +1,4 @@
-"""One unknown of the scene."""
+"""An unknown parameter of the scene and its settings."""
 
 from __future__ import annotations
 
@@ -28,31 +28,29 @@ class Parameter:
     """A scene parameter to recover.
 
     Args:
-        key: as `mitsuba.traverse` names it, e.g. ``"back.bsdf.reflectance.data"``. With `keys`, a name of your own, or nothing for the
-            first of them.
-        initial: where the descent starts: a number, a colour, an array, a file, or None for the scene's own value. A number or a
-            colour fills the parameter. A file is converted as Mitsuba converts it when it loads the scene: the sRGB curve, the repeated
-            columns of an environment map, the transform of a mesh. Pictures and `.vol` grids of another resolution are resized. A `.npy`
-            file, or an `.npz` archive of one array, must have the parameter's shape; a last axis of length 1 may be missing, and so may
-            the repeated columns of an environment map.
-        bounds: (low, high); either may be None. None takes the physical range where it is known (a reflectance: 0 to 1).
-        learning_rate: this parameter's own; None takes the optimizer's.
+        key: name in `mitsuba.traverse`, e.g. ``"back.bsdf.reflectance.data"``. With `keys`, any name; "" takes the first of the keys.
+        initial: initial value: a number, a colour, an array, a file, or None for the scene's value. A number or a colour fills the
+        parameter. A file is converted as Mitsuba converts it when it loads the scene: the sRGB curve, the repeated columns of an
+        environment map, the transform of a mesh. Images and `.vol` grids of another resolution are resized. A `.npy` file, or an `.npz`
+        archive of one array, must have the parameter's shape; a last axis of length 1 and the repeated columns of an environment map may
+        be missing.
+        bounds: (low, high); either may be None. None takes the physical range if it is known (a reflectance: 0 to 1).
+        learning_rate: learning rate of this parameter; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
-        coarse_to_fine: `CoarseToFine`, or its steps alone, for a texture or grid that is coarse at first; None for one resolution.
-        parameterisation: "identity", "log", "logit", "softplus" or "softplus(0.1)", or one of `unrender.parameterisations`: what the
-            optimizer moves in place of the values, and what the learning rate is of. Preconditioner and optimizer act on that; values,
-            bounds and results are the parameter's own. None for the identity.
-        regularizer: of the vertex positions of a mesh, what is added to the loss: `MeshRegularizer`, or a table of its options such as
-            {"bilaplacian": 0.001}; None for nothing.
-        prior: What is known of the values before any picture: `Prior`, or a table of its options such as {"smoothness": 0.05}; None for
-            nothing.
-        remeshing: of the vertex positions of a mesh, when it gets other triangles: `Remeshing`, its steps alone, or a table of its options
-            such as {"steps": [100], "method": "subdivide"}; None for never.
-        self_intersection: of the vertex positions of a mesh, what is done where it passes through itself: "warn" looks now and then and
-            at the end, and tells of it in one line; "prevent" shortens steps that would lead there, and looks at every step, which
-            takes some 25 ms for 1000 triangles; "ignore" never looks.
-        keys: parameters of the scene that all have this one value, or {key: factor} where each is a factor times it. Initial value, bounds,
-            rate and preconditioner are of the one value.
+        coarse_to_fine: `CoarseToFine`, or its steps, for a texture or grid with a coarse initial resolution; None for one resolution.
+        parameterisation: "identity", "log", "logit", "softplus" or "softplus(0.1)", or one of `unrender.parameterisations`. It is the
+        variable that preconditioner, optimizer and learning rate act on; values, bounds and results remain those of the parameter. None
+        for the identity.
+        regularizer: for the vertex positions of a mesh, an additional term of the loss: `MeshRegularizer`, or a table of its options such
+        as {"bilaplacian": 0.001}; None for none.
+        prior: prior knowledge of the values: `Prior`, or a table of its options such as {"smoothness": 0.05}; None for none.
+        remeshing: for the vertex positions of a mesh, steps at which it is remeshed: `Remeshing`, its steps, or a table of its options
+        such as {"steps": [100], "method": "subdivide"}; None for never.
+        self_intersection: for the vertex positions of a mesh, treatment of self-intersections. "warn" checks occasionally and at the end,
+        and reports in one line. "prevent" checks every step and shortens steps that would cause one, which takes about 25 ms for 1000
+        triangles. "ignore" never checks.
+        keys: parameters of the scene that share this one value, or {key: factor} if each is a factor times it. Initial value, bounds,
+        learning rate and preconditioner apply to the shared value.
     """
 
     key: str = ""
@@ -75,12 +73,12 @@ class Parameter:
 
 @dataclass(frozen=True)
 class ParameterSettings:
-    """What a method decides for a parameter that has no setting of its own; None leaves the setting open.
+    """Settings that a method chooses for a parameter whose own are None.
 
     Attributes:
-        parameterisation: What the optimizer moves, or its name.
-        preconditioner: Map of gradients and steps.
-        coarse_to_fine: Resolutions over the steps.
+        parameterisation: parameterisation or its name; None for no choice.
+        preconditioner: linear map of gradients and steps; None for no choice.
+        coarse_to_fine: resolutions over the steps; None for no choice.
     """
 
     parameterisation: Parameterisation | str | None = None
@@ -89,8 +87,8 @@ class ParameterSettings:
 
 
 def ties_of(parameters: Sequence[Parameter]) -> tuple[Tie, ...]:
-    """Return the ties among some parameters, in their order. Raises `FieldError` for keys that cannot be one."""
-    found, names = [], [parameter.key for parameter in parameters]
+    """Return the ties among some parameters, in order. Raises `FieldError` for keys that cannot be tied."""
+    ties, names = [], [parameter.key for parameter in parameters]
     for index, parameter in enumerate(parameters):
         keys, place = parameter.keys, ("parameters", index, "keys")
         if keys is None:
@@ -99,18 +97,18 @@ def ties_of(parameters: Sequence[Parameter]) -> tuple[Tie, ...]:
             raise FieldError(place, f"expected a list of keys, or a table of factors by key, got {keys!r}")
         factors = dict(keys) if isinstance(keys, Mapping) else dict.fromkeys(keys, 1.0)
         if other := next((key for key in factors if key in names and key != parameter.key), None):
-            raise FieldError(place, f"{other} is an unknown of its own; leave it out of one of the two")
+            raise FieldError(place, f"{other} is an unknown of its own; remove it here or there")
         if len(factors) < len(keys):
             raise FieldError(place, "a key is given twice")
         try:
-            found.append(Tie(parameter.key, factors))
+            ties.append(Tie(parameter.key, factors))
         except InputError as error:
             raise FieldError(place, str(error)) from error
-    return tuple(found)
+    return tuple(ties)
 
 
 def tied(renderer: Renderer, parameters: Sequence[Parameter], ties: Sequence[Tie]) -> Renderer:
-    """Return the renderer with these ties, which are those of the parameters. Raises `FieldError` where members do not go together."""
+    """Return the renderer with the ties of these parameters. Raises `FieldError` for members that cannot share a value."""
     try:
         return with_ties(renderer, ties)
     except TieError as error:

@@ -1,4 +1,4 @@
-"""What is to be recovered, from which images, under which loss."""
+"""The inverse problem: what is recovered, from which images, under which loss."""
 
 from __future__ import annotations
 
@@ -56,42 +56,41 @@ __all__ = ["Bounds", "Problem", "open_scene"]
 class Problem(ViewLosses):
     """A scene, its unknown parameters, and the reference images.
 
-    Everything is checked and read at construction. A problem then does not change: its caches hold device copies of the references and
+    The constructor reads and checks everything. A problem does not change afterwards: its caches hold device copies of the references and
     masks, which are constant.
 
     Args:
         scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or a `protocols.Renderer`. A loaded
-            scene cannot be held twice, so methods that compare two states (control variates, meta-estimation) refuse it.
+            scene cannot be duplicated, so methods that compare two states (control variates, meta-estimation) refuse it.
         parameters: the unknowns, at least one, with different keys.
         views: the reference images, at least one.
-        loss: per pixel and channel; None is L2(). Or a function of an image (H, W, 3), or of an image and its reference, to a scalar, in
-            Dr.Jit or PyTorch: see `losses.FunctionLoss`. The total is the sum over views of weight * mean over pixels and
-            channels of mask * loss.
-        max_depth: longest light path in segments, >= 1 (1: emitters seen directly, 2: direct light); None for that of the scene's own
-            integrator: 64 where that has no limit, 6 where there is none.
-        truth: {key: value} of parameters whose true value is known, to measure the error; values as for
-            `Parameter.initial`.
-        name: for people; None takes the scene file's.
-        surfaces: {key: `evaluation.surfaces.Surface`} of vertex positions whose true surface is known,
-            but not where on it a vertex belongs.
+        loss: loss per pixel and channel; None is L2(). Or a function of an image (H, W, 3), or of an image and its reference, that
+            returns a scalar in Dr.Jit or PyTorch: see `losses.FunctionLoss`. The total is the sum over views of weight * mean over pixels
+            and channels of mask * loss.
+        max_depth: maximum path length in segments, >= 1 (1: directly visible emitters, 2: direct illumination). None takes the value of
+            the scene's integrator: 64 if that is unlimited, 6 if there is no integrator.
+        truth: {key: value} of parameters with a known true value, to measure the error; values as for `Parameter.initial`.
+        name: name for display; None takes the name of the scene file.
+        surfaces: {key: `scene.surfaces.Surface`} of vertex positions whose true surface is known, but not the true position of each
+            vertex.
 
     Attributes:
-        renderer: what renders the scene.
-        unknowns: {key: `Unknown`}: each parameter with its defaults filled in, in their order.
-        views: tuple of `View`, their reference a float32 array (H, W, 3), their mask (H, W) or None. Where all references
-            together take more than 512 MiB, they wait in a temporary file, and `np.asarray` reads one.
-        given_views: tuple of `View`, as given.
+        renderer: renderer of the scene.
+        unknowns: {key: `Unknown`}: the parameters with their defaults filled in, in order.
+        views: tuple of `View`, with the reference as a float32 array (H, W, 3), and the mask as (H, W) or None. If all references exceed
+            512 MiB, they are stored in a temporary file, and `np.asarray` reads one.
+        given_views: tuple of `View`, as passed.
         loss, max_depth, name: as above.
-        origin: where it came from, to make it again: {"scene": path of the XML}, with "file", the path of the problem file, where there is
-            one; {"gallery": name, "options": {...}}; empty where only the program that made it can make it again.
-        notices: one line for each setting of the scene that is not used, and for each change made to the input: conversions, values moved
-            into bounds.
+        origin: how to recreate the problem: {"scene": path of the XML}, plus "file", the path of the problem file, if there is one;
+            {"gallery": name, "options": {...}}; empty if only the program that made it can recreate it.
+        notices: one line for each ignored setting of the scene, and for each change of the input, such as a conversion or clamping to
+            bounds.
         references: values and weights of single pixels of the references.
-        executor: computes gradients, in this process unless the views are distributed.
-        remeshed_from: the problem with the meshes that it began with, where it has others now; else None.
+        executor: executor of gradient requests, in this process unless the views are distributed.
+        remeshed_from: the problem with its initial meshes, if this one has been remeshed; else None.
 
     Raises:
-        InputError: in one line, which field is wrong and what was expected.
+        InputError: one line that names the invalid field and the expected value.
     """
 
     renderer: Renderer
@@ -151,7 +150,7 @@ class Problem(ViewLosses):
 
     @classmethod
     def from_file(cls, path: str | Path) -> Problem:
-        """The problem that a TOML file describes. Raises `InputError` that names the line."""
+        """Return the problem of a TOML file. Raises `InputError` that names the line."""
         from unrender.scene.toml_file import read
 
         return read(path)
@@ -165,11 +164,10 @@ class Problem(ViewLosses):
         truth: Mapping[str, Any] | None = None,
         name: str | None = None,
     ) -> Problem:
-        """Another problem of the same scene, which is not loaded again; arguments as for `Problem`, None for what it has already.
+        """Return another problem of the same scene, which is not loaded again. Arguments as for `Problem`; None keeps the current value.
 
-        Of truths and true surfaces those stay whose parameters are still unknown. Of `origin` the scene's file stays.
-
-        Raises `InputError` as `Problem` does.
+        Truths and true surfaces stay for parameters that are still unknown. `origin` keeps only the scene's file. Raises `InputError` as
+        `Problem` does.
         """
         given = self.parameters if parameters is None else check_sequence(parameters, Parameter, "parameters")
         keys = {parameter.key for parameter in given if isinstance(parameter.key, str)}
@@ -183,8 +181,8 @@ class Problem(ViewLosses):
             name=name or self.name,
             surfaces={key: u.surface for key, u in self.unknowns.items() if u.surface is not None and key in keys},
         )
-        kept = {key: value for key, value in self.origin.items() if key == "scene" and self.remeshed_from is None}
-        return made.with_parts(origin=kept)
+        scene_file = {key: value for key, value in self.origin.items() if key == "scene" and self.remeshed_from is None}
+        return made.with_parts(origin=scene_file)
 
     def with_parts(
         self,
@@ -195,7 +193,7 @@ class Problem(ViewLosses):
         executor: Executor | None = None,
         remeshed_from: Problem | None = None,
     ) -> Problem:
-        """Return the same problem with other attributes, which are not checked; None for what it has already."""
+        """Return the same problem with other attributes, which are not checked; None keeps the current one."""
         parts = {"renderer": renderer, "unknowns": unknowns, "origin": origin, "executor": executor}
         changes = {name: part for name, part in {**parts, "remeshed_from": remeshed_from}.items() if part is not None}
         made = object.__new__(Problem)
@@ -203,7 +201,7 @@ class Problem(ViewLosses):
         return made
 
     def configured(self, settings: Mapping[str, ParameterSettings]) -> Problem:
-        """Return the same problem where parameters without a setting of their own take the one given here.
+        """Return the same problem, where parameters whose own setting is None take these settings.
 
         Raises `InputError` for a setting that does not suit its parameter.
         """
@@ -212,11 +210,11 @@ class Problem(ViewLosses):
         return self.with_parts(unknowns={**self.unknowns, **changed})
 
     def topology(self, key: str) -> MeshTopology | None:
-        """Of the mesh at whose vertices a parameter has values, (n V,); None for textures, grids and numbers."""
+        """Return the topology of the mesh whose vertices carry the parameter, (n V,); None for textures, grids and numbers."""
         return mesh_topology(self.renderer.parameters()[key])
 
     def texture_coordinates(self, key: str) -> np.ndarray | None:
-        """(V, 2) of a mesh whose vertex positions are the parameter `key`; None where it has none."""
+        """Return the texture coordinates (V, 2) of the mesh whose vertex positions are the parameter `key`; None if it has none."""
         return texture_coordinates(self.renderer, key, self.unknowns[key].initial.size)
 
     def __repr__(self) -> str:
@@ -227,12 +225,12 @@ class Problem(ViewLosses):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The parameters as given."""
+        """The parameters as passed to the constructor."""
         return tuple(unknown.given for unknown in self.unknowns.values())
 
     @cached_property
     def coordinates(self) -> Coordinates:
-        """What an optimizer moves, by parameterisations and preconditioners."""
+        """Coordinates that an optimizer updates, from parameterisations and preconditioners."""
         known = self.unknowns.items()
         return Coordinates(
             {key: u.transform for key, u in known if u.transform is not None},
@@ -247,32 +245,32 @@ class Problem(ViewLosses):
 
     @cached_property
     def learning_rates(self) -> dict[str, float]:
-        """{key: rate} of the parameters that have their own."""
+        """{key: learning rate} of the parameters that have their own."""
         return {key: u.learning_rate for key, u in self.unknowns.items() if u.learning_rate is not None}
 
     @cached_property
     def faces(self) -> dict[str, np.ndarray]:
-        """{key: (F, 3) numbers of vertices} of the parameters that are vertex positions of a mesh."""
+        """{key: vertex indices (F, 3)} of the parameters that are vertex positions of a mesh."""
         return {key: u.faces for key, u in self.unknowns.items() if u.faces is not None}
 
     @cached_property
     def coarse_to_fine(self) -> dict[str, CoarseToFine]:
-        """{key: resolutions over the steps} of the parameters that are coarse at first."""
+        """{key: resolutions over the steps} of the parameters with a coarse initial resolution."""
         return {key: u.coarse_to_fine for key, u in self.unknowns.items() if u.coarse_to_fine is not None}
 
     @property
     def truth(self) -> dict[str, np.ndarray]:
-        """{key: true value} of the parameters where it is known."""
+        """{key: true value} of the parameters whose true value is known."""
         return {key: u.truth for key, u in self.unknowns.items() if u.truth is not None}
 
     @property
     def has_truth(self) -> bool:
-        """Whether any parameter's true value, or surface, is known."""
+        """Whether the true value or surface of any parameter is known."""
         return any(u.truth is not None or u.surface is not None for u in self.unknowns.values())
 
     @property
     def pixels(self) -> int:
-        """Of all views together."""
+        """Number of pixels of all views."""
         return sum(height * width for height, width in self.sizes)
 
     @property
@@ -282,35 +280,35 @@ class Problem(ViewLosses):
         return [known[view.sensor] for view in self.views]
 
     def initial_values(self) -> dict[str, np.ndarray]:
-        """Where the parameters start, copied."""
+        """Return copies of the initial values at the scene's resolution."""
         return {key: np.array(unknown.initial) for key, unknown in self.unknowns.items()}
 
     def initial(self) -> Tree:
-        """The initial parameters: the renderer's arrays, inside the bounds, at the scene's own resolutions."""
+        """Return the initial parameters as arrays of the renderer, inside the bounds, at the scene's resolution."""
         return {key: self.renderer.array(unknown.initial) for key, unknown in self.unknowns.items()}
 
     def start(self, step: int = 0) -> Tree:
-        """`initial()` at the resolutions that parameters have at a step."""
+        """Return `initial()` at the resolutions of a step."""
         return {key: self.renderer.array(unknown.start(step)) for key, unknown in self.unknowns.items()}
 
     def shapes(self, step: int | None = None) -> dict[str, tuple[int, ...]]:
-        """Of each parameter at a step; None for the scene's own."""
+        """Return the shape of each parameter at a step; None for the scene's."""
         return {key: unknown.shape(step) for key, unknown in self.unknowns.items()}
 
     def full(self, parameters: Mapping[str, Array]) -> dict[str, np.ndarray]:
-        """The parameters as NumPy arrays, those that are still coarse interpolated at the scene's own resolution."""
+        """Return the parameters as NumPy arrays at the scene's resolution; coarser ones are interpolated."""
         return {key: self.unknowns[key].full(arrays.numpy(value)) for key, value in parameters.items()}
 
     def parameter_error(self, parameters: Mapping[str, Array]) -> dict[str, float]:
         """Return the error of each parameter whose truth is known, see `Unknown.error`. Waits for the device."""
         known = [key for key, u in self.unknowns.items() if u.truth is not None or u.surface is not None]
-        found = self.full({key: parameters[key] for key in known})
-        errors = {key: self.unknowns[key].error(values) for key, values in found.items()}
+        full = self.full({key: parameters[key] for key in known})
+        errors = {key: self.unknowns[key].error(values) for key, values in full.items()}
         return {key: error for key, error in errors.items() if error is not None}
 
 
 def _opened(scene: Any, max_depth: int | None, parameters: Sequence[Parameter], views: Sequence[View]) -> Renderer:
-    """Return the renderer of a scene, with unknowns that photographs have. Raises `FieldError`."""
+    """Return the renderer of a scene, including the parameters of photographs. Raises `FieldError`."""
     keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
     renderer = open_scene(scene, max_depth, parameters)
     sensors = [view.sensor for view in views if isinstance(view.sensor, int)]
@@ -324,24 +322,24 @@ def _opened(scene: Any, max_depth: int | None, parameters: Sequence[Parameter], 
 def _unknowns(
     parameters: Sequence[Parameter], renderer: Renderer, truth: Mapping[str, Any], surfaces: Mapping[str, Surface]
 ) -> dict[str, Unknown]:
-    """Return the unknowns with their truth. Raises `FieldError`."""
+    """Return the unknowns with their true values and surfaces. Raises `FieldError`."""
     known = renderer.parameters()
-    found: dict[str, Unknown] = {}
+    unknowns: dict[str, Unknown] = {}
     for index, parameter in enumerate(parameters):
-        if isinstance(parameter.key, str) and parameter.key in found:
+        if isinstance(parameter.key, str) and parameter.key in unknowns:
             raise FieldError(("parameters", index, "key"), f"{parameter.key} is given twice")
-        found[parameter.key] = check_parameter(index, parameter, known, renderer)
-    check_surfaces(surfaces, {key: u.faces for key, u in found.items() if u.faces is not None})
-    found |= {key: replace(found[key], surface=surface) for key, surface in surfaces.items()}
+        unknowns[parameter.key] = check_parameter(index, parameter, known, renderer)
+    check_surfaces(surfaces, {key: u.faces for key, u in unknowns.items() if u.faces is not None})
+    unknowns |= {key: replace(unknowns[key], surface=surface) for key, surface in surfaces.items()}
     for key, value in truth.items():
-        true, notice = check_truth(key, value, {each: known[each] for each in found})
-        notices = (*found[key].notices, *([f"parameter {key}: truth {notice}"] if notice else []))
-        found[key] = replace(found[key], truth=true, notices=notices)
-    return found
+        true, notice = check_truth(key, value, {each: known[each] for each in unknowns})
+        notices = (*unknowns[key].notices, *([f"parameter {key}: truth {notice}"] if notice else []))
+        unknowns[key] = replace(unknowns[key], truth=true, notices=notices)
+    return unknowns
 
 
 def open_scene(scene: Any, max_depth: int | None, parameters: Sequence[Parameter]) -> Renderer:
-    """Return the renderer of a scene in which the ties of these parameters are unknowns. Raises `FieldError`."""
+    """Return the renderer of a scene with the ties of these parameters. Raises `FieldError`."""
     ties = ties_of(parameters)
     keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
     members = [member for tie in ties for member in tie.factors]

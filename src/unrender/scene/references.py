@@ -1,4 +1,4 @@
-"""Values and weights of single pixels of the references of all views."""
+"""Values and loss weights of single pixels of the references of all views."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from unrender.io.stored_pictures import StoredPicture
 from unrender.scene.view import View
 
 ON_DEVICE = 1 << 29
-"""Bytes of references up to which they are copied to the device; larger sets stay in host memory."""
+"""Maximum size in bytes of references that are copied to the device; larger sets stay in host memory."""
 
 
 class References:
-    """Values and weights of single pixels of the references.
+    """Values and loss weights of single pixels of the references.
 
-    Small sets are copied to the renderer's device once. Of large ones only the requested pixels are, from host memory, or from
-    the file where pictures wait (`StoredPicture`).
+    Small sets are copied to the renderer's device once. From large sets only the requested pixels are copied, from host memory or from
+    the file of a `StoredPicture`.
 
     Args:
-        views: with references (H, W, 3), masks (H, W) or None.
-        array: makes the renderer's arrays.
-        on_device: bytes up to which the references are copied to the device.
+        views: views with references (H, W, 3) and masks (H, W) or None.
+        array: function that makes arrays of the renderer.
+        on_device: maximum size in bytes of references that are copied to the device.
     """
 
     def __init__(self, views: Sequence[View], array: Callable[[np.ndarray], Array], on_device: int = ON_DEVICE):
@@ -38,15 +38,15 @@ class References:
 
     @cached_property
     def sensors(self) -> Array:
-        """The sensor of each view, integers."""
+        """Sensor index of each view, integers."""
         return arrays.like_integers(np.array([view.sensor for view in self._views]), self._array(np.zeros(1)))
 
     def at(self, views: Array, pixels: Array) -> tuple[Array, Array]:
-        """Reference values (N, 3) of these pixels, and their factors of the loss (N, 1): weight * mask / (H * W * 3).
+        """Return the reference values (N, 3) of these pixels, and the factors of their losses (N, 1): weight * mask / (H * W * 3).
 
         Args:
             views: index of each pixel's view, (N,).
-            pixels: row-major index within its film, (N,).
+            pixels: row-major index in its film, (N,).
         """
         if self.in_host_memory:
             return self._from_host(arrays.numpy(views), arrays.numpy(pixels))
@@ -57,7 +57,7 @@ class References:
         return arrays.gather_rows(self._all_references, row), factors
 
     def rows(self, views: Array, pixels: Array) -> Array:
-        """The index of these pixels in the concatenation of all views, (N,)."""
+        """Return the index of these pixels in the concatenation of all views, (N,)."""
         return arrays.gather(self._starts, views) + pixels
 
     def _from_host(self, views: np.ndarray, pixels: np.ndarray) -> tuple[Array, Array]:
@@ -93,12 +93,12 @@ class References:
 
 
 def _size(picture: Any) -> int:
-    """Of its values; a stored one is not read for it."""
+    """Return the number of values. A stored image is not read."""
     return picture.size if isinstance(picture, StoredPicture) else np.asarray(picture).size
 
 
 def _rows(picture: Any, pixels: np.ndarray, channels: int) -> np.ndarray:
-    """The values of these pixels, (N, C)."""
+    """Return the values of these pixels, (N, C)."""
     if isinstance(picture, StoredPicture):
         return picture.rows(pixels)
     return np.asarray(picture).reshape(-1, channels)[pixels]

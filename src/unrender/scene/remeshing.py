@@ -1,4 +1,4 @@
-"""Meshes that get other triangles while a descent goes on: even ones, or each cut into four."""
+"""Remeshing during an optimisation: triangles of even size, or subdivision."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _MOST_FACES = 1 << 21
 
 @dataclass(frozen=True)
 class Remeshing:
-    """When a mesh whose vertex positions are unknown gets other triangles, and which.
+    """Steps at which a mesh with unknown vertex positions is remeshed, and the method.
 
     "isotropic" makes triangles of even size on the same surface (Botsch and Kobbelt 2004, "A Remeshing Approach to Multiresolution
-    Modeling"), by gpytoolbox; the mesh must be a manifold, with or without borders, and have no texture coordinates, which new vertices
-    would not have. "subdivide" cuts each triangle into four of the same plane; texture coordinates and seams are kept, and any mesh
-    will do.
+    Modeling"), by gpytoolbox. The mesh must be a manifold, with or without borders, and have no texture coordinates, because new vertices
+    would have none. "subdivide" divides each triangle into four in the same plane. It accepts any mesh and preserves texture coordinates
+    and seams.
 
-    What the optimizer remembers of the vertices begins anew at the step, its schedule and what it remembers of other parameters go on; the
-    estimator begins anew.
+    The optimizer's state of the vertices restarts at the step; its schedule and its state of other parameters continue. The estimator
+    restarts.
 
     Args:
-        steps: before which of the run's steps, counted from 0: ascending, each at least 1.
-        method: see above.
-        edge: "isotropic": length of an edge, as a share of the present mean, > 0. 0.5 makes about four times as many triangles.
+        steps: steps of the run at which the mesh is remeshed, counted from 0: ascending, each at least 1.
+        method: "isotropic" or "subdivide".
+        edge: for "isotropic", edge length relative to the current mean, > 0. 0.5 makes about four times as many triangles.
     """
 
     steps: tuple[int, ...]
@@ -46,18 +46,18 @@ class Remeshing:
         checks.number("Remeshing", "edge", self.edge, above=0.0)
 
     def check(self, positions: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> None:
-        """Raise `InputError` for a mesh that it does not suit: positions (V, 3), faces (F, 3), texture coordinates (V, 2) or None."""
+        """Raise `InputError` for an unsuitable mesh: positions (V, 3), faces (F, 3), texture coordinates (V, 2) or None."""
         if self.method == "subdivide":
             return
         if uv is not None:
             raise InputError(
-                'its mesh has texture coordinates, which isotropic remeshing cannot carry over: method = "subdivide" keeps them'
+                'its mesh has texture coordinates, which isotropic remeshing cannot preserve; use method = "subdivide"'
             )
         shared, count = _edges(_joined(positions, faces)[1])
         if (count > 2).any():
             raise InputError(
-                f'its mesh is no manifold: {int((count > 2).sum())} of {len(shared)} edges have more than two faces: method = "subdivide" '
-                "takes any"
+                f"its mesh is not a manifold: {int((count > 2).sum())} of {len(shared)} edges have more than two faces; "
+                'use method = "subdivide"'
             )
         try:
             import gpytoolbox  # noqa: F401  # pyright: ignore[reportMissingImports]
@@ -67,7 +67,7 @@ class Remeshing:
             ) from error
 
     def apply(self, positions: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> ReplacedMesh:
-        """The new mesh. Raises `InputError` where it would have more than two million faces, or nothing is left of it."""
+        """Return the new mesh. Raises `InputError` if it would have more than two million faces, or none."""
         if self.method == "subdivide":
             _check_size(4 * len(faces))
             return _subdivided(positions, faces, uv)
@@ -81,13 +81,13 @@ class Remeshing:
         vertices, made = remesh_botsch(points.astype(np.float64), joined.astype(np.int32), _ITERATIONS, length, True)
         if not len(made) or not np.isfinite(vertices).all():
             raise InputError(
-                f"isotropic remeshing left nothing of a mesh of {len(faces)} faces: a smaller edge keeps more"
+                f"isotropic remeshing removed every face of a mesh of {len(faces)} faces; use a smaller edge"
             )
         return ReplacedMesh(np.asarray(vertices, np.float64), np.asarray(made, np.int64))
 
 
 def of(given: Any) -> Remeshing:
-    """What a parameter was given: one, its steps alone, or a table of its options. Raises `InputError`."""
+    """Return the remeshing of a parameter from an instance, a list of steps or a table of options. Raises `InputError`."""
     if isinstance(given, Remeshing):
         return given
     if not isinstance(given, (Mapping, Sequence)) or isinstance(given, str):
@@ -103,23 +103,23 @@ def _check_size(faces: int) -> None:
 
 
 def _joined(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (P, 3) and faces of these, those without area in number left out: vertices at the same place are one."""
+    """Merge vertices at the same position and drop degenerate faces; returns positions (P, 3) and faces."""
     points, places = np.unique(positions, axis=0, return_inverse=True)
     joined = places.reshape(-1)[faces]
-    whole = (joined[:, 0] != joined[:, 1]) & (joined[:, 1] != joined[:, 2]) & (joined[:, 2] != joined[:, 0])
-    joined = joined[whole]
+    nondegenerate = (joined[:, 0] != joined[:, 1]) & (joined[:, 1] != joined[:, 2]) & (joined[:, 2] != joined[:, 0])
+    joined = joined[nondegenerate]
     used, numbers = np.unique(joined, return_inverse=True)
     return points[used], numbers.reshape(joined.shape)
 
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of vertices that an edge joins (E, 2), and how many faces each has."""
+    """Return the edges as pairs of vertices (E, 2), and the number of faces of each."""
     sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     return np.unique(sides, axis=0, return_counts=True)
 
 
 def _subdivided(positions: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> ReplacedMesh:
-    """Each triangle cut into four at the middles of its edges; the old vertices come first."""
+    """Divide each triangle into four at the midpoints of its edges; the old vertices come first."""
     sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     edges, which = np.unique(sides, axis=0, return_inverse=True)
     ab, bc, ca = which.reshape(3, -1) + len(positions)

@@ -1,4 +1,4 @@
-"""Images of a problem's views as NumPy arrays, for display, reports and comparison."""
+"""Rendering of a problem's views to NumPy arrays, for display, reports and comparison."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from unrender.rendering.renderer import SampleRequest
 from unrender.scene.problem import Problem
 
 _PATHS_PER_PASS = 1 << 21
-"""Paths per pass, within the memory of a small machine."""
+"""Maximum number of paths per pass, within the memory of a small machine."""
 _MANY_SENSORS = 4
-"""From so many on, all views share one kernel: recording one for each would take longer than rendering."""
+"""Number of sensors from which all views share one kernel: recording one per sensor would take longer than rendering."""
 
 
 @exclusive("render")
@@ -31,12 +31,11 @@ def render(
     """Render one view, in as many passes as memory requires. Unbiased, with the film's reconstruction filter.
 
     Args:
-        problem: whose scene.
-        parameters: {key: array} of all the problem's parameters, also at one of the coarser resolutions that they have in the course of
-            a descent; None for the initial ones.
+        problem: problem that contains the scene.
+        parameters: {key: array} of all parameters of the problem, possibly at a coarser resolution of the run; None for the initial ones.
         view: index of the view.
         spp: samples per pixel, >= 1.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
 
     Returns:
         float32 (H, W, 3), linear RGB.
@@ -60,8 +59,10 @@ def render(
 
 
 def view_request(problem: Problem, view: int, spp: int, seed: int) -> SampleRequest:
-    """The request for a view: of its sensor or, where there are many, of all pixels of its film, each with the sensor's index. Images are
-    then (groups, H * W, 3), and all views of one size share their kernels.
+    """Return the request for a view.
+
+    It is for the view's sensor. With many sensors it is for all pixels of the film instead, each with the sensor's index. Images are then
+    (groups, H * W, 3), and all views of one size share their kernels.
     """
     sensor, sensors = problem.views[view].sensor, {other.sensor for other in problem.views}
     known = problem.renderer.parameters()
@@ -69,8 +70,8 @@ def view_request(problem: Problem, view: int, spp: int, seed: int) -> SampleRequ
         return SampleRequest(sensor, spp, seed)
     height, width = problem.renderer.resolutions()[sensor]
     like = problem.renderer.array(np.zeros(1))
-    of_pixels = arrays.like_integers(np.full(height * width, sensor), like)
-    return SampleRequest(min(sensors), spp, seed, 1, arrays.arange(like, height * width), of_pixels)
+    sensor_of_pixel = arrays.like_integers(np.full(height * width, sensor), like)
+    return SampleRequest(min(sensors), spp, seed, 1, arrays.arange(like, height * width), sensor_of_pixel)
 
 
 @exclusive("render_pair")
@@ -81,16 +82,16 @@ def render_pair(
     spp: int,
     seed: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both images of view 0, on one set of paths traced in the current state. Each unbiased.
+    """Render view 0 in two states with the same paths, which are traced in the current state. Both images are unbiased.
 
     Args:
-        problem: whose scene; its parameters must share paths (`ParameterInfo.shares_paths`).
-        current, previous: {key: array} of all the problem's parameters.
+        problem: problem that contains the scene; its parameters must share paths (`ParameterInfo.shares_paths`).
+        current, previous: {key: array} of all parameters of the problem.
         spp: samples per pixel, >= 1.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
 
     Returns:
-        float32 (H, W, 3) of the current state, and of the previous one.
+        float32 (H, W, 3) of the current state, and the same of the previous state.
     """
     points = as_tree(problem, current), as_tree(problem, previous)
     session = problem.renderer.prepare(list(points[0]), "path")
@@ -98,12 +99,12 @@ def render_pair(
     rendering = session.image_pair(*points, request, "path")
     current_image, previous_image = rendering.images, rendering.previous
     if previous_image is None:
-        raise UnrenderError("render_pair: the renderer returned one image of the two")
+        raise UnrenderError("render_pair: the renderer returned only one of two images")
     return arrays.numpy(current_image[0]), arrays.numpy(previous_image[0])
 
 
 def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tree:
-    """`parameters` as the renderer's arrays; None for the initial ones. Raises `InputError` where keys or shapes differ."""
+    """Return `parameters` as arrays of the renderer; None for the initial ones. Raises `InputError` if keys or shapes differ."""
     point = problem.initial()
     if parameters is None:
         return point

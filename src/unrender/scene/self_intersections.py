@@ -1,25 +1,25 @@
-"""Where a surface of triangles passes through itself."""
+"""Detection of self-intersections of a triangle mesh."""
 
 from __future__ import annotations
 
 import numpy as np
 
 _CELLS_PER_TRIANGLE = 8
-"""At most, on average: cells are made larger until that is so."""
+"""Maximum average number of grid cells per triangle: cells grow until it holds."""
 
 
 def crossing_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Pairs of triangles of which an edge of one passes through the inside of the other.
+    """Return pairs of triangles where an edge of one passes through the interior of the other.
 
-    Triangles that merely touch do not count, nor do two that lie in one plane, nor those that share an edge (which can only
-    fold: `surfaces.folds`). Triangles that share one vertex count where the side opposite to it passes through the other.
+    Excluded are triangles that only touch, that lie in one plane, or that share an edge (these can only fold: `surfaces.folds`).
+    Triangles that share one vertex count if the opposite edge passes through the other triangle.
 
     Args:
         vertices: (V, 3).
-        faces: (F, 3), numbers of places: vertices cut along seams must be one, or their triangles count as apart.
+        faces: (F, 3), position indices: vertices split along seams must be merged, or their triangles count as unconnected.
 
     Returns:
-        Numbers of faces, (N, 2), the lower one first, in order.
+        Face indices, (N, 2), the lower one first, sorted.
     """
     if len(faces) < 2:
         return np.zeros((0, 2), int)
@@ -40,7 +40,7 @@ def crossing_triangles(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _passes(p: np.ndarray, q: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Whether segments from p to q (N, 3) pass through the insides of triangles (N, 3, 3): by the signs of volumes."""
+    """Return whether segments from p to q (N, 3) pass through the interiors of triangles (N, 3, 3), by the signs of volumes."""
     a, b, c = triangles.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     before, after = np.sum((p - a) * normal, axis=1), np.sum((q - a) * normal, axis=1)
@@ -53,7 +53,7 @@ def _passes(p: np.ndarray, q: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def _near(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Pairs (N, 2) of boxes that overlap, by a uniform grid; the lower number first, in order."""
+    """Return pairs (N, 2) of overlapping boxes by a uniform grid, the lower index first, sorted."""
     count, origin = len(low), low.min(axis=0)
     size = max(2.0 * float(np.median((high - low).max(axis=1))), 1e-30)
     while True:
@@ -64,20 +64,20 @@ def _near(low: np.ndarray, high: np.ndarray) -> np.ndarray:
             break
         size *= 2.0
     owner = np.repeat(np.arange(count), cells)
-    within = np.arange(len(owner)) - np.repeat(np.cumsum(cells) - cells, cells)
+    offset = np.arange(len(owner)) - np.repeat(np.cumsum(cells) - cells, cells)
     span = spans[owner]
-    place = np.stack([within % span[:, 0], within // span[:, 0] % span[:, 1], within // (span[:, 0] * span[:, 1])], -1)
+    place = np.stack([offset % span[:, 0], offset // span[:, 0] % span[:, 1], offset // (span[:, 0] * span[:, 1])], -1)
     place += first[owner]
     extent = last.max(axis=0) + 1
     cell = (place[:, 2] * extent[1] + place[:, 1]) * extent[0] + place[:, 0]
     order = np.argsort(cell, kind="stable")
     cell, owner = cell[order], owner[order]
-    found = []
+    overlapping = []
     for step in range(1, count):
         same = np.flatnonzero(cell[step:] == cell[:-step])
         if not len(same):
             break
         one, two = owner[same], owner[same + step]
         overlap = ((low[one] <= high[two]) & (low[two] <= high[one])).all(axis=1)
-        found.append(np.stack([one, two], -1)[overlap])
-    return np.unique(np.concatenate(found), axis=0) if found else np.zeros((0, 2), int)
+        overlapping.append(np.stack([one, two], -1)[overlap])
+    return np.unique(np.concatenate(overlapping), axis=0) if overlapping else np.zeros((0, 2), int)

@@ -1,7 +1,7 @@
-"""A problem as a run folder stores it: problem.toml and arrays beside it, from which it can be made again.
+"""A problem as stored in a run folder: problem.toml with arrays in files, from which it can be recreated.
 
-A problem whose scene is XML becomes a problem file with absolute paths and its arrays in the folder `problem`. One of the gallery
-becomes its name and options. Others, made in Python, are described as far as TOML can.
+A problem with an XML scene becomes a problem file with absolute paths and its arrays in the folder `problem`. A gallery problem becomes
+its name and options. Other problems, made in Python, are described as far as TOML permits.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ __all__ = ["ARRAYS", "FILE", "origin", "save"]
 
 FILE, ARRAYS = "problem.toml", "problem"
 _INLINE = 64
-"""The most elements of an array that is written into the file itself."""
+"""Maximum number of elements of an array that is written into the file itself."""
 
 
 def save(problem: Problem, folder: Path) -> None:
-    """Write problem.toml and what it needs beside it. Raises `InputError` where they cannot be written."""
+    """Write problem.toml and its arrays. Raises `InputError` if they cannot be written."""
     if "gallery" in problem.origin:
         options = {key: _option(value) for key, value in problem.origin["options"].items()}
         document, note = {"gallery": problem.origin["gallery"], "options": options}, "The problem, of the gallery"
@@ -43,7 +43,7 @@ def save(problem: Problem, folder: Path) -> None:
 
 
 def origin(problem: Problem) -> dict[str, Any]:
-    """`Problem.origin` in JSON's types."""
+    """Return `Problem.origin` in types of JSON."""
     options = problem.origin.get("options")
     return dict(problem.origin) | ({} if options is None else {"options": {k: _option(v) for k, v in options.items()}})
 
@@ -92,12 +92,12 @@ def _parameter(index: int, unknown: Unknown, store: _Arrays) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class _Arrays:
-    """The folder of arrays that are too long for the file; None where they are not stored."""
+    """Folder of arrays that are too long for the file; None to omit them."""
 
     folder: Path | None
 
     def field(self, name: str, value: Any, file: str, inline: bool = True) -> dict[str, Any]:
-        """{name: the entry for `value`}; empty where it is not stored."""
+        """Return {name: entry for `value`}; empty if the value is omitted."""
         if isinstance(value, (str, Path)):
             return {name: str(Path(value).resolve())}
         array = np.asarray(value)
@@ -116,7 +116,7 @@ def _option(value: Any) -> Any:
 
 
 def _component(value: Any) -> Any:
-    """The table of a loss, a preconditioner or a parameterisation; of an unregistered one its `repr`, which no reader accepts."""
+    """Return the table of a loss, preconditioner or parameterisation; for an unregistered one its `repr`, which no reader accepts."""
     if isinstance(value, Mapping):
         return dict(value)
     try:

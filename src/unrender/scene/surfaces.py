@@ -1,4 +1,4 @@
-"""How far two triangle meshes are from one another as surfaces, whatever their vertices are; and where a mesh folds over."""
+"""Distance between two triangle meshes as surfaces, independent of their vertices; and detection of folds."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from unrender.core.errors import InputError
 __all__ = ["Surface", "area_normals", "folds", "surface_error"]
 
 _SAMPLES = 2000
-"""Points on each surface."""
+"""Number of sample points on each surface."""
 _NEAR = 8
-"""Candidates for the nearest triangle."""
+"""Number of candidates for the nearest triangle."""
 _SHARP = -0.5
-"""Cosine of the angle between the normals of two faces that share an edge, below which the surface folds over there."""
+"""Cosine of the angle between the normals of two adjacent faces below which the surface folds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +26,10 @@ class Surface:
 
     Attributes:
         vertices: (V, 3), finite.
-        faces: (F, 3), numbers of vertices, at least one face of some area.
+        faces: (F, 3), vertex indices; at least one face has positive area.
 
     Raises:
-        InputError: shapes, numbers or values do not suit.
+        InputError: invalid shapes, indices or values.
     """
 
     vertices: np.ndarray
@@ -39,9 +39,9 @@ class Surface:
         vertices, faces = np.asarray(self.vertices, np.float64), np.asarray(self.faces)
         if vertices.ndim != 2 or vertices.shape[1:] != (3,) or not np.isfinite(vertices).all():
             raise InputError(f"surface: expected finite vertices of shape (V, 3), got shape {vertices.shape}")
-        whole = np.issubdtype(faces.dtype, np.integer) or (faces.size and np.array_equal(faces, np.round(faces)))
-        if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or not whole:
-            raise InputError(f"surface: expected whole numbers of vertices of shape (F, 3), got shape {faces.shape}")
+        integral = np.issubdtype(faces.dtype, np.integer) or (faces.size and np.array_equal(faces, np.round(faces)))
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or not integral:
+            raise InputError(f"surface: expected vertex indices (integers) of shape (F, 3), got shape {faces.shape}")
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise InputError(f"surface: a face names vertex {int(faces.max())} of {len(vertices)}")
         object.__setattr__(self, "vertices", vertices)
@@ -55,54 +55,59 @@ class Surface:
 
     @cached_property
     def _samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points, even by area, and the faces that they lie on; the same at each call."""
+        """Sample points uniform by area, and the index of each one's face; the same at each call."""
         generator = np.random.default_rng(0)
         up_to = np.cumsum(self._areas)
         at = (np.arange(_SAMPLES) + generator.uniform(size=_SAMPLES)) / _SAMPLES * up_to[-1]
-        of = np.minimum(np.searchsorted(up_to, at, side="right"), len(self.faces) - 1)
+        face = np.minimum(np.searchsorted(up_to, at, side="right"), len(self.faces) - 1)
         root, second = np.sqrt(generator.uniform(size=_SAMPLES)), generator.uniform(size=_SAMPLES)
         weights = np.stack([1 - root, root * (1 - second), root * second], -1)
-        points = np.einsum("ni,nij->nj", weights, self.vertices[self.faces[of]])
-        return points, of
+        points = np.einsum("ni,nij->nj", weights, self.vertices[self.faces[face]])
+        return points, face
 
     @cached_property
     def _tree(self) -> tuple[Any, np.ndarray]:
-        """Of the points and of the middles of all faces, and which face each belongs to."""
+        """Search tree of the sample points and the centroids of all faces, and the face index of each."""
         from scipy.spatial import KDTree
 
-        points, of = self._samples
+        points, face = self._samples
         middles = self.vertices[self.faces].mean(axis=1)
-        return KDTree(np.concatenate([points, middles])), np.concatenate([of, np.arange(len(self.faces))])
+        return KDTree(np.concatenate([points, middles])), np.concatenate([face, np.arange(len(self.faces))])
 
     def distances_from(self, other: Surface) -> np.ndarray:
-        """Of points on another surface, even by area, to this one: (N,), exact to the triangles of this one's points that are nearest,
-        hence never too small."""
-        points, (tree, of) = other._samples[0], self._tree
-        near = of[tree.query(points, k=_NEAR)[1]]
+        """Return distances (N,) from points uniform by area on another surface to this one.
+
+        Distances are exact for the triangles of the nearest sample points and centroids, hence never too small.
+        """
+        points, (tree, face) = other._samples[0], self._tree
+        near = face[tree.query(points, k=_NEAR)[1]]
         many = np.repeat(points, _NEAR, axis=0)
-        found = np.linalg.norm(many - _nearest(many, self.vertices[self.faces[near.ravel()]]), axis=1)
-        return found.reshape(-1, _NEAR).min(axis=1)
+        distances = np.linalg.norm(many - _nearest(many, self.vertices[self.faces[near.ravel()]]), axis=1)
+        return distances.reshape(-1, _NEAR).min(axis=1)
 
 
 def surface_error(one: Surface, other: Surface) -> float:
-    """Root mean square distance between two surfaces, in units of the scene: of points of each, even by area, to the other one (the root
-    of the symmetric Chamfer distance of squares, halved). 0 for the same surface, whatever its triangles are."""
+    """Return the root mean square distance between two surfaces, in units of the scene.
+
+    It is the distance of points uniform by area on each surface to the other: the root of half the symmetric squared Chamfer distance. 0
+    for equal surfaces with different triangles.
+    """
     squares = [np.mean(np.square(a.distances_from(b))) for a, b in ((one, other), (other, one))]
     return float(np.sqrt(np.mean(squares)))
 
 
 def area_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Of each face, (F, 3): its normal times twice its area; 0 where it has none."""
+    """Return the normal of each face times twice its area, (F, 3); 0 for a degenerate face."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return np.cross(b - a, c - a)
 
 
 def folds(vertices: np.ndarray, faces: np.ndarray) -> int:
-    """How many edges between two faces have these turned by more than 120 degrees against each other.
+    """Return the number of edges whose two faces are rotated by more than 120 degrees relative to each other.
 
     Args:
         vertices: (V, 3).
-        faces: (F, 3), numbers of places: vertices cut along seams count as one, or their edges as borders.
+        faces: (F, 3), position indices: vertices split along seams must be merged, or their edges count as borders.
     """
     normals = area_normals(vertices, faces)
     length = np.linalg.norm(normals, axis=1)
@@ -118,7 +123,7 @@ def folds(vertices: np.ndarray, faces: np.ndarray) -> int:
 
 
 def _nearest(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The point of each triangle (N, 3, 3) that is nearest to a point (N, 3): inside where its projection is, else on an edge."""
+    """Return the point of each triangle (N, 3, 3) nearest to a point (N, 3): its projection if inside, else the nearest edge point."""
     a, b, c = triangles.transpose(1, 0, 2)
     best = np.full(points.shape, np.inf)
     least = np.full(len(points), np.inf)

@@ -2,18 +2,19 @@
 
     name = "wall"
     scene = "room.xml"
-    max_depth = 6                              # left out: that of the scene's integrator
-    loss = "L1"                                # or { type = "Huber", delta = 0.1 }, { type = "Perceptual", weights = "vgg16.safetensors" }
+    max_depth = 6                              # default: that of the scene's integrator
+    loss = "L1"                                # or { type = "Huber", delta = 0.1 }, { type = "Perceptual", weights = "vgg16.safetensors"
+    }
 
     [[parameters]]
-    key = "wall.bsdf.reflectance.data"         # or keys = [...], several parameters of one value, or { "a" = 1, "b" = 0.5 }, of factors
-    initial = 0.5                              # a number, a colour [r, g, b], a picture, a grid (.vol), a mesh, an array (.npy)
-    bounds = [0.0, 1.0]                        # inf and -inf are open
+    key = "wall.bsdf.reflectance.data"         # or keys = [...] for parameters that share one value; { "a" = 1, "b" = 0.5 } for factors
+    initial = 0.5                              # a number, a colour [r, g, b], an image, a grid (.vol), a mesh, an array (.npy)
+    bounds = [0.0, 1.0]                        # inf and -inf are unbounded
     learning_rate = 0.01
     preconditioner = { type = "LargeSteps", strength = 10.0 }
-    coarse_to_fine = [200, 400]                # steps before which the resolution doubles, see CoarseToFine
-    parameterisation = "logit"                 # what the optimizer moves: identity, log, logit, softplus
-    truth = "wall.exr"                         # where it is known, to measure the error
+    coarse_to_fine = [200, 400]                # steps at which the resolution doubles, see CoarseToFine
+    parameterisation = "logit"                 # variable of the optimizer: identity, log, logit, softplus
+    truth = "wall.exr"                         # true value, if known, to measure the error
 
     [[views]]
     reference = "photo.exr"
@@ -49,15 +50,15 @@ _Number = StrictFloat | StrictInt
 class _Parameter(Table):
     key: StrictStr = Field(
         "",
-        description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"; beside keys, a name of your own',
+        description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"; with keys, any name',
     )
     keys: list[StrictStr] | dict[str, _Number] | None = Field(
-        None, description='several scene parameters of one value, such as ["a.value", "b.value"], or factors by key'
+        None, description='scene parameters that share one value, such as ["a.value", "b.value"], or factors by key'
     )
     initial: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, mesh, .npy or .npz file"
     )
-    bounds: tuple[_Number, _Number] | None = Field(None, description="two numbers [low, high] (inf is open)")
+    bounds: tuple[_Number, _Number] | None = Field(None, description="two numbers [low, high] (inf is unbounded)")
     learning_rate: _Number | None = Field(None, description="a number above 0")
     preconditioner: StrictStr | dict[str, Any] | None = Field(
         None, description='a table such as { type = "LargeSteps", strength = 10.0 }'
@@ -71,17 +72,17 @@ class _Parameter(Table):
         description='"identity", "log", "logit", "softplus" or, with a scale, "softplus(0.1)"',
     )
     regularizer: dict[str, Any] | None = Field(
-        None, description="of vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"
+        None, description="for vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"
     )
     prior: dict[str, Any] | None = Field(
         None, description="a table such as { smoothness = 0.05 } or { near = [0.5, 0.5, 0.5], std = 0.1 }"
     )
     remeshing: list[StrictInt] | dict[str, Any] | None = Field(
         None,
-        description='of vertex positions, a list of steps such as [100], or a table such as { steps = [100], method = "subdivide" }',
+        description='for vertex positions, a list of steps such as [100], or a table such as { steps = [100], method = "subdivide" }',
     )
     self_intersection: Literal["warn", "prevent", "ignore"] = Field(
-        "warn", description='of vertex positions, "warn", "prevent" or "ignore"'
+        "warn", description='for vertex positions, "warn", "prevent" or "ignore"'
     )
     truth: _Number | StrictStr | list[Any] | None = Field(
         None, description="a number, a colour [r, g, b], or the path of a picture, .vol, mesh, .npy or .npz file"
@@ -107,10 +108,10 @@ class _Problem(Table):
 
 
 def read(path: str | Path) -> Problem:
-    """The problem that a TOML file describes.
+    """Return the problem of a TOML file.
 
     Raises:
-        InputError: "problem.toml:12: parameters[0].bounds: ...": the file, the line, the field, what was expected.
+        InputError: "problem.toml:12: parameters[0].bounds: ...": file, line, field and the expected value.
     """
     file = Path(path)
     model, text = toml_models.read(file, _Problem, {"parameters": _Parameter, "views": _View})
@@ -120,7 +121,7 @@ def read(path: str | Path) -> Problem:
         return problem.with_parts(origin={**problem.origin, "file": str(file.resolve())})
     except FieldError as error:
         place = error.place
-        if place[0] == "truth":  # in a file it stands with the parameter
+        if place[0] == "truth":  # a file lists it with the parameter
             keys = [parameter.key or next(iter(parameter.keys or [""])) for parameter in model.parameters]
             place = ("parameters", keys.index(str(place[1])), "truth")
         raise toml_models.error_at(file, text, place, error.what) from error
@@ -159,16 +160,16 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
             preconditioner = tables.component(model.preconditioner, "preconditioner", folder=folder)
         except InputError as error:
             raise FieldError(("parameters", index, "preconditioner"), str(error)) from error
-    way = None
+    resolutions = None
     if model.coarse_to_fine is not None:
         try:
-            way = coarse_to_fine.of(model.coarse_to_fine)
+            resolutions = coarse_to_fine.of(model.coarse_to_fine)
         except InputError as error:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
     given = {"parameterisation": model.parameterisation, "regularizer": model.regularizer, "remeshing": model.remeshing}
     given |= {"prior": model.prior, "self_intersection": model.self_intersection, "keys": model.keys}
-    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, way, **given)
+    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, resolutions, **given)
 
 
 def _value(value: Any, folder: Path) -> Any:

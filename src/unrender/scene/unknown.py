@@ -1,4 +1,4 @@
-"""One unknown of a problem: a parameter with its defaults filled in, and what the scene says of it."""
+"""An unknown of a problem: a parameter with its defaults filled in and properties from the scene."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from unrender.scene.surfaces import Surface, surface_error
 
 @dataclass(frozen=True, eq=False)
 class Unknown:
-    """One unknown of a problem.
+    """An unknown of a problem.
 
     Attributes:
-        given: The parameter as its author gave it, with what a method has added.
-        initial: Where it starts: float32, inside the bounds, of the scene's shape. Read-only: may be the scene's own memory.
-        bounds: (low, high), the parameter's own or the physical range that the renderer knows; None is open.
-        measure: How errors against the truth are measured.
-        learning_rate: Its own; None for the optimizer's.
-        preconditioner: S, bound to its mesh where it has one; None for the identity.
-        parameterisation: As given; None for none.
-        transform: φ of that; None for the identity.
+        given: The parameter as passed, with the settings of a method.
+        initial: Initial value: float32, inside the bounds, of the scene's shape. Read-only, because it may be the scene's own memory.
+        bounds: (low, high), the parameter's or the physical range from the renderer; None is unbounded.
+        measure: Measure of errors against the true value.
+        learning_rate: Learning rate of the parameter; None for the optimizer's.
+        preconditioner: S, bound to the mesh if there is one; None for the identity.
+        parameterisation: Parameterisation as passed; None for none.
+        transform: φ of the parameterisation; None for the identity.
         coarse_to_fine: Resolutions over the steps; None for one resolution.
-        faces: (F, 3) numbers of vertices, where it is the vertex positions of a mesh; else None.
-        regularizer: Bound to the mesh; None for none.
-        prior: Bound to the unknown; None for none.
-        remeshing: When the mesh gets other triangles; None for never.
-        truth: True value, of the shape of `initial`; None where it is not known.
-        surface: True surface of a mesh, where it is not known which point of it a vertex belongs to; else None.
-        notices: One line for each change made to the input.
+        faces: Vertex indices (F, 3), if the parameter is the vertex positions of a mesh; else None.
+        regularizer: Regularizer, bound to the mesh; None for none.
+        prior: Prior, bound to the unknown; None for none.
+        remeshing: Steps and method of remeshing; None for never.
+        truth: True value, of the shape of `initial`; None if unknown.
+        surface: True surface of a mesh, if the true position of each vertex is unknown; else None.
+        notices: One line for each change of the input.
     """
 
     given: Parameter
@@ -59,23 +59,24 @@ class Unknown:
     notices: tuple[str, ...] = ()
 
     def shape(self, step: int | None = None) -> tuple[int, ...]:
-        """Return its shape at a step; None for the scene's own."""
-        way = None if step is None else self.coarse_to_fine
-        return self.initial.shape if way is None or step is None else way.shape(self.initial.shape, step)
+        """Return its shape at a step; None for the scene's."""
+        levels = None if step is None else self.coarse_to_fine
+        return self.initial.shape if levels is None or step is None else levels.shape(self.initial.shape, step)
 
     def start(self, step: int) -> np.ndarray:
         """Return the initial value at the resolution of a step."""
         return self.initial if self.coarse_to_fine is None else self.coarse_to_fine.coarsened(self.initial, step)
 
     def full(self, values: np.ndarray) -> np.ndarray:
-        """Return values at the scene's resolution, interpolated where they are still coarse."""
-        way, shape = self.coarse_to_fine, self.initial.shape
-        return way.refined(values, shape) if way is not None and values.shape in way.shapes(shape) else values
+        """Return values at the scene's resolution; coarser ones are interpolated."""
+        levels, shape = self.coarse_to_fine, self.initial.shape
+        return levels.refined(values, shape) if levels is not None and values.shape in levels.shapes(shape) else values
 
     def error(self, values: np.ndarray) -> float | None:
-        """Return the error of values at the scene's resolution; NaN for another shape than the truth's, None where no truth is known.
+        """Return the error of values at the scene's resolution; NaN if the shape differs from the true value's, None if no truth is
+        known.
 
-        The error of a mesh whose true surface is known is the root mean square distance between the surfaces.
+        The error of a mesh with a known true surface is the root mean square distance between the surfaces.
         """
         if self.surface is not None and self.faces is not None and values.size == self.initial.size:
             return surface_error(Surface(values.reshape(-1, 3), self.faces), self.surface)

@@ -1,4 +1,4 @@
-"""What the user gives to a `Problem`, checked and read: parameters, views, truth, bounds, the scene."""
+"""Validation of the arguments of a `Problem`: parameters, views, truth, bounds, the scene."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from unrender.scene.unknown import Unknown
 _DEEPEST = 1 << 20
 _LONGEST_KEY = 200
 _SHORTEST_NORMAL = 0.1
-"""Length of a vector of a normal map below which its direction is arbitrary; it should be 1."""
+"""Length of a normal map's vector below which its direction is arbitrary; it should be 1."""
 
 
 @runtime_checkable
@@ -61,11 +61,11 @@ class _Loss(Loss, Protocol): ...
 
 
 def check_max_depth(max_depth: Any) -> None:
-    """Raise `FieldError` for what is neither a longest path length nor None."""
+    """Raise `FieldError` unless the argument is a maximum path length or None."""
     if max_depth is None:
         return
     if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
-        hint = "; Mitsuba's -1, no limit, is a number that light hardly reaches, such as 64" if max_depth == -1 else ""
+        hint = "; for Mitsuba's -1 (no limit) use a large number such as 64" if max_depth == -1 else ""
         given = shorten(repr(max_depth), 60)
         raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {given}{hint}")
     if max_depth > _DEEPEST:
@@ -73,12 +73,12 @@ def check_max_depth(max_depth: Any) -> None:
 
 
 def longest_path(renderer: Renderer) -> int:
-    """The longest light path of a renderer in segments; 6 of one that does not tell."""
+    """Return the maximum path length of a renderer in segments; 6 if it does not report one."""
     return int(getattr(scene_renderer(renderer), "max_depth", 6))
 
 
 def check_loss(loss: Any) -> Loss:
-    """A loss, made of a function where one is given. Raises `FieldError` for what is neither."""
+    """Return a loss, made from a function if necessary. Raises `FieldError` for anything else."""
     if isinstance(loss, _Loss) and not isinstance(loss, type):
         return loss
     try:
@@ -88,7 +88,7 @@ def check_loss(loss: Any) -> Loss:
 
 
 def check_loss_function(loss: Loss, reference: np.ndarray) -> None:
-    """Raise `FieldError` for a function that is no loss of images such as this one (H, W, 3)."""
+    """Raise `FieldError` for a function that is not a loss of images with the shape of `reference` (H, W, 3)."""
     if isinstance(loss, FunctionLoss):
         try:
             loss.prepare(reference)
@@ -99,7 +99,7 @@ def check_loss_function(loss: Loss, reference: np.ndarray) -> None:
 def check_parameter(
     index: int, parameter: Parameter, known: Mapping[str, ParameterInfo], renderer: Renderer
 ) -> Unknown:
-    """Return the `index`-th parameter with its defaults filled in. Raises `FieldError` for the field that is wrong."""
+    """Return the `index`-th parameter with its defaults filled in. Raises `FieldError` that names the invalid field."""
     key, info = parameter.key, _known(index, parameter.key, known)
 
     @contextmanager
@@ -136,8 +136,8 @@ def check_parameter(
         remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
     with checking("self_intersection"):
         check_self_intersection(parameter.self_intersection, mesh)
-    told = (f"initial {notice}" if notice else "", narrowed, clipped)
-    notices = [f"parameter {key}: {line}" for line in told if line]
+    changes = (f"initial {notice}" if notice else "", narrowed, clipped)
+    notices = [f"parameter {key}: {line}" for line in changes if line]
     notices += _at_bounds(key, parameterisation, transform, initial, bounds)
     notices += [] if mesh is None else mesh_notices(key, *mesh)
     return Unknown(
@@ -169,12 +169,12 @@ def _check_rate(rate: Any) -> float | None:
 
 
 def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo) -> Unknown:
-    """Return an unknown with those settings that it has none of its own for. Raises `InputError` for one that does not suit."""
+    """Return the unknown with those settings for which its own are None. Raises `InputError` for an unsuitable one."""
     own = {n: x for n, x in vars(settings).items() if x is not None and getattr(unknown.given, n) is None}
     changes: dict[str, Any] = dict(own)
     if "parameterisation" in own:
-        found = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
-        changes |= {"parameterisation": found[0], "transform": found[1]}
+        pair = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
+        changes |= {"parameterisation": pair[0], "transform": pair[1]}
     if "preconditioner" in own:
         changes["preconditioner"] = _check_preconditioner(unknown.given.key, own["preconditioner"], info)
     if "coarse_to_fine" in own:
@@ -186,10 +186,10 @@ def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo
 
 
 def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
-    """What the renderer says of a parameter. Raises `FieldError` for a key that it does not have, or cannot recover."""
+    """Return the renderer's description of a parameter. Raises `FieldError` for a key that is unknown or cannot be recovered."""
     if not isinstance(key, str) or key not in known:
         raise FieldError(("parameters", index, "key"), f"the scene has no parameter {key}{near_key(str(key), known)}")
-    if len(key) > _LONGEST_KEY:  # files are named by it
+    if len(key) > _LONGEST_KEY:  # it becomes part of file names
         raise FieldError(
             ("parameters", index, "key"), f"{key}: expected at most {_LONGEST_KEY} characters, got {len(key)}"
         )
@@ -202,7 +202,7 @@ def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> Paramete
 
 
 def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.ndarray, bounds: Bounds) -> list[str]:
-    """A line where values start on a bound that a parameterisation leaves slowly; none otherwise."""
+    """Return a notice if values start on a bound that a parameterisation leaves slowly; else an empty list."""
     count = 0 if transform is None else int(np.sum(project(initial, *bounds) != initial))
     slowly = f"at a bound, which {type(given).__name__.lower()} leaves slowly"
     return [f"parameter {key}: {count} of {initial.size} initial values are {slowly}"] if count else []
@@ -211,7 +211,7 @@ def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.nd
 def _check_parameterisation(
     given: Any, bounds: Bounds, initial: np.ndarray
 ) -> tuple[Parameterisation, Transform | None]:
-    """A parameterisation, made of its name or table, and its φ. Raises `InputError`."""
+    """Return a parameterisation, made from its name or table, and its φ. Raises `InputError`."""
     try:
         made = tables.component(given, "parameterisation") if isinstance(given, (str, Mapping)) else given
     except InputError as error:
@@ -222,7 +222,7 @@ def _check_parameterisation(
 
 
 def mesh_topology(info: ParameterInfo) -> MeshTopology | None:
-    """Of the mesh at whose vertices a parameter has values; None where it has none."""
+    """Return the topology of the mesh whose vertices carry the parameter; None if there is none."""
     return None if info.mesh is None else MeshTopology.of(*info.mesh(), info.welded)
 
 
@@ -231,12 +231,12 @@ def texture_coordinates(renderer: Renderer, key: str, size: int) -> np.ndarray |
     name = f"{key.rpartition('.')[0]}.vertex_texcoords"
     if name not in renderer.parameters():
         return None
-    found = arrays.numpy(renderer.values([name])[name]).reshape(-1, 2)
-    return found if len(found) == size // 3 else None
+    uv = arrays.numpy(renderer.values([name])[name]).reshape(-1, 2)
+    return uv if len(uv) == size // 3 else None
 
 
 def _check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner:
-    """A preconditioner that suits the parameter, bound to its mesh where it has one. Raises `InputError`."""
+    """Return the preconditioner, bound to the parameter's mesh if there is one. Raises `InputError` if it does not suit."""
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
     if isinstance(preconditioner, MeshPreconditioner) and (topology := mesh_topology(info)) is not None:
@@ -267,38 +267,38 @@ def _check_resolutions(schedule: CoarseToFine, info: ParameterInfo) -> None:
 
 
 def _initial(parameter: Parameter, info: ParameterInfo, renderer: Renderer) -> tuple[np.ndarray, str]:
-    """The initial value, float32, and what was changed to make it fit, "" for nothing."""
+    """Return the initial value, float32, and a notice of how it was converted, "" if it was not."""
     if parameter.initial is not None:
         return parameter_values.fill(parameter.initial, info.shape, info.conversion)
-    # On a CPU the scene's own memory, which nobody writes to: grids and textures can be as large as all else.
+    # On a CPU this is the scene's own memory, which is never written to: grids and textures can be large.
     start = np.asarray(arrays.view(renderer.values([parameter.key])[parameter.key]), np.float32)
     if not np.isfinite(start).all():
-        raise InputError("the scene's own value is not finite; give another")
+        raise InputError("the scene's own value is not finite; set initial")
     return start, ""
 
 
 def _check_normals(start: np.ndarray, info: ParameterInfo) -> None:
-    """Raise `InputError` for a normal map with vectors too short to have a direction: derivatives grow as one over the length."""
+    """Raise `InputError` for a normal map with very short vectors: derivatives grow with the inverse of their length."""
     if info.role != "normal":
         return
     short = np.linalg.norm(2.0 * start.reshape(-1, 3) - 1.0, axis=-1) < _SHORTEST_NORMAL
     if short.any():
         raise InputError(
-            f"{int(short.sum())} of {len(short)} normals have no direction: a value x stands for 2 x - 1, which is near zero; "
+            f"{int(short.sum())} of {len(short)} normals have no direction: a value x encodes 2 x - 1, which is near zero; "
             "expected vectors of length 1, such as [0.5, 0.5, 1] for a flat surface"
         )
 
 
 def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tuple[np.ndarray, str]:
-    """Return the true value of a parameter, float32, and what was changed to make it fit, "" for nothing.
+    """Return the true value of a parameter, float32, and a notice of how it was converted, "" if it was not.
 
     Args:
-        key: of the parameter.
-        value: as given.
+        key: key of the parameter.
+        value: the value as passed.
         known: the problem's parameters.
 
     Raises:
-        FieldError: it does not suit.
+        FieldError: the value does not suit the parameter.
     """
     if key not in known:
         raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, known)}")
@@ -309,8 +309,11 @@ def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tup
 
 
 def open_renderer(scene: Any, max_depth: int | None, keys: Iterable[str] = ()) -> Renderer:
-    """The renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or itself. `keys`:
-    parameters that will be asked for. Raises `FieldError`."""
+    """Return the renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or a
+    renderer.
+
+    `keys` are the parameters that will be used. Raises `FieldError`.
+    """
     if isinstance(scene, _Renderer) and not isinstance(scene, type):
         return scene
     loaded = type(scene).__module__.partition(".")[0] == "mitsuba"
@@ -334,9 +337,9 @@ def open_renderer(scene: Any, max_depth: int | None, keys: Iterable[str] = ()) -
 
 
 def _check_files(scene: Path) -> None:
-    """Raise `InputError` where an XML scene of a problem file names files outside of both folders.
+    """Raise `InputError` if an XML scene of a problem file refers to files outside of both folders.
 
-    A scene that a script names itself is trusted as the script is.
+    A scene that a script names itself is as trusted as the script.
     """
     if not confinement.is_confined():
         return
@@ -345,12 +348,12 @@ def _check_files(scene: Path) -> None:
 
 
 def renderer_notices(renderer: Renderer) -> Sequence[str]:
-    """What a renderer does otherwise than its scene asks for, one line each; a renderer need not tell."""
+    """Return a renderer's deviations from its scene, one line each; a renderer need not report any."""
     return renderer.notices if isinstance(renderer, _Noticing) else ()
 
 
 def check_sequence(given: Any, kind: type, name: str) -> tuple[Any, ...]:
-    """A tuple of at least one `kind`. Raises `FieldError`."""
+    """Return a tuple of at least one `kind`. Raises `FieldError`."""
     items = (given,) if isinstance(given, kind) else given
     if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Sequence):
         raise FieldError((name,), f"expected a list of {kind.__name__}, got {type(given).__name__}")

@@ -1,4 +1,4 @@
-"""One reference image of the scene."""
+"""A reference image of the scene."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from unrender.io.stored_pictures import StoredPicture
 
 @dataclass(frozen=True)
 class View:
-    """A reference image and the sensor that it was taken with.
+    """A reference image and its sensor.
 
     Args:
-        reference: file, or array (H, W, 3), linear RGB. 8-bit files are taken as sRGB and linearised. An array is what the film stores:
-            luminance (H, W) or XYZ (H, W, 3) where the film's `pixel_format` says so. Alpha of 8- and 16-bit pictures multiplies the mask;
-            that of floating-point pictures is left out, since films store colours multiplied with it.
+        reference: file, or array (H, W, 3), in linear RGB. 8-bit files are converted from sRGB. An array contains the film's format:
+            luminance (H, W) or XYZ (H, W, 3) according to the film's `pixel_format`. Alpha of 8- and 16-bit images multiplies the mask.
+            Alpha of floating-point images is ignored, because films store premultiplied colours.
         sensor: index of the scene's sensor.
         weight: factor of this view's loss, > 0.
-        mask: file or array (H, W), in [0, 1]; factor of each pixel's loss. None for all ones.
+        mask: file or array (H, W), in [0, 1], the factor of each pixel's loss; None for ones.
     """
 
     reference: str | Path | np.ndarray | StoredPicture

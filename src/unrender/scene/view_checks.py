@@ -1,4 +1,4 @@
-"""Checks of views, and their pictures."""
+"""Validation of views and of their images."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from unrender.scene.validation import is_number
 from unrender.scene.view import View
 
 _DARKEST = -1e-4
-"""Share of the largest value down to which negative values are rounding."""
+"""Ratio to the largest value above which negative values count as rounding error."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A reference as losses compare it.
+    """A reference in the form that losses compare.
 
     Attributes:
-        values: (H, W, 3) float32, linear RGB; of a film that stores luminance, that in each channel.
-        alpha: (H, W) in [0, 1], of a cut-out picture of 8 or 16 bits; None where there is none.
-        limited: whether values end at a white.
+        values: (H, W, 3) float32, linear RGB; luminance is repeated in each channel.
+        alpha: (H, W) in [0, 1] for an 8- or 16-bit image with alpha; else None.
+        limited: whether values are clipped at white.
         notices: one line for each conversion.
     """
 
@@ -43,13 +43,12 @@ class Reference:
 
 
 def read_reference(source: Any, form: PictureFormat) -> Reference:
-    """The reference in a file or an array.
+    """Read the reference from a file or an array.
 
-    An array, or a .npy file, has what the film of that format stores. Other files tell their own colour space.
-    The alpha of 8- and 16-bit pictures becomes a mask. That of floating-point pictures is left out: films store colours that are
-    multiplied with it already.
+    An array, or a .npy file, contains the film's format. Other files specify their own colour space. Alpha of 8- and 16-bit images
+    becomes a mask. Alpha of floating-point images is ignored, because films store premultiplied colours.
 
-    Raises `InputError`: see `images.read`; and for another number of channels than the film's, and for negative radiance.
+    Raises `InputError` as `images.read` does, and if the number of channels differs from the film's or radiance is negative.
     """
     grey = form.colour == "luminance"
     channels = {"luminance": (1, 2), "xyz": (3, 4), "rgb": (1, 3, 4)}[form.colour]
@@ -62,24 +61,24 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
     values = image.values
     if grey and values.shape[2] != 1:
         raise InputError(
-            "it has three channels and the film's pixel_format is luminance: give one channel, or the film pixel_format rgb"
+            "it has three channels and the film's pixel_format is luminance; use an image of one channel, or the pixel_format rgb"
         )
     if not form.signed:
         _check_not_negative(values)
     notices = [image.notice] if image.notice else []
     if form.colour == "xyz" and _is_of_film(source):
         values = images.xyz_to_rgb(values)
-        notices.append("in XYZ as the film stores it, converted to RGB")
+        notices.append("is in XYZ, as the film stores it, and is converted to RGB")
     elif values.shape[2] == 1 and not grey:
-        notices.append("of one channel, which red, green and blue of the image are each compared with")
+        notices.append("has one channel, with which red, green and blue of the image are each compared")
     elif grey:
-        notices.append("of luminance, which the luminance of the image is compared with")
+        notices.append("is luminance, with which the image's luminance is compared")
     full = np.array(np.broadcast_to(values, (*values.shape[:2], 3)))
     return Reference(full, image.alpha, bool(image.notice), tuple(notices))
 
 
 def _is_of_film(source: Any) -> bool:
-    """Whether values are as a film has them, with no colour space of their own."""
+    """Return whether the values are in the film's format, with no colour space of their own."""
     path = isinstance(source, (str, Path))
     integers = not path and np.asarray(source).dtype in (np.uint8, np.uint16)
     return not integers and (not path or Path(source).suffix.lower() == ".npy")
@@ -90,45 +89,45 @@ def _check_not_negative(values: np.ndarray) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
         raise InputError(
-            f"{int(bad.sum())} pixels are negative, the first in row {row}, column {column}, and radiance is not: "
-            "clip them at 0, or give the film the filter with negative lobes that made them"
+            f"{int(bad.sum())} pixels are negative, the first in row {row}, column {column}, but radiance is not; "
+            "clip them at 0, or use the same reconstruction filter with negative lobes in the film"
         )
 
 
 _WHITE = 0.001
-"""Share of saturated pixels that is told."""
+"""Fraction of saturated pixels from which a notice is given."""
 
 
 def check_views(given: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[tuple[View, ...], list[str]]:
-    """The views with their pictures, in memory, or in a file where they are many; and notices. Raises `FieldError`.
+    """Return the views with their images, in memory or in a file if they are large, and notices. Raises `FieldError`.
 
     Args:
-        given: as the problem was given them.
-        renderer: of the scene, whose films tell sizes and formats.
-        loss: one that knows of saturated pixels needs no notice of them.
+        given: views as passed to the problem.
+        renderer: renderer whose films give sizes and formats.
+        loss: loss; one that handles saturated pixels needs no notice of them.
     """
-    found, notices, resolutions = [], [], renderer.resolutions()
+    checked, notices, resolutions = [], [], renderer.resolutions()
     films = scene_renderer(renderer)
     known = [v.sensor for v in given if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
     store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
     for number, one in enumerate(given):
         view, notes = _check_view(number, one, resolutions, films, not isinstance(loss, Censored))
-        found.append(view if store is None else _stored(view, store))
+        checked.append(view if store is None else _stored(view, store))
         notices += notes
-    return tuple(found), notices
+    return tuple(checked), notices
 
 
 def _check_view(
     index: int, view: View, resolutions: Sequence[tuple[int, int]], films: Renderer, tell_saturated: bool
 ) -> tuple[View, list[str]]:
-    """The view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for the field that is wrong.
+    """Return the view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for an invalid field.
 
     Args:
-        index: of the view in the problem, for messages.
-        view: as given.
+        index: index of the view in the problem, for messages.
+        view: view as passed.
         resolutions: (height, width) of each sensor's film.
-        films: the renderer that may tell their formats.
-        tell_saturated: whether a reference with saturated pixels is worth a notice.
+        films: renderer that may know the films' formats.
+        tell_saturated: whether a reference with saturated pixels gets a notice.
     """
     owner = f"view {index}"
 
@@ -142,7 +141,7 @@ def _check_view(
         raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
     height, width = resolutions[view.sensor]
     notices: list[str] = []
-    limited, alpha = None, None  # in values, to a white
+    limited, alpha = None, None  # the reference, if it is clipped at white; its alpha
     try:
         if isinstance(view.reference, StoredPicture):
             _check_size(view.reference, height, width, view.sensor)
@@ -164,23 +163,23 @@ def _check_view(
             if mask.min() < 0 or mask.max() > 1:
                 raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
             if not mask.any():
-                raise InputError("it is 0 everywhere: no pixel would count")
+                raise InputError("it is 0 everywhere, so no pixel would count")
         except InputError as error:
             raise wrong("mask", error) from error
     if alpha is not None:
         mask = alpha if mask is None else np.asarray(mask) * alpha
         if not mask.any():
-            raise wrong("reference", "its alpha, with the mask, is 0 everywhere: no pixel would count")
+            raise wrong("reference", "its alpha times the mask is 0 everywhere, so no pixel would count")
     counted = None if mask is None else np.asarray(mask) > 0
     if tell_saturated and limited is not None and (white := _saturated(limited, counted)) >= _WHITE:
         notices.append(
-            f"{owner}: {white:.1%} of the reference's pixels are saturated; the loss Censored takes them for lower bounds"
+            f"{owner}: {white:.1%} of the reference's pixels are saturated; the loss Censored treats them as lower bounds"
         )
     return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices
 
 
 def _saturated(reference: np.ndarray, counted: np.ndarray | None) -> float:
-    """The share of pixels that are white in a channel, among those that count; None for all."""
+    """Return the fraction of pixels with a white channel, among those that count; None for all."""
     white = np.any(reference >= 1, axis=2)
     return float(np.mean(white if counted is None else white[counted]))
 
@@ -194,6 +193,6 @@ def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, sen
 
 
 def _stored(view: View, store: PictureStore) -> View:
-    """A view that was checked, with its pictures in a file."""
-    kept = {name: store.add(x) for name in ("reference", "mask") if isinstance(x := getattr(view, name), np.ndarray)}
-    return replace(view, **kept)
+    """Return a checked view with its images stored in a file."""
+    stored = {name: store.add(x) for name in ("reference", "mask") if isinstance(x := getattr(view, name), np.ndarray)}
+    return replace(view, **stored)

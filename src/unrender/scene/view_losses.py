@@ -1,4 +1,4 @@
-"""The losses of views at images, and references and masks on the device."""
+"""Losses of views, and references and masks on the device."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from unrender.scene.view import View
 
 
 class ViewLosses:
-    """What `Problem` is to estimators: a loss per view. The attributes are the problem's."""
+    """The part of `Problem` that estimators use: a loss per view. The attributes are those of `Problem`."""
 
     loss: Loss
     views: tuple[View, ...]
@@ -25,36 +25,36 @@ class ViewLosses:
     _masks: dict[int, Array | None]
 
     def reference(self, view: int) -> Array:
-        """The view's reference as the renderer's array (H, W, 3)."""
+        """Return the view's reference as an array of the renderer, (H, W, 3)."""
         if view in self._references:
             return self._references[view]
-        found = self.renderer.array(np.asarray(self.views[view].reference))
+        array = self.renderer.array(np.asarray(self.views[view].reference))
         if not self.references.in_host_memory:
-            self._references[view] = found
-        return found
+            self._references[view] = array
+        return array
 
     def mask(self, view: int) -> Array | None:
-        """The view's mask as the renderer's array (H, W, 1), or None where every pixel counts."""
+        """Return the view's mask as an array of the renderer, (H, W, 1), or None if every pixel counts."""
         if view in self._masks:
             return self._masks[view]
         mask = self.views[view].mask
-        found = None if mask is None else self.renderer.array(np.asarray(mask)[..., None])
+        array = None if mask is None else self.renderer.array(np.asarray(mask)[..., None])
         if not self.references.in_host_memory:
-            self._masks[view] = found
-        return found
+            self._masks[view] = array
+        return array
 
     def loss_value(self, view: int, image: Array) -> Array:
-        """The view's part of the loss at an image (H, W, 3): weight * mean(mask * loss), a lazy scalar."""
+        """Return the view's loss at an image (H, W, 3): weight * mean(mask * loss), a lazy scalar."""
         return arrays.mean(self._values(image, self.reference(view), self.mask(view))) * self.views[view].weight
 
     def loss_values(self, view: int, images: Array) -> Array:
-        """`loss_value` of each of many images (B, H, W, 3): (B,), lazy."""
+        """Return `loss_value` of each of B images (B, H, W, 3): (B,), lazy."""
         reference, mask = arrays.add_first_axis(self.reference(view)), self.mask(view)
         values = self._values(images, reference, None if mask is None else arrays.add_first_axis(mask))
         return arrays.mean_over_rest(values) * self.views[view].weight
 
     def loss_derivative(self, view: int, image: Array) -> Array:
-        """∂(total loss)/∂(pixel) at an image (H, W, 3): weight * mask * loss' / (H * W * 3)."""
+        """Return ∂(total loss)/∂(pixel) at an image (H, W, 3): weight * mask * loss' / (H * W * 3)."""
         reference, mask = self.reference(view), self.mask(view)
         derivative = self.loss.derivative(self._masked(image, reference, mask), reference)
         factor = self.views[view].weight / math.prod(arrays.shape(reference))
@@ -65,5 +65,5 @@ class ViewLosses:
         return values if mask is None or not self.loss.pixelwise else values * mask
 
     def _masked(self, image: Array, reference: Array, mask: Array | None) -> Array:
-        """The argument of the loss: the image for a pixelwise loss; else blended with the reference by the mask."""
+        """Return the argument of the loss: the image for a pixelwise loss, else the reference and image blended by the mask."""
         return image if mask is None or self.loss.pixelwise else reference + mask * (image - reference)
