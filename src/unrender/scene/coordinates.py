@@ -47,15 +47,15 @@ class Coordinates:
 
     def pull_back(self, gradient: Tree, slopes: Tree) -> Tree:
         """Return the gradient with respect to v, S (φ' g), from the gradient g with respect to x."""
-        return self._smoothed(_times(gradient, slopes))
+        return self._precondition(_times(gradient, slopes))
 
     def push_forward(self, tangent: Tree, slopes: Tree) -> Tree:
         """Return the tangent of x, φ' (S t), from a tangent t of v."""
-        return _times(self._smoothed(tangent), slopes)
+        return _times(self._precondition(tangent), slopes)
 
     def moved(self, parameters: Tree, steps: Tree) -> tuple[Tree, Tree]:
         """Return u and x after steps of v. Elements of x whose change is zero keep their exact value."""
-        changes = self._smoothed(steps)
+        changes = self._precondition(steps)
         reached = trees.add(self.of(parameters), changes)
 
         def values(key: str):
