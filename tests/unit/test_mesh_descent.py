@@ -53,9 +53,9 @@ def test_distance_between_surfaces_is_that_of_spheres() -> None:
     [
         (POINTS[:, :2], FACES, r"finite vertices of shape \(V, 3\)"),
         (np.where(POINTS > 0.9, np.nan, POINTS), FACES, "finite vertices"),
-        (POINTS, FACES + 0.5, "whole numbers"),
+        (POINTS, FACES + 0.5, "vertex indices"),
         (POINTS, FACES + 1, "names vertex 162 of 162"),
-        (POINTS, FACES[:0], "whole numbers"),
+        (POINTS, FACES[:0], "vertex indices"),
         (np.zeros((162, 3)), FACES, "none of its faces has an area"),
     ],
 )

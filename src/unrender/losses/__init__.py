@@ -1,11 +1,11 @@
-"""Losses, all but one per pixel and channel: value and derivative, and whether the derivative is linear in the image.
+"""Losses of images: value, derivative, and whether the derivative is linear in the image.
 
-Why linearity matters: an image estimate I with E[I] = F gives E[∂ℓ(I)] = ∂ℓ(F) only where ∂ℓ is linear. Otherwise the
-gradient is biased by the image's noise, however many steps are averaged (Nicolet et al. 2023, section 4).
+Linearity matters for bias. An image estimate I with E[I] = F satisfies E[∂ℓ(I)] = ∂ℓ(F) only if ∂ℓ is linear. Otherwise the image's noise
+biases the gradient, even when many steps are averaged (Nicolet et al. 2023, section 4).
 
-The loss of a problem is the sum over views of weight · mean over pixels and channels of mask · value. A loss of whole
-images sees the reference where the mask is 0: mean of ℓ(R + mask · (I − R), R). Any function of images in Dr.Jit or PyTorch is a loss
-of whole images (`FunctionLoss`).
+The loss of a problem is the sum over views of weight · mean over pixels and channels of mask · value. A loss of full images gets the
+reference where the mask is 0: mean of ℓ(R + mask · (I − R), R). Any function of images in Dr.Jit or PyTorch can be a loss of full images
+(`FunctionLoss`).
 """
 
 from unrender.losses.base import Loss

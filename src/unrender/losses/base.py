@@ -1,4 +1,4 @@
-"""What a loss is."""
+"""Protocol of losses."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from unrender.core.arrays import Array
 
 
 class Loss(Protocol):
-    """How far an image is from its reference, element by element. Arrays of any equal shape, linear radiance."""
+    """Distance of an image to its reference per element. Arrays have any equal shape; values are linear radiance."""
 
     @property
     def linear(self) -> bool:
@@ -17,17 +17,17 @@ class Loss(Protocol):
 
     @property
     def pixelwise(self) -> bool:
-        """Whether an element's loss depends on that element alone, so that some pixels may be had without the others.
+        """Whether the loss of an element depends on that element alone, so that it can be evaluated for some pixels.
 
-        A loss of whole images (..., H, W, 3) spreads its value evenly over each, so that the mean is the loss, and scales its derivative
-        alike.
+        A loss of full images (..., H, W, 3) returns an image's loss in each of its elements, so that their mean is the loss, and scales
+        its derivative accordingly.
         """
         ...
 
     def value(self, image: Array, reference: Array) -> Array:
-        """ℓ(I, R) >= 0, per element."""
+        """Return ℓ(I, R) >= 0 per element."""
         ...
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """∂ℓ/∂I, per element."""
+        """Return ∂ℓ/∂I per element."""
         ...

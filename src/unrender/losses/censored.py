@@ -1,4 +1,4 @@
-"""Saturated pixels of photographs: known to be at least as bright as white."""
+"""Loss for photographs with saturated pixels, whose true radiance is at least white."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from unrender.losses.pixelwise import L1
 @register(position=6)
 @dataclass(frozen=True)
 class Censored:
-    """ℓ(min(I, R), R) where the reference R is at least `white`, ℓ(I, R) elsewhere, per element.
+    """ℓ(min(I, R), R) where the reference R is at least `white`, and ℓ(I, R) elsewhere, per element.
 
-    A photograph cannot show more than its white: there a rendering that is darker is wrong, one that is brighter is not. The loss is
-    then of one side (censored regression, Tobin 1958).
+    A photograph cannot show more than white. At saturated pixels a darker rendering is wrong and a brighter one is not, so the loss is
+    one-sided there (censored regression, Tobin 1958).
 
-    The derivative is not linear in the image, whatever ℓ is. Where the true radiance is near white, noise of the image counts when it is
-    darker alone, so such pixels come out too bright, by about the image's standard deviation; pixels far above white have no bias, and
-    no information beyond it. Leaving saturated pixels out, by a mask, has no bias, and lets highlights be as dark as they like.
+    The derivative is not linear in the image. If the true radiance is near white, image noise counts only where it is darker, so such
+    pixels become too bright by about the standard deviation of the image. Pixels far above white have no bias, and only a lower bound.
+    Excluding saturated pixels by a mask has no bias, but leaves highlights unconstrained.
 
     Args:
-        loss: ℓ, per pixel and channel.
-        white: the least value of a saturated pixel, linear, > 0. Photographs are scaled to [0, 1]; values below 1 allow for pixels that
-            resizing mixed with their neighbours.
+        loss: ℓ, a pixelwise loss.
+        white: smallest value of a saturated pixel, linear, > 0. Photographs are scaled to [0, 1]. Values below 1 include pixels that
+            resizing has mixed with their neighbours.
     """
 
     loss: Loss = field(default_factory=L1)
@@ -36,7 +36,7 @@ class Censored:
     def __post_init__(self):
         checks.number("Censored", "white", self.white, above=0.0)
         if isinstance(self.loss, type) or not getattr(self.loss, "pixelwise", False):
-            raise InputError(f"Censored: loss must be one per pixel, such as L1(), got {self.loss!r:.80}")
+            raise InputError(f"Censored: loss must be pixelwise, such as L1(), got {self.loss!r:.80}")
 
     @property
     def linear(self) -> bool:
@@ -52,7 +52,7 @@ class Censored:
         return self.loss.value(self._censored(image, reference), reference)
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """See `Loss.derivative`; 0 where the image is brighter than white."""
+        """Return ∂ℓ/∂I per element; 0 at saturated pixels where the image is brighter than the reference."""
         slope = self.loss.derivative(self._censored(image, reference), reference)
         return arrays.where((reference >= self.white) & (image >= reference), slope * 0.0, slope)
 

@@ -1,4 +1,4 @@
-"""A loss that is a user's own function of images, written in Dr.Jit or in PyTorch."""
+"""A loss that is a user's function of images, written in Dr.Jit or PyTorch."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 
-Way = Literal["drjit", "torch"]
+Backend = Literal["drjit", "torch"]
 
 
 @dataclass(frozen=True, eq=False)
 class FunctionLoss:
-    """f(image) or f(image, reference), a scalar, differentiated by the framework it is written in.
+    """Loss f(image) or f(image, reference), a scalar that Dr.Jit or PyTorch differentiates.
 
-    `Problem` makes one of any callable that it is given as its loss. It is called with tensors (H, W, 3) of linear radiance: with
-    Dr.Jit's first and, where that fails or gives no Dr.Jit scalar, with PyTorch's; `prepare` finds out which.
+    `Problem` wraps any callable loss in this class. The function gets tensors (H, W, 3) of linear radiance. `prepare` determines the
+    framework: it calls the function with Dr.Jit tensors and, if that fails or returns no Dr.Jit scalar, with PyTorch tensors.
 
-    It counts as a loss of whole images whose derivative is not linear: noise of the image may bias its gradient, pixel mini-batches
-    cannot have it, and where a view's mask is 0 it sees the reference. No file can describe a function, so a run with one is resumed by
+    It is treated as a loss of full images with a nonlinear derivative. Image noise may bias its gradient, pixel mini-batches do not
+    support it, and it gets the reference where a view's mask is 0. A file cannot describe a function, so a run with one is resumed by
     `unrender.resume(..., problem=)`.
 
     Args:
-        function: of one argument, the image, or of two, the image and the reference; arguments with defaults are left alone. Must be
-            pure: called again with the same image, it gives the same value.
+        function: function of the image, or of the image and the reference; arguments with defaults keep them. It must be pure: equal
+            images give equal values.
     """
 
     function: Callable[..., Any]
@@ -45,20 +45,20 @@ class FunctionLoss:
 
     @property
     def linear(self) -> bool:
-        """False: nothing is known of it."""
+        """False, because nothing is known about the function."""
         return False
 
     @property
     def pixelwise(self) -> bool:
-        """False: nothing is known of it."""
+        """False, because nothing is known about the function."""
         return False
 
     @functools.cached_property
     def takes_reference(self) -> bool:
-        """Whether it is given the reference too. Raises `InputError` where it takes neither one nor two arguments."""
+        """Whether the function also takes the reference. Raises `InputError` if it takes neither one nor two arguments."""
         try:
             parameters = inspect.signature(self.function).parameters.values()
-        except (TypeError, ValueError):  # of compiled code, which may not tell
+        except (TypeError, ValueError):  # compiled code may have no signature
             return True
         given = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
         required = [p.name for p in given if p.default is p.empty]
@@ -70,71 +70,78 @@ class FunctionLoss:
         return len(required) == 2 or (len(required) < 2 and open_ended)
 
     def __repr__(self) -> str:
-        # The same in another process: what a resumed run compares.
+        # Equal in another process, because a resumed run compares it.
         name = getattr(self.function, "__qualname__", None) or type(self.function).__qualname__
         return f"{getattr(self.function, '__module__', '?')}.{name}"
 
     def prepare(self, reference: np.ndarray) -> None:
-        """Find out which framework it is written in, from its answer to a reference (H, W, 3) and an image that differs from it.
+        """Determine the function's framework by calling it with a reference (H, W, 3) and an image that differs from it.
 
-        Raises `InputError`, in one line, where it takes neither's tensors, or gives no finite scalar.
+        Raises `InputError`, in one line, if it accepts neither framework's tensors or returns no finite scalar.
         """
-        self.__dict__["_way"] = self._find_way(reference)
+        self.__dict__["_framework"] = self._detect_framework(reference)
 
     def value(self, image: Array, reference: Array) -> Array:
-        """See `Loss.value`: of images (..., H, W, 3), the loss of each, everywhere in it."""
+        """Return the loss of each image (..., H, W, 3), repeated in all its elements."""
         return _each(lambda one, other: arrays.zeros_like(one) + self._evaluate(one, other, False)[0], image, reference)
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """See `Loss.derivative`: of images (..., H, W, 3), H · W · 3 times the derivative of the loss."""
+        """Return H · W · 3 times the derivative of each image's loss, (..., H, W, 3)."""
         elements = float(np.prod(arrays.shape(image)[-3:]))
         return _each(lambda one, other: self._evaluate(one, other, True)[1] * elements, image, reference)
 
-    def _find_way(self, reference: np.ndarray) -> Way:
-        said, image = [], reference * reference.dtype.type(0.9) + reference.dtype.type(0.05)
-        ways: tuple[Way, ...] = ("drjit", "torch")
-        for way in ways:
+    def _detect_framework(self, reference: np.ndarray) -> Backend:
+        failures, image = [], reference * reference.dtype.type(0.9) + reference.dtype.type(0.05)
+        frameworks: tuple[Backend, ...] = ("drjit", "torch")
+        for framework in frameworks:
             try:
-                value, _ = _CALLS[way](self, image, reference, True)
-            except Exception as error:  # whatever a user's function raises for arrays of another framework
-                said.append(f"with {_NAMES[way]}'s tensors: {reason_of(error, 160)}")
+                value, _ = _CALLS[framework](self, image, reference, True)
+            except Exception as error:  # a user's function may raise anything for another framework's arrays
+                failures.append(f"with {_NAMES[framework]}'s tensors: {reason_of(error, 160)}")
                 continue
             if not np.isfinite(value):
                 raise InputError(f"{self!r}: its value at an image that is nearly the reference is {value}")
-            return way
-        raise InputError(f"{self!r}: expected a function from an image (H, W, 3) to a scalar; {'; '.join(said)}")
+            return framework
+        raise InputError(f"{self!r}: expected a function from an image (H, W, 3) to a scalar; {'; '.join(failures)}")
 
     def _evaluate(self, image: Array, reference: Array, derivative: bool) -> tuple[Array, Array]:
-        """The loss of one image (H, W, 3) and, where it is asked for, its derivative."""
-        if "_way" not in self.__dict__:
+        """Return the loss of one image (H, W, 3) and, if requested, its derivative."""
+        if "_framework" not in self.__dict__:
             self.prepare(arrays.numpy(reference))
-        return _CALLS[self.__dict__["_way"]](self, image, reference, derivative)
+        return _CALLS[self.__dict__["_framework"]](self, image, reference, derivative)
 
 
 def _each(of_one: Callable[[Array, Array], Array], images: Array, references: Array) -> Array:
-    """A function of an image (H, W, 3) and its reference, applied to all of (..., H, W, 3)."""
+    """Apply a function of an image (H, W, 3) and its reference to all images (..., H, W, 3)."""
     if len(images.shape) == 3:
         return of_one(images, references)
     several = len(references.shape) > 3 and references.shape[0] > 1
-    alone = references if len(references.shape) == 3 else references[0]
-    found = [_each(of_one, images[index], references[index] if several else alone) for index in range(images.shape[0])]
-    return arrays.concatenate([arrays.add_first_axis(one) for one in found])
+    only_reference = references if len(references.shape) == 3 else references[0]
+    results = [
+        _each(of_one, images[index], references[index] if several else only_reference)
+        for index in range(images.shape[0])
+    ]
+    return arrays.concatenate([arrays.add_first_axis(one) for one in results])
 
 
 def _with_drjit(loss: FunctionLoss, image: Array, reference: Array, derivative: bool) -> tuple[Array, Array]:
     kind = type(image) if arrays.is_drjit(image) else _tensor_type(image)
-    given = _detached(image, kind)
+    tensor = _detached(image, kind)
     with dr.resume_grad() if derivative else dr.suspend_grad():
         if derivative:
-            dr.enable_grad(given)
-        found = loss.function(given, *([_detached(reference, kind)] if loss.takes_reference else []))
-        if not arrays.is_drjit(found) or dr.width(found) != 1 or (dr.depth_v(found) > 1 and not dr.is_tensor_v(found)):
-            raise InputError(f"it returns {_described(found)}, expected a scalar")
+            dr.enable_grad(tensor)
+        result = loss.function(tensor, *([_detached(reference, kind)] if loss.takes_reference else []))
+        if (
+            not arrays.is_drjit(result)
+            or dr.width(result) != 1
+            or (dr.depth_v(result) > 1 and not dr.is_tensor_v(result))
+        ):
+            raise InputError(f"it returns {_described(result)}, expected a scalar")
         if derivative:
-            if not dr.grad_enabled(found):
-                raise InputError("what it returns does not depend on the image, or was detached from it")
-            dr.backward(found)
-    value, slope = dr.detach(found), dr.grad(given) if derivative else given
+            if not dr.grad_enabled(result):
+                raise InputError("its result does not depend on the image, or is detached from it")
+            dr.backward(result)
+    value, slope = dr.detach(result), dr.grad(tensor) if derivative else tensor
     if not arrays.is_drjit(image):
         return arrays.number(value), slope.numpy()
     return kind(dr.ravel(value), ()), slope
@@ -146,30 +153,30 @@ def _detached(x: Array, kind: Any) -> Any:
 
 def _with_torch(loss: FunctionLoss, image: Array, reference: Array, derivative: bool) -> tuple[Array, Array]:
     torch: Any = sys.modules.get("torch")
-    if torch is None:  # a function that is written in it has imported it
+    if torch is None:  # a function that uses PyTorch has imported it
         raise InputError("PyTorch is not imported")
-    given = torch.from_numpy(arrays.numpy(image)).requires_grad_(derivative)
+    tensor = torch.from_numpy(arrays.numpy(image)).requires_grad_(derivative)
     with torch.set_grad_enabled(derivative):
-        found = loss.function(given, *([torch.from_numpy(arrays.numpy(reference))] if loss.takes_reference else []))
-    if not isinstance(found, torch.Tensor) or found.numel() != 1:
-        raise InputError(f"it returns {_described(found)}, expected a scalar")
+        result = loss.function(tensor, *([torch.from_numpy(arrays.numpy(reference))] if loss.takes_reference else []))
+    if not isinstance(result, torch.Tensor) or result.numel() != 1:
+        raise InputError(f"it returns {_described(result)}, expected a scalar")
     if not derivative:
-        return float(found), image
-    if not found.requires_grad:
-        raise InputError("what it returns does not depend on the image, or was detached from it")
-    (slope,) = torch.autograd.grad(found.reshape(()), given, materialize_grads=True)
-    return float(found.detach()), arrays.like(slope.numpy(), image)
+        return float(result), image
+    if not result.requires_grad:
+        raise InputError("its result does not depend on the image, or is detached from it")
+    (slope,) = torch.autograd.grad(result.reshape(()), tensor, materialize_grads=True)
+    return float(result.detach()), arrays.like(slope.numpy(), image)
 
 
-_CALLS: dict[Way, Callable[[FunctionLoss, Array, Array, bool], tuple[Array, Array]]] = {
+_CALLS: dict[Backend, Callable[[FunctionLoss, Array, Array, bool], tuple[Array, Array]]] = {
     "drjit": _with_drjit,
     "torch": _with_torch,
 }
-_NAMES: dict[Way, str] = {"drjit": "Dr.Jit", "torch": "PyTorch"}
+_NAMES: dict[Backend, str] = {"drjit": "Dr.Jit", "torch": "PyTorch"}
 
 
 def _tensor_type(values: np.ndarray) -> Any:
-    """Dr.Jit's differentiable tensor of the variant in use, in the precision of `values`."""
+    """Return Dr.Jit's differentiable tensor type of the current variant, in the precision of `values`."""
     mitsuba = sys.modules.get("mitsuba")
     if mitsuba is not None and mitsuba.variant() is not None:
         module = sys.modules[mitsuba.Float.__module__]

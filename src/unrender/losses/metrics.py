@@ -1,8 +1,8 @@
-"""How far a picture is from its reference, by measures that others report too.
+"""Image metrics: differences between an image and its reference, by standard measures.
 
-All take linear RGB (H, W, 3). PSNR, SSIM and FLIP are of pictures as a screen shows them: both are multiplied by one exposure, that
-takes the reference's 95th percentile of luminance to 0.7, clipped to [0, 1] and put through the sRGB curve. Radiance has no greatest
-value that a peak signal-to-noise ratio could refer to, and a lamp in the picture would otherwise decide everything.
+All take linear RGB (H, W, 3). PSNR, SSIM and FLIP are computed on display images: both images are multiplied by the exposure that maps
+the reference's 95th percentile of luminance to 0.7, clipped to [0, 1], and converted by the sRGB curve. Radiance has no peak value for a
+peak signal-to-noise ratio, and a visible emitter would otherwise dominate.
 """
 
 from __future__ import annotations
@@ -35,34 +35,34 @@ __all__ = [
 
 
 RELATIVE_EPSILON = 1e-2
-"""Added to the squared reference by `relative_mse`, so that black pixels do not decide."""
+"""Constant that `relative_mse` adds to the squared reference, so that black pixels do not dominate."""
 _WHITE_PERCENTILE = 95.0
 _WHITE = 0.7
 _SSIM_WINDOW = 7
 
 
 def exposure(reference: np.ndarray) -> float:
-    """The factor that takes the reference's 95th percentile of luminance to 0.7; 1 for a black reference.
+    """Return the factor that maps the reference's 95th percentile of luminance to 0.7; 1 for a black reference.
 
-    A percentile, so that a lamp in the picture leaves the rest of it visible.
+    A percentile, unlike the maximum, is not affected by a small visible emitter.
     """
     luminance = reference @ np.array([0.2126, 0.7152, 0.0722])
-    found = luminance[np.isfinite(luminance)]
-    if found.size == 0:
+    finite = luminance[np.isfinite(luminance)]
+    if finite.size == 0:
         return 1.0
-    level = float(np.percentile(found, _WHITE_PERCENTILE))
-    level = level if level > 0 else float(found.max())
+    level = float(np.percentile(finite, _WHITE_PERCENTILE))
+    level = level if level > 0 else float(finite.max())
     return _WHITE / level if level > 0 else 1.0
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """The sRGB transfer function (IEC 61966-2-1) of values clipped to [0, 1]; NaN becomes 0."""
+    """Apply the sRGB transfer function (IEC 61966-2-1) to values clipped to [0, 1]; NaN becomes 0."""
     x = np.clip(np.nan_to_num(linear, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
 
 
 def displayed(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both as a screen shows them, at the reference's exposure: values in [0, 1]. Raises `InputError` for other shapes."""
+    """Return both images as displayed at the reference's exposure, with values in [0, 1]. Raises `InputError` for unequal shapes."""
     image, reference = _pair(image, reference)
     factor = exposure(reference)
     with np.errstate(over="ignore"):
@@ -70,16 +70,19 @@ def displayed(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def psnr(image: np.ndarray, reference: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE) as displayed; infinite for equal pictures. Larger is better."""
+    """Return the peak signal-to-noise ratio of the display images in dB, 10 log10(1 / MSE); infinite for equal images.
+
+    Larger is better.
+    """
     shown, wanted = displayed(image, reference)
     error = float(np.mean((shown - wanted) ** 2))
     return 10 * math.log10(1 / error) if error > 0 else math.inf
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float | None:
-    """Structural similarity (Wang et al. 2004) as displayed, in [-1, 1]: scikit-image's, in windows of 7 pixels, or as large as fit.
+    """Return the structural similarity (Wang et al. 2004) of the display images, in [-1, 1], by scikit-image.
 
-    1 for equal pictures. None for pictures of less than 3 pixels' width or height.
+    The window has 7 pixels, or as many as fit. 1 for equal images. None for images with a side of less than 3 pixels.
     """
     from skimage.metrics import structural_similarity
 
@@ -88,44 +91,44 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float | None:
     if side < 3:
         return None
     window = side if side % 2 else side - 1
-    found: Any = structural_similarity(wanted, shown, data_range=1.0, channel_axis=2, win_size=window)
-    return float(found)
+    similarity: Any = structural_similarity(wanted, shown, data_range=1.0, channel_axis=2, win_size=window)
+    return float(similarity)
 
 
 def flip(image: np.ndarray, reference: np.ndarray) -> float:
-    """The mean of FLIP (Andersson et al. 2020) as displayed, in [0, 1], at its own 67 pixels per degree. Smaller is better.
+    """Return the mean FLIP (Andersson et al. 2020) of the display images, in [0, 1], at 67 pixels per degree. Smaller is better.
 
-    Raises `InputError` where the package flip-evaluator is missing.
+    Raises `InputError` if the package flip-evaluator is missing.
     """
     try:
         import flip_evaluator
     except ImportError as error:
-        raise InputError("metrics: FLIP needs a package of its own: pip install 'unrender[flip]'") from error
+        raise InputError("metrics: FLIP needs another package: pip install 'unrender[flip]'") from error
     shown, wanted = (np.ascontiguousarray(x, np.float32) for x in displayed(image, reference))
     _, mean, _ = flip_evaluator.evaluate(wanted, shown, "LDR", inputsRGB=True, applyMagma=False)
     return float(mean)
 
 
 def relative_mse(image: np.ndarray, reference: np.ndarray) -> float:
-    """The mean over pixels and channels of (I - R)² / (R² + 0.01), of linear values. Smaller is better.
+    """Return the mean over pixels and channels of (I - R)² / (R² + 0.01), in linear values. Smaller is better.
 
-    Infinite where a value is not finite. Raises `InputError` for pictures of different sizes.
+    Infinite if a value is not finite. Raises `InputError` for images of different sizes.
     """
     image, reference = _pair(image, reference)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = float(np.mean((image - reference) ** 2 / (reference**2 + RELATIVE_EPSILON)))
-    return found if math.isfinite(found) else math.inf
+        error = float(np.mean((image - reference) ** 2 / (reference**2 + RELATIVE_EPSILON)))
+    return error if math.isfinite(error) else math.inf
 
 
 def rmse(image: np.ndarray, reference: np.ndarray) -> float:
-    """The root of the mean squared difference of linear values. Smaller is better.
+    """Return the root mean square difference in linear values. Smaller is better.
 
-    Infinite where a value is not finite. Raises `InputError` for pictures of different sizes.
+    Infinite if a value is not finite. Raises `InputError` for images of different sizes.
     """
     image, reference = _pair(image, reference)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = float(np.sqrt(np.mean((image - reference) ** 2)))
-    return found if math.isfinite(found) else math.inf
+        error = float(np.sqrt(np.mean((image - reference) ** 2)))
+    return error if math.isfinite(error) else math.inf
 
 
 def _pair(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -138,19 +141,19 @@ def _pair(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def has_flip() -> bool:
-    """Whether the package that computes FLIP is installed."""
+    """Return whether the package that computes FLIP is installed."""
     from importlib.util import find_spec
 
     return find_spec("flip_evaluator") is not None
 
 
-MISSING = "LPIPS is left out: it needs pip install lpips, and AlexNet's weights in PyTorch's folder hub/checkpoints"
+MISSING = "LPIPS is not reported: it needs pip install lpips, and AlexNet's weights in PyTorch's folder hub/checkpoints"
 _LEAST = 32
-"""Pixels a side that the network needs."""
+"""Smallest side in pixels that the network accepts."""
 
 
 def available() -> bool:
-    """Whether the package is installed and AlexNet's weights lie where torchvision keeps them."""
+    """Return whether LPIPS is installed and AlexNet's weights are in torchvision's cache folder."""
     if any(find_spec(name) is None for name in ("torch", "torchvision", "lpips")):
         return False
     import torch  # pyright: ignore[reportMissingImports]
@@ -159,7 +162,7 @@ def available() -> bool:
 
 
 def distance(image: np.ndarray, reference: np.ndarray) -> float | None:
-    """Of two pictures (H, W, 3) as displayed, in [0, 1], by AlexNet. Smaller is better. None where it cannot be computed."""
+    """Return LPIPS by AlexNet of two display images (H, W, 3), values in [0, 1]. Smaller is better. None if it cannot be computed."""
     if min(image.shape[:2]) < _LEAST or not available():
         return None
     import torch  # pyright: ignore[reportMissingImports]

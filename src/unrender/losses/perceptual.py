@@ -1,7 +1,7 @@
-"""A loss between features that a network sees, in place of pixels: what is alike looks alike, wherever its details lie.
+"""Perceptual loss between features of a network, which is tolerant to the exact position of details.
 
-The network is VGG-16 (Simonyan and Zisserman 2015), thirteen convolutions; the loss is the mean squared difference of what some of its
-layers answer (Johnson, Alahi and Fei-Fei 2016, Eq. 2). It needs PyTorch and the network's weights.
+The network is VGG-16 (Simonyan and Zisserman 2015) with thirteen convolutions. The loss is the mean squared difference of the features of
+some layers (Johnson, Alahi and Fei-Fei 2016, Eq. 2). It needs PyTorch and the network's weights.
 """
 
 from __future__ import annotations
@@ -24,38 +24,38 @@ from unrender.core.text import reason_of
 from unrender.io import bounded_files
 
 _SAFE_UNPICKLER = (2, 6)
-"""PyTorch before this version runs code from a file also with `weights_only` (CVE-2025-32434)."""
+"""Oldest version of PyTorch with a safe `weights_only`: earlier ones may execute code from the file (CVE-2025-32434)."""
 _BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
-"""Channels of the convolutions; the resolution is halved between blocks."""
+"""Channels of the convolutions by block; the resolution is halved between blocks."""
 
 LAYERS = {
     f"relu{block}_{place}": block for block, widths in enumerate(_BLOCKS, 1) for place in range(1, len(widths) + 1)
 }
-"""The layers that may be compared, each after its rectifier, with the block that they stand in."""
+"""Layers whose features can be compared, each after its ReLU, with the index of its block."""
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of the pictures that the network was trained on, in sRGB."""
+"""Mean and standard deviation of the network's training images, in sRGB."""
 
 
 @register(position=5)
 @dataclass(frozen=True)
 class Perceptual:
-    """strength · mean over `layers` of mean (φₗ(I) − φₗ(R))², for VGG-16's features φₗ of images as sRGB shows them.
+    """strength · mean over `layers` of mean (φₗ(I) − φₗ(R))², for VGG-16's features φₗ of images in sRGB.
 
-    The loss is of a whole image, not of a pixel: `value` spreads it evenly over the image, so that its mean is the loss, and `derivative`
-    is scaled alike. Batches of pixels cannot have it (`pixelwise`). Radiance goes through the sRGB curve, which is continued above 1; below
-    0 it counts as 0, without a derivative. The derivative is not linear in the image, so noise biases the gradient: features see noise
-    as texture. Use an image with little of it (`images.RecursiveControlVariate`, `images.Denoised`).
+    The loss is of a full image: `value` returns it in each element of the image, so that their mean is the loss, and `derivative` is
+    scaled accordingly. Pixel mini-batches do not support it (`pixelwise`). Radiance is converted by the sRGB curve, which continues above
+    1. Negative radiance counts as 0, with zero derivative. The derivative is not linear in the image, so noise biases the gradient: the
+    network sees noise as texture. Use an image estimator with little noise (`images.RecursiveControlVariate`, `images.Denoised`).
 
     Args:
-        weights: file of the network's weights: a .safetensors file, or a .pth file of tensors alone, named as torchvision names them
-            (features.0.weight, ...; others are ignored). None takes those of torchvision, where that is installed.
-        layers: which features to compare, of `perceptual.LAYERS`. relu3_3 needs images of 4 x 4 at least, relu5_3 of 16 x 16.
+        weights: file of the network's weights: a .safetensors file, or a .pth file with tensors only, with torchvision's names
+            (features.0.weight, ...; others are ignored). None takes torchvision's weights if it is installed.
+        layers: features to compare, from `perceptual.LAYERS`. relu3_3 needs images of at least 4 x 4, relu5_3 of 16 x 16.
         strength: factor of the loss, > 0.
 
     Raises:
-        InputError: no PyTorch, weights that are missing, damaged or of another network, no such layer; from `value`, an image that is too
-            small for a layer.
+        InputError: PyTorch is missing; weights are missing, damaged or of another network; a layer does not exist; `value` gets an image
+            that is too small for a layer.
     """
 
     weights: str | Path | None = None
@@ -73,7 +73,7 @@ class Perceptual:
         object.__setattr__(self, "layers", tuple(self.layers))
         if self.weights is not None and not isinstance(self.weights, (str, Path)):
             raise InputError(f"Perceptual: weights must be a file, got {self.weights!r}")
-        self._network(np.dtype(np.float32))  # so that a wrong file is known now
+        self._network(np.dtype(np.float32))  # reports an invalid file at construction
 
     @property
     def linear(self) -> bool:
@@ -86,19 +86,19 @@ class Perceptual:
         return False
 
     def value(self, image: Array, reference: Array) -> Array:
-        """See `Loss.value`: of images (..., H, W, 3), the loss of each, everywhere in it."""
+        """Return the loss of each image (..., H, W, 3), repeated in all its elements."""
         seen = arrays.numpy(image)
         losses, _ = self._compare(seen, arrays.numpy(reference), derivative=False)
         return arrays.like(np.broadcast_to(losses[..., None, None, None], seen.shape), image)
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """See `Loss.derivative`: of images (..., H, W, 3), H · W · 3 times the derivative of the loss."""
+        """Return H · W · 3 times the derivative of each image's loss, (..., H, W, 3)."""
         seen = arrays.numpy(image)
         _, slope = self._compare(seen, arrays.numpy(reference), derivative=True)
         return arrays.like(slope * float(np.prod(seen.shape[-3:])), image)
 
     def _compare(self, image: np.ndarray, reference: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The loss of each image, (...), and its derivative, (..., H, W, 3); zeros where that is not asked for."""
+        """Return the loss of each image, (...), and its derivative, (..., H, W, 3); zeros if it is not requested."""
         torch = _torch()
         height, width = image.shape[-3:-1]
         for name in self.layers:
@@ -125,11 +125,11 @@ class Perceptual:
 
 
 class _Network:
-    """The part of VGG-16 that some layers need.
+    """The layers of VGG-16 up to the last one that is compared.
 
     Args:
         tensors: {"features.0.weight": ...}.
-        layers: names of `LAYERS`.
+        layers: names in `LAYERS`.
         dtype: "float32" or "float64".
     """
 
@@ -154,15 +154,15 @@ class _Network:
             number += 1
 
     def features(self, images: Any) -> list[Any]:
-        """What the layers answer to images (B, H, W, 3), linear: tensors (B, C, H', W')."""
+        """Return the features of images (B, H, W, 3), linear: one tensor (B, C, H', W') per layer."""
         torch = _torch()
         x = torch.clamp(images, min=0)
         x = torch.where(x <= 0.0031308, 12.92 * x, 1.055 * torch.clamp(x, min=0.0031308) ** (1 / 2.4) - 0.055)
         x = ((x - x.new_tensor(_MEAN)) / x.new_tensor(_DEVIATION)).movedim(-1, 1)
-        found = {}
+        features = {}
         for name, stage in self._stages:
-            x = found[name] = stage(x)
-        return [found[name] for name in self._wanted]
+            x = features[name] = stage(x)
+        return [features[name] for name in self._wanted]
 
 
 def _torch() -> Any:
@@ -174,7 +174,7 @@ def _torch() -> Any:
 
 
 def _age(path: Path | None) -> int:
-    """Tells a file from the one that it was."""
+    """Return the modification time of a file, which invalidates the cache when it changes."""
     try:
         return 0 if path is None else path.stat().st_mtime_ns
     except OSError as error:
@@ -198,18 +198,18 @@ def _read(path: Path) -> Mapping[str, Any]:
         raise InputError("not a file")
     version = tuple(int(part) for part in re.findall(r"\d+", torch.__version__)[:2])
     if path.suffix.lower() != ".safetensors" and version < _SAFE_UNPICKLER:
-        raise InputError(f"expected a .safetensors file: PyTorch {torch.__version__} may run code that lies in another")
+        raise InputError(f"expected a .safetensors file: PyTorch {torch.__version__} may execute code from other files")
     try:
         if path.suffix.lower() == ".safetensors":
             from safetensors.torch import load_file  # pyright: ignore[reportMissingImports]
 
             return load_file(path)
-        found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # PyTorch throws whatever its unpickler and its zip reader throw
+        tensors = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # PyTorch's unpickler and zip reader may raise anything
         raise InputError(f"cannot be read: {reason_of(error, 200)}") from error
-    if not isinstance(found, Mapping):
-        raise InputError(f"expected named tensors, found a {type(found).__name__}")
-    return found
+    if not isinstance(tensors, Mapping):
+        raise InputError(f"expected named tensors, found a {type(tensors).__name__}")
+    return tensors
 
 
 def _from_torchvision() -> Mapping[str, Any]:
@@ -219,16 +219,16 @@ def _from_torchvision() -> Mapping[str, Any]:
         raise InputError("torchvision is not installed; give a file of weights, or pip install torchvision") from error
     try:
         return VGG16_Weights.IMAGENET1K_V1.get_state_dict(progress=False)
-    except Exception as error:  # the network's, the disk's
+    except Exception as error:  # network or disk errors
         raise InputError(f"cannot be fetched: {' '.join(str(error).split())[:200]}") from error
 
 
 def _tensor(tensors: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Any:
     if name not in tensors:
         raise InputError(f"has no {name}; expected those of VGG-16, as torchvision names them")
-    found = tensors[name]
-    if tuple(np.shape(found)) != shape:
-        raise InputError(f"{name} must be of shape {shape}, got {tuple(np.shape(found))}")
-    if not bool(_torch().isfinite(found).all()):
+    tensor = tensors[name]
+    if tuple(np.shape(tensor)) != shape:
+        raise InputError(f"{name} must be of shape {shape}, got {tuple(np.shape(tensor))}")
+    if not bool(_torch().isfinite(tensor).all()):
         raise InputError(f"{name} has values that are not finite")
-    return found
+    return tensor

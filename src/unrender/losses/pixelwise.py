@@ -1,4 +1,4 @@
-"""Losses per pixel and channel."""
+"""Pixelwise losses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from unrender.core.registry import register
 
 
 class _Pixelwise:
-    """Of every loss here."""
+    """Base of the losses in this module."""
 
     @property
     def pixelwise(self) -> bool:
@@ -35,7 +35,7 @@ class _WithNonlinearDerivative(_Pixelwise):
 @register(position=1)
 @dataclass(frozen=True)
 class L1(_WithNonlinearDerivative):
-    """|I − R|. The derivative is the sign (0 where equal): noise biases it, the more the closer I is to R."""
+    """|I − R|. The derivative is the sign, 0 for equal values. Noise biases it more the closer I is to R."""
 
     def value(self, image: Array, reference: Array) -> Array:
         return arrays.absolute(image - reference)
@@ -60,14 +60,14 @@ class L2(_WithLinearDerivative):
 @register(position=3)
 @dataclass(frozen=True)
 class RelativeL2(_WithLinearDerivative):
-    """(I − R)² / (R² + ε): dark pixels count as much as bright ones.
+    """(I − R)² / (R² + ε), which weights dark and bright pixels alike.
 
-    The denominator holds the reference alone, never the noisy image, so the derivative stays linear. With image and adjoint from
-    independent samples, as all estimators here have them, its gradient is that of the unbiased mean relative squared error
-    (Deng et al. 2022; Pidhorskyi et al. 2022).
+    The denominator contains the reference only, not the noisy image, so the derivative is linear. The estimators sample the image and the
+    adjoint independently. The gradient is then that of the unbiased mean relative squared error (Deng et al. 2022; Pidhorskyi et al.
+    2022).
 
     Args:
-        epsilon: ε in squared radiance, > 0; below √ε the loss turns absolute.
+        epsilon: ε in squared radiance, > 0. For R below √ε the loss is nearly absolute.
     """
 
     epsilon: float = 1e-2
@@ -86,7 +86,7 @@ class RelativeL2(_WithLinearDerivative):
 @register(position=4)
 @dataclass(frozen=True)
 class Huber(_WithNonlinearDerivative):
-    """(I − R)²/2 within δ of the reference, δ (|I − R| − δ/2) beyond: the derivative is I − R clamped to [−δ, δ].
+    """(I − R)²/2 for |I − R| <= δ, else δ (|I − R| − δ/2). The derivative is I − R clamped to [−δ, δ].
 
     Args:
         delta: δ in radiance, > 0.

@@ -1,4 +1,4 @@
-"""Changes of the variable that an optimizer moves: one rate for a reflectance, a radiance of 5000 and an extinction."""
+"""Changes of variables for the optimizer, so that one learning rate suits reflectances, radiances and extinctions alike."""
 
 from unrender.parameterisations.base import Parameterisation
 from unrender.parameterisations.elementwise import Identity, Log, Logit, Softplus

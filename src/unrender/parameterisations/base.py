@@ -1,4 +1,4 @@
-"""What a parameterisation is."""
+"""Protocols of parameterisations and their maps."""
 
 from __future__ import annotations
 
@@ -9,38 +9,38 @@ import numpy as np
 from unrender.core.arrays import Array
 
 Bounds = tuple[float | None, float | None]
-"""(low, high); None is open."""
+"""(low, high); None is unbounded."""
 
 
 class Transform(Protocol):
-    """A smooth increasing map x = φ(u) from the variable u that an optimizer moves to the values x of a parameter, element by element.
+    """A smooth increasing elementwise map x = φ(u) from the optimizer's variable u to the values x of a parameter.
 
-    Arrays are NumPy's or Dr.Jit's, results of the argument's type. Every x is inside the bounds, less a margin, where φ' > 0.
+    Arrays are NumPy's or Dr.Jit's, and results have the argument's type. Every x is inside the bounds less a margin, where φ' > 0.
     """
 
     def forward(self, u: Array) -> Array:
-        """φ(u)."""
+        """Return φ(u)."""
         ...
 
     def inverse(self, x: Array) -> Array:
-        """The u with φ(u) = x."""
+        """Return the u with φ(u) = x."""
         ...
 
     def slope(self, x: Array) -> Array:
-        """φ' at the u with φ(u) = x, > 0."""
+        """Return φ' > 0 at the u with φ(u) = x."""
         ...
 
     def curvature(self, x: Array) -> Array:
-        """φ'' there."""
+        """Return φ'' at the u with φ(u) = x."""
         ...
 
 
 class Parameterisation(Protocol):
-    """A rule by which a parameter becomes the variable that an optimizer moves."""
+    """A rule that defines the optimizer's variable from a parameter's bounds and initial values."""
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform | None:
-        """φ of a parameter with these bounds and initial values; None where φ(u) = u.
+        """Return φ of a parameter with these bounds and initial values; None for the identity.
 
-        Raises `InputError` for bounds that do not suit.
+        Raises `InputError` for unsuitable bounds.
         """
         ...

@@ -1,4 +1,4 @@
-"""Logarithm, logit and softplus, and none of them."""
+"""Identity, logarithm, logit and softplus."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from unrender.core.registry import register
 from unrender.parameterisations.base import Bounds, Transform
 
 _LARGEST = 80.0
-"""The magnitude of u at which exponentials end: single precision has e^88."""
+"""Magnitude at which u is clamped in exponentials: e^88 is the limit of single precision."""
 _SERIES = 0.1
-"""x/s below which log(e^(x/s) − 1) is summed as a series: relative error 3e-8 there."""
+"""x/s below which log(e^(x/s) − 1) is computed by a series; its relative error there is 3e-8."""
 
 _SMALL = 0.01
-"""e^-|u| below which log(1 + e^-|u|) is: relative error 2.5e-7 there."""
+"""e^-|u| below which log(1 + e^-|u|) is computed by a series; its relative error there is 2.5e-7."""
 
 
 @register(position=0)
 @dataclass(frozen=True)
 class Identity:
-    """u = x: steps are in units of the parameter."""
+    """u = x: steps have the parameter's unit."""
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform | None:
         del bounds, initial
@@ -33,11 +33,11 @@ class Identity:
 @register(position=1)
 @dataclass(frozen=True)
 class Log:
-    """u = log(x − low): a step η multiplies the distance from the lower bound by e^η, about a change by the share η.
+    """u = log(x − low): a step η multiplies the distance from the lower bound by e^η, a relative change of about η.
 
-    For what is positive and known to its order of magnitude alone: the radiance of a lamp, the extinction of a medium. Steps are alike
-    whatever the unit: with every value, and the rest of the problem, times c, the descent is that times c. Values near the bound move
-    slowly; at the bound itself, where φ' is 0, none is: the loop keeps a margin (`scene.bounds`). An upper bound is met by projection.
+    Use it for positive values of unknown order of magnitude: the radiance of an emitter, the extinction of a medium. Steps are invariant
+    to the unit: scaling every value and the rest of the problem by c scales the optimisation by c. Values near the bound change slowly.
+    φ' is 0 at the bound, so the loop keeps a margin (`scene.bounds`). An upper bound is enforced by projection.
     """
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform:
@@ -48,9 +48,9 @@ class Log:
 @register(position=2)
 @dataclass(frozen=True)
 class Logit:
-    """u = log(t / (1 − t)) of the place t = (x − low) / (high − low) between two bounds.
+    """u = log(t / (1 − t)) with the relative position t = (x − low) / (high − low) between two bounds.
 
-    A step η moves x by η t (1 − t) (high − low): by a quarter of the range times η in the middle, ever less towards either bound.
+    A step η changes x by η t (1 − t) (high − low): η times a quarter of the range in the middle, and less towards either bound.
     """
 
     def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform:
@@ -66,12 +66,12 @@ class Logit:
 @register(position=3)
 @dataclass(frozen=True)
 class Softplus:
-    """x = low + s log(1 + e^u): `log` where x − low is below the scale s, and steps of η s where it is well above.
+    """x = low + s log(1 + e^u), which acts as `Log` for x − low below the scale s and linearly, with steps η s, well above it.
 
-    For what is positive, and may have to become nearly nothing in places: a grid of extinction.
+    Use it for positive values that may nearly vanish in places, such as a grid of extinction.
 
     Args:
-        scale: s, in units of the parameter, > 0; None for the root mean square of the initial values' distance from the bound, 1 where
+        scale: s, in the parameter's unit, > 0. None takes the root mean square distance of the initial values from the bound, or 1 if
             that is 0.
     """
 
@@ -127,7 +127,7 @@ class _Logit:
         return below * above * (above - below) * self.range
 
     def _parts(self, x: Array) -> tuple[Array, Array]:
-        """t and 1 − t."""
+        """Return t and 1 − t."""
         below = (x - self.low) * (1.0 / self.range)
         return below, (self.low + self.range - x) * (1.0 / self.range)
 
@@ -158,7 +158,7 @@ class _Softplus:
         return share * (1.0 - share) * self.scale
 
     def _share(self, x: Array) -> Array:
-        """1 / (1 + e^-u) = 1 − e^(−y), for y = (x − low) / s."""
+        """Return 1 / (1 + e^-u) = 1 − e^(−y) for y = (x − low) / s."""
         y = (x - self.low) * (1.0 / self.scale)
         series = y * (1.0 - y * (0.5 - y * (1 / 6 - y * (1 / 24))))
         return arrays.where(y < _SERIES, series, 1.0 - arrays.exp(-arrays.maximum(y, _SERIES)))

@@ -1,4 +1,4 @@
-"""Linear maps that turn one parameter's gradient into a better direction."""
+"""Preconditioners: linear maps of one parameter's gradients and steps."""
 
 from unrender.preconditioners.base import Preconditioner
 from unrender.preconditioners.laplacian_pyramid import LaplacianPyramid

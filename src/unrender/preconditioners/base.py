@@ -1,4 +1,4 @@
-"""What a preconditioner is."""
+"""Protocols of preconditioners."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from unrender.preconditioners.mesh import MeshTopology
 
 
 class Preconditioner(Protocol):
-    """A symmetric positive linear map S of one parameter's gradients and steps.
+    """A symmetric positive definite linear map S of one parameter's gradients and steps.
 
-    The loop hands S g to the optimizer and adds S (step): descent in the coordinates u where the parameter is x = S u.
+    The loop passes S g to the optimizer and adds S (step) to the parameter. This is an optimisation in coordinates u with x = S u.
     """
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
-        """Raise `InputError` where this map does not suit a parameter of that shape."""
+        """Raise `InputError` if this map does not support a parameter of this shape."""
         ...
 
     def apply(self, x: Array) -> Array:
-        """S x, of the shape and kind of `x`."""
+        """Return S x, with the shape and type of `x`."""
         ...
 
 
 @runtime_checkable
 class MeshPreconditioner(Protocol):
-    """A preconditioner that suits values at the vertices of a mesh, such as positions, once it knows the mesh."""
+    """A preconditioner that supports values at mesh vertices, such as positions, once it is bound to the mesh."""
 
     def on_mesh(self, topology: MeshTopology) -> Preconditioner:
-        """The same for values at the V vertices of a mesh, (n V,)."""
+        """Return the preconditioner for n values at each of the V vertices of a mesh, (n V,)."""
         ...
 
 
 @runtime_checkable
 class PeriodicPreconditioner(Protocol):
-    """A preconditioner that suits an array whose outer columns repeat those of the opposite end, such as an environment map."""
+    """A preconditioner that supports arrays with repeated border columns, such as environment maps."""
 
     def on_repeated(self, columns: int) -> Preconditioner:
-        """Return the same for (H, W + 2 `columns`, C): neighbours go on across the left and right borders."""
+        """Return the preconditioner for (H, W + 2 `columns`, C), where the left and right borders are neighbours."""
         ...
 
 
@@ -48,12 +48,13 @@ _Inner = TypeVar("_Inner", bound=Preconditioner)
 
 @dataclass(frozen=True)
 class Around(Generic[_Inner]):
-    """A preconditioner applied to the columns that are unknown; the others are copies of the result.
+    """A preconditioner of the interior columns. The repeated border columns are copies of the result.
 
-    The map is symmetric and positive on these columns, as `inner` is. Computed on the host, of the argument's type.
+    The map is symmetric and positive definite on the interior columns, as `inner` is. Computed on the host; the result has the argument's
+    type.
 
     Args:
-        inner: suits (H, W, C), with neighbours across the left and right borders.
+        inner: preconditioner of (H, W, C) that wraps across the left and right borders.
         columns: number of repeated columns at each end of (H, W + 2 `columns`, C).
     """
 
@@ -61,15 +62,15 @@ class Around(Generic[_Inner]):
     columns: int
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
-        """Raise `InputError` where `inner` does not suit the unknown columns."""
+        """Raise `InputError` if `inner` does not support the interior columns."""
         self.inner.check(key, periodic.interior_shape(shape, self.columns))
 
     def apply(self, x: Array) -> Array:
-        """Return S x, of the shape and kind of `x`."""
-        found = self.inner.apply(periodic.interior(arrays.numpy(x), self.columns))
-        return arrays.like(periodic.pad(found, self.columns), x)
+        """Return S x, with the shape and type of `x`."""
+        result = self.inner.apply(periodic.interior(arrays.numpy(x), self.columns))
+        return arrays.like(periodic.pad(result, self.columns), x)
 
 
 def around_axis(wrap: bool | tuple[bool, ...]) -> tuple[bool, ...]:
-    """Return which of the two axes of an environment map (H, W, C) wrap, given what the preconditioner was asked for."""
+    """Return whether each of the two axes of an environment map (H, W, C) wraps; `wrap` is the preconditioner's setting."""
     return (wrap[0] if isinstance(wrap, tuple) else False, True)

@@ -1,11 +1,11 @@
-"""Solvers of (I + λ L) y = x on a grid, L its graph Laplacian, and powers of its inverse.
+"""Solvers of (I + λ L) y = x on a grid with graph Laplacian L, and of powers of its inverse.
 
-(L x)_i is the sum of x_i − x_j over the neighbours j of cell i, one before and one after along each axis. At the
-border there is no neighbour (zero slope), or with `wrap` the cell at the other end.
+(L x)_i is the sum of x_i − x_j over the neighbours j of cell i, one on each side along each axis. Beyond a border there is no neighbour
+(zero slope), or with `wrap` the cell at the other end.
 
-Two solvers of the same system. In two dimensions the sparse Cholesky factor is small. In three its fill-in grows like
-n^(4/3): 48³ cells take half a minute and 64³ several, so there the Laplacian is diagonalised instead, by the cosine
-transform along axes with a border and the Fourier transform along axes that wrap.
+Two solvers are used. In two dimensions the sparse Cholesky factor is small. In three dimensions its fill-in grows as n^(4/3): 48³ cells
+take half a minute and 64³ several. There the Laplacian is diagonalised by the cosine transform along axes with borders, and by the
+Fourier transform along axes that wrap.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from unrender.core.errors import InputError
 
 
 class Solver(Protocol):
-    """(I + λ L)^-1 on one grid."""
+    """Solver of (I + λ L) y = x on one grid."""
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        """y with (I + λ L) y = x, each channel by itself. x, y: (*grid, channels), float32."""
+        """Return y with (I + λ L) y = x, for each channel separately. x, y: (*grid, channels), float32."""
         ...
 
 
 class CholeskySolver:
-    """By sparse Cholesky factorisation, once; a solve costs the factor's entries."""
+    """Solver by a sparse Cholesky factorisation that is computed once. A solve takes time proportional to the factor's entries."""
 
     def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]):
         import scipy.sparse
@@ -50,10 +50,10 @@ class CholeskySolver:
 
 
 class Transform:
-    """The orthonormal transform in which L is diagonal: of cosines along axes with a border, Fourier's along axes that wrap.
+    """The orthonormal transform that diagonalises L: cosine transform along axes with borders, Fourier transform along axes that wrap.
 
     Attributes:
-        eigenvalues: of L, (*grid, 1).
+        eigenvalues: eigenvalues of L, (*grid, 1).
     """
 
     def __init__(self, grid: tuple[int, ...], wrap: tuple[bool, ...]):
@@ -66,7 +66,7 @@ class Transform:
             self.eigenvalues += along.reshape([-1 if a == axis else 1 for a in range(len(grid) + 1)])
 
     def forward(self, x: np.ndarray) -> np.ndarray:
-        """The spectrum of x, (*grid, channels), float32; complex where axes wrap."""
+        """Return the spectrum of x, (*grid, channels), float32; complex if an axis wraps."""
         import scipy.fft
 
         y = np.asarray(x, np.float32)
@@ -75,7 +75,7 @@ class Transform:
         return np.asarray(scipy.fft.fftn(y, axes=self._wrapped, norm="ortho")) if self._wrapped else y
 
     def backward(self, spectrum: np.ndarray) -> np.ndarray:
-        """The array that has this spectrum, float32."""
+        """Return the array with this spectrum, float32."""
         import scipy.fft
 
         y = spectrum
@@ -87,7 +87,7 @@ class Transform:
 
 
 class TransformSolver:
-    """By the transform in which L is diagonal: n log n, nothing to factorise. Solves (I + λ L)^power y = x."""
+    """Solver of (I + λ L)^power y = x by the diagonalising transform, in O(n log n) without factorisation."""
 
     def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float = 1.0):
         self._transform = transform(grid, wrap)
@@ -99,13 +99,13 @@ class TransformSolver:
 
 @lru_cache(maxsize=16)
 def transform(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Transform:
-    """The transform of one grid, made once; `wrap` says per axis whether its two ends are neighbours."""
+    """Return the cached transform of a grid; `wrap` states per axis whether its two ends are neighbours."""
     return Transform(grid, wrap)
 
 
 @lru_cache(maxsize=16)
 def solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Solver:
-    """The solver of one system, made once.
+    """Return the cached solver of one system.
 
     Args:
         strength: λ, >= 0.
@@ -117,12 +117,12 @@ def solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]) -> So
 
 @lru_cache(maxsize=16)
 def square_root_solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Solver:
-    """The solver of (I + λ L)^(1/2) y = x; arguments as for `solver`."""
+    """Return the cached solver of (I + λ L)^(1/2) y = x; arguments as in `solver`."""
     return TransformSolver(strength, grid, wrap, 0.5)
 
 
 def check(owner: str, key: str, shape: tuple[int, ...], wrap: bool | tuple[bool, ...]) -> None:
-    """Raise `InputError` unless `shape` is a texture's or a grid's of more than one texel, and `wrap` has as many axes."""
+    """Raise `InputError` unless `shape` is a texture or grid of more than one texel and `wrap` has as many axes."""
     if len(shape) not in (3, 4) or int(np.prod(shape[:-1])) < 2 or shape[-1] < 1:
         raise InputError(
             f"{key}: preconditioner {owner} needs a texture (H, W, C) or a grid (Z, Y, X, C) of more than one "
@@ -136,26 +136,26 @@ def check(owner: str, key: str, shape: tuple[int, ...], wrap: bool | tuple[bool,
 
 
 def is_map(shape: tuple[int, ...]) -> bool:
-    """Whether a shape is that of a texture (H, W, C) or a grid (Z, Y, X, C) with neighbours to average with."""
+    """Return whether a shape is a texture (H, W, C) or grid (Z, Y, X, C) with more than two texels along some axis."""
     return len(shape) in (3, 4) and shape[-1] > 0 and min(shape[:-1], default=0) > 0 and max(shape[:-1]) > 2
 
 
 def wraps(owner: str, wrap: Any) -> bool | tuple[bool, ...]:
-    """What a preconditioner was given for `wrap`, a list of a problem file as a tuple. Raises `InputError` for anything else."""
-    found = tuple(wrap) if isinstance(wrap, list) else wrap  # TOML gives lists, which have no hash
-    axes = found if isinstance(found, tuple) else (found,)
+    """Return the setting `wrap` with a list converted to a tuple. Raises `InputError` for anything else than booleans."""
+    setting = tuple(wrap) if isinstance(wrap, list) else wrap  # TOML has lists, which are not hashable
+    axes = setting if isinstance(setting, tuple) else (setting,)
     if not axes or not all(isinstance(wraps, bool) for wraps in axes):
-        raise InputError(f"{owner}: wrap must be true, false, or one of these per axis, got {found!r}")
-    return found
+        raise InputError(f"{owner}: wrap must be true, false, or one of these per axis, got {setting!r}")
+    return setting
 
 
 def per_axis(wrap: bool | tuple[bool, ...], axes: int) -> tuple[bool, ...]:
-    """`wrap` as one truth value per axis."""
+    """Return `wrap` as one truth value per axis."""
     return wrap if isinstance(wrap, tuple) else (wrap,) * axes
 
 
 def laplacian(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> scipy.sparse.csr_matrix:
-    """L as a sparse matrix over the cells in row-major order: symmetric, positive semi-definite, rows sum to 0."""
+    """Return L as a sparse matrix over the cells in row-major order: symmetric, positive semi-definite, with zero row sums."""
     import scipy.sparse
 
     cells = int(np.prod(grid))
@@ -163,9 +163,9 @@ def laplacian(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> scipy.sparse.csr
     starts, ends = [], []
     for axis, (size, wraps) in enumerate(zip(grid, wrap, strict=True)):
         after = np.roll(index, -1, axis)
-        kept = range(size if wraps else size - 1)
-        starts.append(np.take(index, kept, axis).ravel())
-        ends.append(np.take(after, kept, axis).ravel())
+        starting = range(size if wraps else size - 1)
+        starts.append(np.take(index, starting, axis).ravel())
+        ends.append(np.take(after, starting, axis).ravel())
     i, j = np.concatenate(starts), np.concatenate(ends)
     edges = scipy.sparse.coo_matrix((np.ones(len(i)), (i, j)), (cells, cells))
     adjacency = edges + edges.T

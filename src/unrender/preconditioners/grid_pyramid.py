@@ -1,6 +1,6 @@
-"""Powers of (I + λ L)^-1 on large grids, near enough, in time proportional to the number of cells, where the array is.
+"""Approximate powers of (I + λ L)^-1 on large grids, on the device, in time proportional to the number of cells.
 
-A sum over the levels of a pyramid as in Bramble, Pasciak and Xu 1990, "Parallel Multilevel Preconditioners".
+They are sums over the levels of a pyramid as in Bramble, Pasciak and Xu 1990, "Parallel Multilevel Preconditioners".
 """
 
 from __future__ import annotations
@@ -16,31 +16,31 @@ from unrender.core.arrays import Array
 from unrender.preconditioners import grid
 
 LARGEST_EXACT = 1 << 17
-"""Cells up to which transforms of the whole grid are used in place of a pyramid."""
+"""Number of cells up to which transforms of the full grid are used in place of a pyramid."""
 _COARSEST = 1 << 16
-"""Cells of the coarsest level, at most, and of what `GridPyramid.summary` has of each finer one."""
+"""Maximum number of cells of the coarsest level, and of the samples of each finer level in `GridPyramid.summary`."""
 _PER_OCTAVE, _FINER = 8, 3
-"""Frequencies per octave and direction that weights are fitted at, and octaves below the coarsest level's that they reach."""
+"""Frequencies per octave and direction at which weights are fitted, and octaves below the coarsest level that the fit includes."""
 _CORRECTED = 0.3
-"""Gain of the interpolation from which the coarsest level corrects what the sum is off by."""
+"""Gain of the interpolation at which the coarsest level corrects the error of the sum by half."""
 _SMALLEST = 1e-12
-"""Gain that is divided by, at least."""
+"""Smallest gain that is divided by."""
 
 
 class GridPyramid:
-    """(I + λ L)^-p as S = c_0 I + P (c_1 I + P (c_2 I + ... P M R ...) R) R on a grid with borders, each channel by itself.
+    """Approximation S = c_0 I + P (c_1 I + P (c_2 I + ... P M R ...) R) R of (I + λ L)^-p on a grid with borders, per channel.
 
-    R halves every side, rounded upwards, with weights (1, 3, 3, 1) / 8 along each axis; P interpolates linearly between the centres of
-    cells, and is R's adjoint but for a factor and for the last cells of odd sides. Of a wave of frequency f, P R leaves cos(f/2)^6 along
-    each axis. With c >= 0 fitted to that by non-negative least squares of relative errors, S is between 0.8 and 1.4 times what it stands
-    for where detail is of some cells, at p = 1/2, and within some percent for what is coarser, where M, diagonal in the cosine transform of
-    the coarsest level, mends what the sum is off by. Constants pass unchanged.
+    R halves every side, rounded up, with weights (1, 3, 3, 1) / 8 along each axis. P interpolates linearly between the centres of cells.
+    P is the adjoint of R up to a factor, except at the last cells of odd sides. P R multiplies a wave of frequency f by cos(f/2)^6 along
+    each axis. The weights c >= 0 are fitted by non-negative least squares of relative errors. At p = 1/2, S is between 0.8 and 1.4 times
+    the exact map for detail of a few cells, and within a few percent for coarser structure. There M, diagonal in the cosine transform of
+    the coarsest level, corrects the error of the sum. Constants are preserved.
 
     Args:
         cells: sides of the grid, two or three.
 
     Attributes:
-        levels: sides of each level, from the finest to the first of at most 65536 cells.
+        levels: sides of each level, from the finest to the first with at most 65536 cells.
     """
 
     def __init__(self, cells: tuple[int, ...]):
@@ -50,7 +50,7 @@ class GridPyramid:
         self._weights = lru_cache(maxsize=64)(self._fitted)
 
     def apply(self, x: Array, strength: float, power: float) -> Array:
-        """S x, of the shape (*cells, channels) and kind of x, evaluated. Waits for the device."""
+        """Return S x, with the shape (*cells, channels) and type of x, evaluated. Waits for the device."""
         shape = arrays.shape(x)
         weights, gain = self._weights(strength, power)
         parts = self._restricted(x)
@@ -65,38 +65,40 @@ class GridPyramid:
         return arrays.shaped(y, shape, x)
 
     def summary(self, x: Array) -> np.ndarray:
-        """What `products` needs of x, (n,) float32: the coarsest level, and of each finer one a cell of each of some 65536 blocks.
+        """Return the part of x that `products` needs, (n,) float32: the coarsest level, and of each finer level one cell per block.
 
-        The cells are the same for all x. Waits for the device.
+        The sampled cells are the same for all x. Waits for the device.
         """
         parts, channels = self._restricted(x), arrays.shape(x)[-1]
-        found = [arrays.numpy(_rows(part, cells, channels)) for part, cells in zip(parts, self._samples, strict=False)]
-        return np.concatenate([*found, arrays.numpy(parts[-1])]).astype(np.float32)
+        samples = [
+            arrays.numpy(_rows(part, cells, channels)) for part, cells in zip(parts, self._samples, strict=False)
+        ]
+        return np.concatenate([*samples, arrays.numpy(parts[-1])]).astype(np.float32)
 
     def products(self, first: np.ndarray, second: np.ndarray, strengths: np.ndarray) -> np.ndarray:
-        """x · (I + λ L)^-1 y for each λ of `strengths`, (n,) float64, of the summaries of x and y: estimates, by the cells in these."""
+        """Estimate x · (I + λ L)^-1 y for each λ of `strengths`, (n,) float64, from the summaries of x and y."""
         axes, coarsest = len(self.levels[0]), math.prod(self.levels[-1])
         counts = [len(cells) for cells in self._samples]
         channels = len(first) // (sum(counts) + coarsest)
-        whole, ends = math.prod(self.levels[0]) / coarsest, channels * np.cumsum(counts)
+        cells_per_coarse, ends = math.prod(self.levels[0]) / coarsest, channels * np.cumsum(counts)
         *fine, last = np.split(first.astype(np.float64) * second, ends)
-        detail = np.array([whole * part.sum() for part in fine])
+        detail = np.array([cells_per_coarse * part.sum() for part in fine])
         transform = grid.transform(self.levels[-1], (False,) * axes)
         one, other = (
             transform.forward(x[len(x) - last.size :].reshape(*self.levels[-1], channels)) for x in (first, second)
         )
-        spectrum = whole * (one.astype(np.float64) * other).sum(axis=-1, keepdims=True)
-        found = []
+        spectrum = cells_per_coarse * (one.astype(np.float64) * other).sum(axis=-1, keepdims=True)
+        products = []
         for strength in strengths:
             weights, gain = self._weights(float(np.float32(strength)), 1.0)
-            found.append((weights * detail).sum() + (gain * spectrum).sum())
-        return np.array(found)
+            products.append((weights * detail).sum() + (gain * spectrum).sum())
+        return np.array(products)
 
     @cached_property
     def _samples(self) -> list[np.ndarray]:
-        """Of each level but the coarsest, one cell of each block of those that a cell of the coarsest covers."""
+        """For each level but the coarsest, one cell of each block that a cell of the coarsest level covers."""
         rng = np.random.default_rng(0)
-        found = []
+        samples = []
         for level, cells in enumerate(self.levels[:-1]):
             side = 1 << (len(self.levels) - 1 - level)
             index = np.zeros(self.levels[-1], np.int64)
@@ -104,11 +106,11 @@ class GridPyramid:
                 block = np.arange(self.levels[-1][axis]).reshape([-1 if a == axis else 1 for a in range(len(cells))])
                 at = np.minimum(side * block + rng.integers(side, size=index.shape), size - 1)
                 index = index * size + at
-            found.append(index.reshape(-1))
-        return found
+            samples.append(index.reshape(-1))
+        return samples
 
     def _restricted(self, x: Array) -> list[Array]:
-        """R^l x of each level l, (cells · channels,) each."""
+        """Return R^l x of each level l, (cells · channels,) each."""
         parts, channels = [arrays.flat(x)], arrays.shape(x)[-1]
         arrays.evaluate(parts[0])
         for fine, coarse in itertools.pairwise(self.levels):
@@ -117,7 +119,7 @@ class GridPyramid:
         return parts
 
     def _fitted(self, strength: float, power: float) -> tuple[np.ndarray, np.ndarray]:
-        """c of all levels but the coarsest, and M's diagonal there, (*cells, 1) float32."""
+        """Return c of all levels but the coarsest, and the diagonal of M, (*cells, 1) float32."""
         from scipy.optimize import nnls
 
         eigenvalues, gains = self._fitted_waves
@@ -125,16 +127,16 @@ class GridPyramid:
         eigenvalues, gains = self._coarse_waves
         finer = len(self.levels) - 1
         weights[:finer] /= max(1.0, weights[:finer].sum())
-        interpolation, found = gains[finer], np.tensordot(weights, gains, 1)
+        interpolation, response = gains[finer], np.tensordot(weights, gains, 1)
         tail = np.tensordot(weights[finer:], gains[finer:], 1) / np.maximum(interpolation, _SMALLEST)
-        missing = (1.0 + strength * eigenvalues) ** -power - found
+        missing = (1.0 + strength * eigenvalues) ** -power - response
         mended = tail + missing * interpolation / (interpolation**2 + _CORRECTED**2)
         mended[(0,) * mended.ndim] = 1.0 - weights[:finer].sum()
         return weights[:finer], np.maximum(mended, 0.0)[..., None].astype(np.float32)
 
     @cached_property
     def _fitted_waves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Eigenvalues of L, (n,), and gains of P^l R^l, (levels, n), of waves that weights are fitted at."""
+        """Eigenvalues of L, (n,), and gains of P^l R^l, (levels, n), of the waves at which weights are fitted."""
         octaves = np.arange(0, len(self.levels) + _FINER, 1 / _PER_OCTAVE)
         directions = [d for d in itertools.product((0.0, 0.5, 1.0), repeat=len(self.levels[0])) if max(d) == 1.0]
         waves = np.pi * (2.0 ** -octaves[:, None, None] * np.array(directions)).reshape(-1, len(self.levels[0]))
@@ -142,33 +144,33 @@ class GridPyramid:
 
     @cached_property
     def _coarse_waves(self) -> tuple[np.ndarray, np.ndarray]:
-        """Likewise of those of the coarsest level's transform, (*cells,) and (levels, *cells)."""
+        """The same for the waves of the coarsest level's transform: (*cells,) and (levels, *cells)."""
         sides = [np.pi / side * np.arange(side) for side in self.levels[-1]]
         waves = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1) * 0.5 ** (len(self.levels) - 1)
         return _eigenvalues(waves), _gains(waves, len(self.levels) + _FINER)
 
 
 def _eigenvalues(waves: np.ndarray) -> np.ndarray:
-    """Of L, of waves of frequencies (..., axes)."""
+    """Return the eigenvalues of L for waves of frequencies (..., axes)."""
     return (2.0 - 2.0 * np.cos(waves)).sum(axis=-1)
 
 
 def _gains(waves: np.ndarray, count: int) -> np.ndarray:
-    """What P^l R^l leaves of waves of frequencies (..., axes), for l = 0, ..., count - 1: (count, ...)."""
-    found = [np.ones(waves.shape[:-1])]
+    """Return the gains of P^l R^l for waves of frequencies (..., axes), for l = 0, ..., count - 1: (count, ...)."""
+    gains = [np.ones(waves.shape[:-1])]
     for level in range(count - 1):
-        found.append(found[-1] * np.prod(np.cos(2.0 ** (level - 1) * waves) ** 6, axis=-1))
-    return np.stack(found)
+        gains.append(gains[-1] * np.prod(np.cos(2.0 ** (level - 1) * waves) ** 6, axis=-1))
+    return np.stack(gains)
 
 
 def _coordinates(index: Array, sides: tuple[int, ...]) -> list[Array]:
-    """Of elements in row-major order, along each axis."""
-    found = []
+    """Return the coordinates along each axis of elements in row-major order."""
+    coordinates = []
     for side in reversed(sides):
-        above = index // side
-        found.append(index - above * side)
-        index = above
-    return found[::-1]
+        quotient = index // side
+        coordinates.append(index - quotient * side)
+        index = quotient
+    return coordinates[::-1]
 
 
 def _strides(cells: tuple[int, ...], channels: int) -> list[int]:
@@ -176,7 +178,7 @@ def _strides(cells: tuple[int, ...], channels: int) -> list[int]:
 
 
 def _weighted(x: Array, offset: Array, taps: list[list[tuple[Array, float]]]) -> Array:
-    """Σ w x[offset + o] over the products of the taps (o, w) of the axes."""
+    """Return Σ w x[offset + o] over the products of the axes' taps (o, w)."""
     if not taps:
         return arrays.gather(x, offset)
     along, *rest = taps
@@ -187,7 +189,7 @@ def _weighted(x: Array, offset: Array, taps: list[list[tuple[Array, float]]]) ->
 
 
 def _halved(x: Array, fine: tuple[int, ...], coarse: tuple[int, ...], channels: int) -> Array:
-    """R x; beyond a border are the cells at it."""
+    """Return R x; border cells are repeated beyond the border."""
     *at, channel = _coordinates(arrays.arange(x, math.prod(coarse) * channels), (*coarse, channels))
     taps = []
     for cell, side, stride in zip(at, fine, _strides(fine, channels), strict=True):
@@ -200,7 +202,7 @@ def _halved(x: Array, fine: tuple[int, ...], coarse: tuple[int, ...], channels: 
 
 
 def _interpolated(y: Array, coarse: tuple[int, ...], fine: tuple[int, ...], channels: int) -> Array:
-    """P y; beyond a border are the cells at it."""
+    """Return P y; border cells are repeated beyond the border."""
     *at, channel = _coordinates(arrays.arange(y, math.prod(fine) * channels), (*fine, channels))
     taps = []
     for cell, side, stride in zip(at, coarse, _strides(coarse, channels), strict=True):
@@ -212,12 +214,12 @@ def _interpolated(y: Array, coarse: tuple[int, ...], fine: tuple[int, ...], chan
 
 
 def _rows(x: Array, cells: np.ndarray, channels: int) -> Array:
-    """The channels of the given cells, flat."""
+    """Return the channels of these cells, flat."""
     index = (cells[:, None] * channels + np.arange(channels)).reshape(-1)
     return arrays.gather(x, arrays.like_integers(index, x))
 
 
 @lru_cache(maxsize=16)
 def pyramid(cells: tuple[int, ...]) -> GridPyramid:
-    """The pyramid of one grid, made once."""
+    """Return the cached pyramid of a grid."""
     return GridPyramid(cells)

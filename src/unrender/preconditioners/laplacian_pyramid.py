@@ -1,8 +1,8 @@
-"""Steps of textures and grids at all scales at once: those of the coefficients of a Laplacian pyramid.
+"""Preconditioner of textures and grids by a Laplacian pyramid, which takes steps at all scales.
 
-Burt and Adelson 1983, "The Laplacian Pyramid as a Compact Image Code"; as a preconditioner of inverse rendering Weier et al. 2025,
-"Practical Inverse Rendering of Textured and Translucent Appearance"; sums over levels as preconditioners are those of Bramble, Pasciak and
-Xu 1990, "Parallel Multilevel Preconditioners".
+Burt and Adelson 1983, "The Laplacian Pyramid as a Compact Image Code". Weier et al. 2025, "Practical Inverse Rendering of Textured and
+Translucent Appearance", use it in inverse rendering. Bramble, Pasciak and Xu 1990, "Parallel Multilevel Preconditioners", introduce sums
+over levels as preconditioners.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ from unrender.preconditioners import grid
 from unrender.preconditioners.base import Around, around_axis
 
 _LEAST_FALLOFF = 0.001
-"""Below it, nothing but the coarsest level moves."""
+"""Smallest falloff: below it, almost only the coarsest level receives steps."""
 
 
 @register
 @dataclass(frozen=True)
 class LaplacianPyramid:
-    """S = Σ_l a_l U_l D_l^-1 U_lᵀ over the levels l of a pyramid, with Σ a_l = 1, each channel by itself.
+    """S = Σ_l a_l U_l D_l^-1 U_lᵀ over the levels l of a pyramid, with Σ a_l = 1, for each channel separately.
 
-    A texture that is the sum Σ_l U_l p_l of a pyramid of levels p_l, each half as fine as the one before and interpolated linearly by U_l
-    to the texture's resolution, moves along Σ_l U_l U_lᵀ g when the levels descend in place of texels: all that a coarse texel covers moves
-    together, while level 0, U_0 = I, leaves all detail within reach. D_l, the diagonal matrix of the sums U_lᵀ 1, makes of U_lᵀ g a mean
-    over what the coarse texel covers, so that constants pass unchanged whatever the shares a_l. S is symmetric, its eigenvalues lie in
-    [a_0, 1].
+    Consider a texture Σ_l U_l p_l with levels p_l of halved resolution, interpolated linearly by U_l to the texture's resolution.
+    Gradient descent on the levels changes the texture along Σ_l U_l U_lᵀ g. All texels under a coarse texel then change together, and
+    level 0, U_0 = I, keeps all detail reachable. D_l is the diagonal matrix of the sums U_lᵀ 1. It turns U_lᵀ g into a mean, so that
+    constants are preserved for all shares a_l. S is symmetric with eigenvalues in [a_0, 1].
 
-    Adam stands between gradient and step here, as with the other preconditioners: it normalises per texel what all levels together make
-    of a gradient. Weier et al. have it normalise the coefficients of each level apart, which no map from texels to texels can.
+    Adam normalises the sum of all levels per texel, as with the other preconditioners. Weier et al. normalise the coefficients of each
+    level separately, which a map from texels to texels cannot do.
 
-    With a `falloff` of r the shares a_l grow as 1/r^l: what varies over 2^l texels moves as if by shares of up to l. At 1/2, S
-    falls in proportion to the frequency, as `Sobolev` does where λ is large; at 1, of equal shares, only with its logarithm.
+    With `falloff` r the shares a_l grow as 1/r^l: structure of 2^l texels is scaled by the shares up to level l. At r = 1/2, S decreases
+    in proportion to the frequency, as `Sobolev` does for large λ. At r = 1, with equal shares, it decreases with the logarithm of the
+    frequency.
 
-    Suits textures (H, W, C) and grids (Z, Y, X, C), of any sides: an odd side is halved upwards. The result is computed on the host in
-    float32, in time proportional to the number of texels, and has the argument's type; on Dr.Jit it waits for the device, and copies to
-    and fro where that is a GPU.
+    Supports textures (H, W, C) and grids (Z, Y, X, C) with any sides; odd sides are halved and rounded up. Computed on the host in
+    float32, in time proportional to the number of texels. The result has the argument's type. For Dr.Jit arrays it waits for the device,
+    and copies to and from a GPU.
 
     Args:
-        levels: of the pyramid, the texture itself among them, >= 1; 1 does nothing. None for all, down to a single texel. More than these
-            are as all.
-        falloff: r, a level's share over that of the next coarser one, in [0.001, 1].
-        wrap: whether opposite borders are neighbours, as for a tiling texture; for all axes, or one truth value per
-            axis: an environment map (H, W, C) wraps as (False, True).
+        levels: number of levels including the texture, >= 1; 1 is the identity. None, or a larger number than exist, takes all levels
+            down to a single texel.
+        falloff: r, ratio of a level's share to that of the next coarser one, in [0.001, 1].
+        wrap: whether opposite borders are neighbours, as in a tiling texture: one truth value, or one per axis. An environment map (H, W,
+            C) wraps as (False, True).
     """
 
     levels: int | None = None
@@ -76,7 +76,7 @@ class LaplacianPyramid:
         grid.check("LaplacianPyramid", key, shape, self.wrap)
 
     def apply(self, x: Array) -> Array:
-        """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""
+        """Return S x, with the shape and type of `x`. Raises `InputError` for an unsupported shape."""
         shape = arrays.shape(x)
         self.check("parameter", shape)
         wrap = grid.per_axis(self.wrap, len(shape) - 1)
@@ -89,8 +89,8 @@ class _Level:
     """A level of the pyramid along one axis.
 
     Attributes:
-        interpolation: from this level to the next finer one, (n, m) for sides n and m; None of the texture itself.
-        sums: of the interpolation to the texture, over its texels, (m,).
+        interpolation: matrix from this level to the next finer one, (n, m) for sides n and m; None for the texture.
+        sums: column sums of the interpolation to the texture, (m,).
     """
 
     interpolation: scipy.sparse.csr_matrix | None
@@ -99,7 +99,7 @@ class _Level:
 
 @lru_cache(maxsize=64)
 def _pyramid(size: int, wraps: bool, levels: int | None) -> tuple[_Level, ...]:
-    """The levels along an axis of `size` texels, from the finest to, at most, that of a single texel."""
+    """Return the levels along an axis of `size` texels, from the finest down to at most a single texel."""
     made = [_Level(None, np.ones(size, np.float32))]
     to_texture = None
     while len(made[-1].sums) > 1 and (levels is None or len(made) < levels):
@@ -110,7 +110,7 @@ def _pyramid(size: int, wraps: bool, levels: int | None) -> tuple[_Level, ...]:
 
 
 def _interpolation(size: int, wraps: bool) -> scipy.sparse.csr_matrix:
-    """Linear interpolation between the centres of ⌈n/2⌉ texels, at those of n: (n, ⌈n/2⌉), of rows that sum to 1."""
+    """Return the linear interpolation from ⌈n/2⌉ to n texel centres, (n, ⌈n/2⌉); rows sum to 1."""
     import scipy.sparse
 
     coarse = (size + 1) // 2
@@ -123,7 +123,7 @@ def _interpolation(size: int, wraps: bool) -> scipy.sparse.csr_matrix:
 
 
 def _sum_over_levels(x: np.ndarray, axes: Sequence[tuple[_Level, ...]], falloff: float) -> np.ndarray:
-    """S x for the pyramids of each axis; a shorter axis stays at its single texel while the others go on."""
+    """Return S x for the pyramids of each axis. A shorter axis stays at a single texel on further levels."""
     count = max(len(levels) for levels in axes)
     shares = falloff ** -np.arange(count, dtype=np.float64)
     shares /= shares.sum()
@@ -139,7 +139,7 @@ def _sum_over_levels(x: np.ndarray, axes: Sequence[tuple[_Level, ...]], falloff:
 
 
 def _covered(axes: Sequence[tuple[_Level, ...]], level: int) -> np.ndarray:
-    """D_l, (*coarse grid, 1): the product of what the axes' texels cover."""
+    """Return the diagonal of D_l, (*coarse grid, 1): the product of the axes' sums."""
     covered = np.ones((1,) * (len(axes) + 1), np.float32)
     for axis, levels in enumerate(axes):
         sums = levels[min(level, len(levels) - 1)].sums
@@ -148,7 +148,7 @@ def _covered(axes: Sequence[tuple[_Level, ...]], level: int) -> np.ndarray:
 
 
 def _along(x: np.ndarray, axes: Sequence[tuple[_Level, ...]], level: int, transposed: bool) -> np.ndarray:
-    """U from this level to the next finer one along each axis that has it; `transposed`, Uᵀ from there."""
+    """Apply U from this level to the next finer one along each axis that has it; with `transposed`, Uᵀ from there."""
     for axis, levels in enumerate(axes):
         step = levels[level].interpolation if level < len(levels) else None
         if step is None:

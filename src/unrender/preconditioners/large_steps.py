@@ -1,6 +1,6 @@
-"""Smooth steps on textures, grids and meshes.
+"""Preconditioner of large steps on textures, grids and meshes.
 
-After Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geometry".
+Follows Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geometry".
 """
 
 from __future__ import annotations
@@ -18,21 +18,19 @@ from unrender.preconditioners.mesh import MeshTopology
 @register
 @dataclass(frozen=True)
 class LargeSteps:
-    """S = (I + λ L)^-1 with the graph Laplacian L of the texture's grid, or of the mesh, each channel or coordinate by itself.
+    """S = (I + λ L)^-1 with the graph Laplacian L of the texture's grid or of the mesh, for each channel or coordinate separately.
 
-    Gradient noise and steps are blurred over about √λ texels (the kernel of S falls by e over √λ), while constants
-    pass unchanged and no detail is out of reach: S has full rank, so the descent has the same minima. S is symmetric,
-    its eigenvalues lie in [1/(1 + 4 d λ), 1] on d axes.
+    S blurs gradient noise and steps over about √λ texels (its kernel falls by e over √λ). Constants are preserved, and S has full rank,
+    so the minima are the same and all detail is reachable. S is symmetric with eigenvalues in [1/(1 + 4 d λ), 1] on d axes.
 
-    Suits textures (H, W, C), grids (Z, Y, X, C), values at the vertices of meshes (n V,) and their positions, which go with
-    `Adam(uniform=True)` as in the paper: one rate for all vertices keeps smooth steps smooth. Vertices of a mesh at the same place move as
-    one. The result is computed on the host in float32 and has the argument's type; on Dr.Jit it waits for the device, and copies to and fro
-    where that is a GPU.
+    Supports textures (H, W, C), grids (Z, Y, X, C), and values at mesh vertices (n V,). For vertex positions use `Adam(uniform=True)` as
+    in the paper: one step scale for all vertices keeps smooth steps smooth. Mesh vertices at the same position move together. Computed on
+    the host in float32. The result has the argument's type. For Dr.Jit arrays it waits for the device, and copies to and from a GPU.
 
     Args:
-        strength: λ, >= 0; 0 does nothing. 1 to 100 is usual.
-        wrap: whether opposite borders are neighbours, as for a tiling texture; for all axes, or one truth value per
-            axis: an environment map (H, W, C) wraps as (False, True).
+        strength: λ, >= 0; 0 is the identity. Usual values are 1 to 100.
+        wrap: whether opposite borders are neighbours, as in a tiling texture: one truth value, or one per axis. An environment map (H, W,
+            C) wraps as (False, True).
     """
 
     strength: float = 10.0
@@ -58,7 +56,7 @@ class LargeSteps:
         grid.check("LargeSteps", key, shape, self.wrap)
 
     def apply(self, x: Array) -> Array:
-        """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""
+        """Return S x, with the shape and type of `x`. Raises `InputError` for an unsupported shape."""
         if self._mesh is not None:
             return arrays.like(self._mesh.solver(float(self.strength)).solve(arrays.numpy(x)), x)
         shape = arrays.shape(x)

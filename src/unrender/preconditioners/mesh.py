@@ -1,8 +1,9 @@
-"""Solvers of (C + λ L) y = x over the places of a mesh, L its graph Laplacian, C how many vertices are there; and powers of their inverse.
+"""Solvers of (C + λ L) y = x on a mesh with graph Laplacian L and vertex multiplicities C, and powers of their inverse.
 
-(L x)_i is the sum of x_i − x_j over the places j that an edge joins with place i. Of positions, vertices at the same place are one: what is
-cut along seams of texture coordinates or of normals moves together. Of attributes, such as colours, each vertex is a place of its own, and
-what is cut there are neighbours.
+A *place* is a set of vertices that move together, C is the diagonal matrix of their numbers, and (L x)_i is the sum of x_i − x_j over the
+places j that share an edge with place i. For positions, vertices at the same position form one place, so that both sides of a seam of
+texture coordinates or normals move together. For attributes such as colours, each vertex is its own place, and both sides of a seam are
+neighbours.
 """
 
 from __future__ import annotations
@@ -20,20 +21,22 @@ if TYPE_CHECKING:
     import scipy.sparse
 
 _POLE_FACTOR = 16.0
-"""Strengths of the solvers that functions of L are sums of, from one to the next: with 4 in its place, errors are smaller, and there are
-twice as many solvers."""
+"""Ratio of successive λ_k of the solvers whose sum approximates a function of L.
+
+A ratio of 4 has smaller errors and needs twice as many solvers.
+"""
 _WEAKEST_POLE = 1 / 16
 _SAMPLES = 200
-"""Of the spectrum of L, at which such a sum is fitted."""
+"""Number of points of the spectrum of L at which such a sum is fitted."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeshTopology:
-    """Which vertices of a mesh are one, and which are neighbours.
+    """Groups of coincident vertices of a mesh (places), and the edges between them.
 
     Attributes:
-        places: of each vertex, the number of its place, (V,).
-        neighbours: pairs of places that an edge joins, each once, (E, 2).
+        places: index of each vertex's place, (V,).
+        neighbours: pairs of places that share an edge, each once, (E, 2).
     """
 
     places: np.ndarray
@@ -42,7 +45,10 @@ class MeshTopology:
 
     @classmethod
     def of(cls, positions: np.ndarray, faces: np.ndarray, welded: bool = True) -> MeshTopology:
-        """Of a mesh as loaded: positions (V, 3), faces (F, 3). `welded`: vertices at the same place are one; else they are neighbours."""
+        """Build the topology of a mesh with initial positions (V, 3) and faces (F, 3).
+
+        With `welded`, vertices at the same position form one place; otherwise they are neighbours.
+        """
         _, places = np.unique(positions, axis=0, return_inverse=True)
         places = places.reshape(-1)
         if welded:
@@ -54,12 +60,12 @@ class MeshTopology:
 
     @cached_property
     def copies(self) -> np.ndarray:
-        """The diagonal of C, (P,): vertices at each place."""
+        """Diagonal of C, (P,): number of vertices at each place."""
         return np.bincount(self.places)
 
     @cached_property
     def laplacian(self) -> scipy.sparse.csr_matrix:
-        """L, (P, P)."""
+        """Graph Laplacian L, (P, P)."""
         import scipy.sparse
 
         i, j = self.neighbours.T
@@ -68,18 +74,18 @@ class MeshTopology:
         return (scipy.sparse.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
 
     def solver(self, strength: float) -> MeshSolver:
-        """That of (C + λ L) y = x, factorised once."""
+        """Return the cached solver of (C + λ L) y = x."""
         if strength not in self._solvers:
             self._solvers[strength] = MeshSolver(strength, self)
         return self._solvers[strength]
 
     def gathered(self, x: np.ndarray) -> np.ndarray:
-        """Bᵀ x, (P, n) float64: the sums of what the vertices at each place have, x (V, n)."""
+        """Return Bᵀ x, (P, n) float64: sums over the vertices of each place, for x (V, n)."""
         sums = (np.bincount(self.places, column, len(self.copies)) for column in x.T)
         return np.stack(list(sums), axis=1)
 
     def split(self, owner: str, x: np.ndarray) -> np.ndarray:
-        """An array of all vertices' values, (n V,), as (V, n). Raises `InputError` for another number of vertices."""
+        """Reshape vertex values (n V,) to (V, n). Raises `InputError` for another number of vertices."""
         vertices = len(self.places)
         if x.ndim != 1 or x.size == 0 or x.size % vertices:
             raise InputError(f"{owner}: expected values of the mesh's {vertices} vertices, got shape {x.shape}")
@@ -87,13 +93,14 @@ class MeshTopology:
 
 
 class MeshSolver:
-    """B (C + λ L)^-1 Bᵀ by sparse Cholesky factorisation, once: B hands what a place has to its vertices, Bᵀ sums them up, C = Bᵀ B.
+    """B (C + λ L)^-1 Bᵀ by a sparse Cholesky factorisation that is computed once.
 
-    So a constant passes unchanged, whatever vertices are cut; where none is, C is I.
+    B copies the value of a place to its vertices, Bᵀ sums over them, and C = Bᵀ B. Constants are preserved whatever the seams; without
+    seams C is I.
 
     Args:
         strength: λ, >= 0.
-        topology: of the mesh.
+        topology: topology of the mesh.
     """
 
     def __init__(self, strength: float, topology: MeshTopology):
@@ -110,12 +117,15 @@ class MeshSolver:
         return CholeskySolverF(matrix.shape[0], rows, columns, matrix.data.astype(np.float64), MatrixType.COO)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        """y of the shape of x, (n V,) float32, each of the n channels by itself. Raises `InputError` for another number of vertices."""
+        """Return y of the shape of x, (n V,) float32, for each of the n channels separately.
+
+        Raises `InputError` for another vertex number.
+        """
         values = self._topology.split("LargeSteps", np.asarray(x, np.float32))
         return self.solve_places(self._topology.gathered(values))[self._topology.places].reshape(-1)
 
     def solve_places(self, x: np.ndarray) -> np.ndarray:
-        """(C + λ L)^-1 x, (P, n), float32."""
+        """Return (C + λ L)^-1 x, (P, n), float32."""
         right = np.ascontiguousarray(x, np.float32)
         result = np.empty_like(right)
         self._factor.solve(right, result)
@@ -123,18 +133,18 @@ class MeshSolver:
 
 
 class MeshSpectrum:
-    """Functions of C^-1/2 L C^-1/2 as sums of solvers, C^1/2 Σ_k w_k (C + λ_k L)^-1 C^1/2: those that are such integrals with positive w.
+    """Approximation of functions of C^-1/2 L C^-1/2 by sums of solvers, C^1/2 Σ_k w_k (C + λ_k L)^-1 C^1/2 with w_k >= 0.
 
-    So are (1 + λ x)^-1 and its square root for any λ up to the strongest. λ_k are 0 and the strongest over powers of 16; the weights are
-    fitted by non-negative least squares over the spectrum, to an error of some percent: the sum is symmetric and positive, as a
-    preconditioner has to be, and leaves a constant as it is.
+    It applies to functions that are such integrals with positive weights, among them (1 + λ x)^-1 and its square root for every λ up to
+    the strongest. The λ_k are 0 and the strongest divided by powers of 16. Non-negative least squares over the spectrum fits the weights
+    to an error of a few percent. The sum is symmetric and positive definite, as a preconditioner must be, and preserves constants.
 
     Args:
-        topology: of the mesh.
-        strongest: λ, >= 0.
+        topology: topology of the mesh.
+        strongest: largest λ, >= 0.
 
     Attributes:
-        topology: as given.
+        topology: as above.
     """
 
     def __init__(self, topology: MeshTopology, strongest: float):
@@ -146,7 +156,7 @@ class MeshSpectrum:
         self._weights: dict[tuple[float, float], np.ndarray] = {}
 
     def solved(self, x: np.ndarray) -> np.ndarray:
-        """Of all poles, (poles, P, n): (C + λ_k L)^-1 x, x (P, n)."""
+        """Return (C + λ_k L)^-1 x for all poles, (poles, P, n), for x (P, n)."""
         return np.stack(
             [
                 x / self.topology.copies[:, None],
@@ -155,23 +165,23 @@ class MeshSpectrum:
         )
 
     def weights(self, strength: float, power: float) -> np.ndarray:
-        """w, (poles,), >= 0 and of sum 1, of (1 + λ x)^-power; λ up to the strongest, power up to 1."""
+        """Return the weights w >= 0, (poles,), with sum 1, that fit (1 + λ x)^-power; λ up to the strongest, power up to 1."""
         from scipy.optimize import nnls
 
         if (strength, power) not in self._weights:
             x = np.geomspace(1e-3 / self._poles[1], self._largest, _SAMPLES)
             basis = 1.0 / (1.0 + np.outer(x, self._poles))
-            found, _ = nnls(basis * ((1.0 + strength * x) ** power)[:, None], np.ones(len(x)))
-            self._weights[strength, power] = found / found.sum()
+            weights, _ = nnls(basis * ((1.0 + strength * x) ** power)[:, None], np.ones(len(x)))
+            self._weights[strength, power] = weights / weights.sum()
         return self._weights[strength, power]
 
     def root(self, strength: float, x: np.ndarray) -> np.ndarray:
-        """Near B C^-1/2 (I + λ C^-1/2 L C^-1/2)^-1/2 C^-1/2 Bᵀ x, of the shape of x, (V, n) float32."""
-        found = np.tensordot(self.weights(strength, 0.5), self.solved(self.topology.gathered(x)), 1)
-        return np.asarray(found[self.topology.places], np.float32)
+        """Return an approximation of B C^-1/2 (I + λ C^-1/2 L C^-1/2)^-1/2 C^-1/2 Bᵀ x, with the shape of x, (V, n) float32."""
+        values = np.tensordot(self.weights(strength, 0.5), self.solved(self.topology.gathered(x)), 1)
+        return np.asarray(values[self.topology.places], np.float32)
 
     def descents(self, strength: float, smooth: np.ndarray, gradient: np.ndarray, shares: np.ndarray) -> np.ndarray:
-        """See `Sobolev.descents`; smooth, gradient: (V, n)."""
+        """Return the products of `Sobolev.descents`; smooth, gradient: (V, n)."""
         topology = self.topology
         places = np.zeros((len(topology.copies), smooth.shape[1]))
         places[topology.places] = self.root(strength, smooth)  # (C + λ L)^-1 Bᵀ g
@@ -186,6 +196,6 @@ def _edges(corners: np.ndarray) -> np.ndarray:
 
 
 def _pairs(edges: np.ndarray) -> np.ndarray:
-    """Each once, of two different ends."""
+    """Return each edge with different ends once."""
     pairs = np.sort(edges, axis=1)
     return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)

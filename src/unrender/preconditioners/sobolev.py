@@ -1,6 +1,6 @@
-"""Sobolev gradients of textures, grids and values at the vertices of meshes.
+"""Sobolev gradients of textures, grids and values at mesh vertices.
 
-Descent along the gradient of the H¹ inner product in place of that of L²: Neuberger 1997, "Sobolev Gradients and Differential Equations".
+Descent along the gradient of the H¹ inner product in place of L²: Neuberger 1997, "Sobolev Gradients and Differential Equations".
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from unrender.preconditioners.mesh import MeshSpectrum, MeshTopology
 @register
 @dataclass(frozen=True)
 class Sobolev:
-    """S = (I + λ L)^(-1/2) with the graph Laplacian L of the texture's grid, each channel by itself.
+    """S = (I + λ L)^(-1/2) with the graph Laplacian L of the texture's grid, for each channel separately.
 
     The loop applies S to gradients and to steps, so a gradient g moves the parameter along (I + λ L)^-1 g, the gradient in the Sobolev
-    space H¹. Independent noise in texels is averaged with that of their neighbours, while detail stays within reach: a pattern that
-    alternates from texel to texel on d axes moves 1 + 4 d λ times more slowly than a constant one. `LargeSteps` has S = (I + λ L)^-1,
-    and the square of that factor.
+    space H¹. Independent noise is averaged over neighbouring texels, and all detail stays reachable: a pattern that alternates from texel
+    to texel on d axes moves 1 + 4 d λ times more slowly than a constant. `LargeSteps` has S = (I + λ L)^-1, and thus the square of this
+    factor.
 
-    Among linear preconditioners it is the natural one for textures like those of photographs, whose spectra fall with the frequency f
-    as 1/f² in power: (I + λ L)^-1 is the covariance of such a texture beyond √λ texels.
+    It suits textures with the statistics of photographs, whose power spectra decrease with frequency f as 1/f²: (I + λ L)^-1 is the
+    covariance of such a texture at distances beyond √λ texels.
 
-    Suits textures (H, W, C), grids (Z, Y, X, C) and values at the V vertices of a mesh (n V,), the cells of whose grid are its vertices,
-    neighbours along edges; there S is near that root, to some percent (`MeshSpectrum`). The result is computed on the host in float32 and
-    has the argument's type; on Dr.Jit it waits for the device, and copies to and fro where that is a GPU. S is symmetric, its eigenvalues
-    lie in [(1 + 4 d λ)^(-1/2), 1].
+    Supports textures (H, W, C), grids (Z, Y, X, C) and values at the V vertices of a mesh (n V,), where L is that of the mesh's edges and
+    S is approximated to a few percent (`MeshSpectrum`). Computed on the host in float32. The result has the argument's type. For Dr.Jit
+    arrays it waits for the device, and copies to and from a GPU. S is symmetric with eigenvalues in [(1 + 4 d λ)^(-1/2), 1].
 
-    Of more than 131072 texels or cells with borders on all sides, S is near that root, too, to some percent and a fifth to a third where
-    detail is of a few texels, by a pyramid on the device (`GridPyramid`), of which the host sees the coarsest level alone.
+    For more than 131072 texels or cells with borders on all sides, a pyramid on the device approximates S (`GridPyramid`), and the host
+    gets the coarsest level only. Errors are a few percent, and a fifth to a third for detail of a few texels.
 
     Args:
-        strength: λ, >= 0; 0 does nothing. None for (`correlation` N)², N the geometric mean of the grid's sides, of meshes √V.
-        wrap: whether opposite borders are neighbours, as for a tiling texture; for all axes, or one truth value per axis.
-        correlation: √λ where no strength is given, as a share of N, >= 0.
+        strength: λ, >= 0; 0 is the identity. None for (`correlation` N)², where N is the geometric mean of the grid's sides, or √V for a
+            mesh.
+        wrap: whether opposite borders are neighbours, as in a tiling texture: one truth value, or one per axis.
+        correlation: √λ relative to N if no strength is given, >= 0.
     """
 
     strength: float | None = None
@@ -61,7 +61,7 @@ class Sobolev:
         return replace(self)._bound(MeshSpectrum(topology, self._strength_on(topology)))
 
     def on_repeated(self, columns: int) -> Sobolev:
-        """Return the preconditioner of an environment map. A large one, see above, keeps borders on all sides."""
+        """Return the preconditioner of an environment map. A map of more than 131072 texels keeps borders on all sides."""
         return replace(self)._bound(None, columns)
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
@@ -72,7 +72,7 @@ class Sobolev:
         grid.check("Sobolev", key, shape, self.wrap)
 
     def apply(self, x: Array) -> Array:
-        """See `Preconditioner.apply`. Raises `InputError` for a shape that does not suit."""
+        """Return S x, with the shape and type of `x`. Raises `InputError` for an unsupported shape."""
         if (spectrum := self._spectrum) is not None:
             values = spectrum.topology.split("Sobolev", arrays.numpy(x))
             return arrays.like(spectrum.root(self._strength_on(spectrum.topology), values).reshape(-1), x)
@@ -86,14 +86,14 @@ class Sobolev:
         return arrays.like(solver.solve(arrays.numpy(x)), x)
 
     def apply_twice(self, x: Array) -> Array:
-        """S² x."""
+        """Return S² x."""
         shape = arrays.shape(x)
         if (pyramid := self._pyramid(shape)) is not None:
             return pyramid.apply(x, self.strength_of(shape), 1.0)
         return self.apply(self.apply(x))
 
     def strength_of(self, shape: tuple[int, ...]) -> float:
-        """λ for a texture or grid of this shape; of its mesh, where it has one."""
+        """Return λ for a texture or grid of this shape, or for the mesh if there is one."""
         if self._spectrum is not None:
             return self._strength_on(self._spectrum.topology)
         cells = periodic.interior_shape(shape, self._columns)[:-1]
@@ -102,15 +102,15 @@ class Sobolev:
         return (self.correlation * math.prod(cells) ** (1 / len(cells))) ** 2
 
     def scaled(self, share: float) -> Sobolev:
-        """The same with `share` of λ, >= 0."""
+        """Return the preconditioner with λ times `share`, >= 0."""
         if self.strength is None:
-            found = replace(self, correlation=self.correlation * math.sqrt(share))
+            scaled = replace(self, correlation=self.correlation * math.sqrt(share))
         else:
-            found = replace(self, strength=self.strength * share)
-        return found._bound(self._spectrum, self._columns)
+            scaled = replace(self, strength=self.strength * share)
+        return scaled._bound(self._spectrum, self._columns)
 
     def descents(self, smooth: Array, gradient: Array, shares: np.ndarray) -> np.ndarray:
-        """With `shares` s of λ and S_s = (I + s λ L)^(-1/2), of two estimates g and g' of a gradient: S_s g · S_s g' and |S_s g|².
+        """Return S_s g · S_s g' and |S_s g|² for two estimates g and g' of a gradient, where S_s = (I + s λ L)^(-1/2).
 
         Args:
             smooth: S g.
@@ -136,25 +136,26 @@ class Sobolev:
         return np.array([[np.vdot(gain, part) for gain in gains] for part in sums])
 
     def summary(self, gradient: Array) -> np.ndarray | None:
-        """What `descents_of_summaries` needs of a gradient g, (m,) float32; None where `descents` serves, of few texels and of meshes."""
+        """Return the part of a gradient that `descents_of_summaries` needs, (m,) float32; None for meshes and small grids
+        (`descents`)."""
         pyramid = self._pyramid(arrays.shape(gradient))
         return None if pyramid is None else pyramid.summary(gradient)
 
     def descents_of_summaries(
         self, shape: tuple[int, ...], first: np.ndarray, second: np.ndarray, shares: np.ndarray
     ) -> np.ndarray:
-        """As `descents`, of the summaries of g and g', estimates of that shape: by all that is coarse, and some of the texels."""
+        """Estimate the result of `descents` from the summaries of g and g', gradients of this shape."""
         pyramid = self._pyramid(shape)
         assert pyramid is not None
         strengths = self.strength_of(shape) * np.asarray(shares)
         return np.stack([pyramid.products(first, other, strengths) for other in (second, first)])
 
     def is_on_device(self, shape: tuple[int, ...]) -> bool:
-        """Whether an array of this shape stays on the device, as large textures and grids do."""
+        """Return whether an array of this shape stays on the device, as large textures and grids do."""
         return self._pyramid(shape) is not None
 
     def _pyramid(self, shape: tuple[int, ...]) -> grid_pyramid.GridPyramid | None:
-        """That stands in for transforms of a large grid; None where it does not, as on meshes."""
+        """Return the pyramid that replaces transforms of a large grid; None for small grids and meshes."""
         if self._spectrum is not None or self._around(shape) is not None:
             return None
         if math.prod(shape[:-1]) <= grid_pyramid.LARGEST_EXACT or any(self._wraps(shape)):
@@ -162,7 +163,7 @@ class Sobolev:
         return grid_pyramid.pyramid(shape[:-1])
 
     def _around(self, shape: tuple[int, ...]) -> Around[Sobolev] | None:
-        """The map of an environment map that is not too large for transforms; None for all else."""
+        """Return the preconditioner of an environment map that is small enough for transforms; None for anything else."""
         if not self._columns or math.prod(shape[:2]) > grid_pyramid.LARGEST_EXACT:
             return None
         return Around(replace(self, wrap=around_axis(self.wrap)), self._columns)
