@@ -234,7 +234,9 @@ def test_losses_of_whole_images_and_views_of_workers_are_refused() -> None:
         pixelwise = False  # pyright: ignore[reportAssignmentType]
 
     asked = problem().replaced(loss=Whole())
-    with pytest.raises(ur.InputError, match="Whole is of whole images, in which each pixel needs as many samples"):
+    with pytest.raises(
+        ur.InputError, match="Whole is a loss of full images, in which each pixel needs as many samples"
+    ):
         Counts().init(asked, asked.initial())
 
 

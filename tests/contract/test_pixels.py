@@ -583,5 +583,5 @@ def test_what_makes_no_sense_is_refused() -> None:
         def pixelwise(self) -> bool:
             return False
 
-    with pytest.raises(ur.InputError, match=r"Blurred is of whole images"):
+    with pytest.raises(ur.InputError, match=r"Blurred is a loss of full images"):
         ur.optimize(problem(Blurred()), ur.PathGradient(pixels=ur.pixels.Uniform(8)), ur.optimizers.Adam(), steps=1)

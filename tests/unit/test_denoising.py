@@ -104,7 +104,7 @@ def test_what_makes_no_sense_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
     with pytest.raises(ur.InputError, match="guides no"):
         denoise(good, albedo=good, by="variation")
     monkeypatch.setattr(denoising, "choose", lambda by: by)
-    with pytest.raises(ur.InputError, match="normals need albedo"):
+    with pytest.raises(ur.InputError, match="normals require albedo"):
         denoise(good, normals=good, by="oidn")
     with pytest.raises(ur.InputError, match=r"albedo must be of shape \(4, 4, 3\)"):
         denoise(good, albedo=np.ones((4, 5, 3)), by="oidn")

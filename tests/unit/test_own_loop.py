@@ -248,17 +248,17 @@ def test_values_come_in_several_forms() -> None:
         (lambda: ur.Renderer(scene(), []), "keys must be a list of scene parameters"),
         (lambda: ur.Renderer(scene(), KEYS, spp=0), "spp must be a whole number of at least 1, got 0"),
         (lambda: ur.Renderer(scene(), KEYS, spp=4, groups=3), "groups must divide spp, 4, got 3"),
-        (lambda: ur.Renderer(scene(), KEYS, groups=2, adjoint_spp=1), "adjoint_spp is for groups=1"),
-        (lambda: ur.Renderer(scene(), KEYS, groups=2, coupled=True), "coupled=True goes with groups=1"),
+        (lambda: ur.Renderer(scene(), KEYS, groups=2, adjoint_spp=1), "adjoint_spp needs groups=1"),
+        (lambda: ur.Renderer(scene(), KEYS, groups=2, coupled=True), "coupled=True needs groups=1"),
         (lambda: ur.Renderer(scene(), KEYS, pixels=Uniform(8), coupled=True), r"use pixels=unrender.pixels.All\(\)"),
-        (lambda: ur.Renderer(scene(), KEYS, pixels=Adaptive(8)), "Adaptive draws pixels by their loss derivative; give ref"),
+        (lambda: ur.Renderer(scene(), KEYS, pixels=Adaptive(8)), "Adaptive samples pixels by their loss derivative; set ref"),
         (lambda: ur.Renderer(scene(), KEYS, pixels=ur.pixels.AdaptiveCounts()), "which only optimize\\(\\) knows"),
         (lambda: ur.Renderer(scene(), KEYS, pixels=8), "pixels must be one of unrender.pixels"),  # pyright: ignore[reportArgumentType]
         (lambda: ur.Renderer(scene(), KEYS, image=CV), "image must be one of unrender.images"),  # pyright: ignore[reportArgumentType]
         (lambda: ur.Renderer(scene(), KEYS, sensor=3), "sensor must be 0, the only one, got 3"),
         (lambda: ur.Renderer(scene(), KEYS, sensor=[0, 0]), "different sensors"),
         (lambda: ur.Renderer(3, KEYS), "scene: expected an .xml file"),
-        (lambda: ur.Renderer(scene(), KEYS).backward(REFERENCE), "backward comes after render"),
+        (lambda: ur.Renderer(scene(), KEYS).backward(REFERENCE), "call render before backward"),
         (lambda: ur.Renderer(scene(), KEYS).render({"colour": START["colour"]}), "no value for parameter map"),
         (lambda: ur.Renderer(scene(), KEYS).render(START["colour"]), r"expected \{key: array\} for colour, map"),
         (lambda: ur.Renderer(scene(), KEYS).render({**START, "colour": np.ones(4)}), r"colour: expected shape \(3,\), got \(4,\)"),
@@ -407,9 +407,11 @@ def test_a_derivative_that_is_not_finite_is_one_line(bad: float) -> None:
 
 def test_values_that_would_be_ignored_are_one_line() -> None:
     renderer = ur.Renderer(scene(), ["colour"])
-    with pytest.raises(InputError, match=r"Renderer: colour2 is none of its parameters; did you mean colour\?"):
+    with pytest.raises(InputError, match=r"Renderer: colour2 is not one of its parameters; did you mean colour\?"):
         renderer.render({"colour": START["colour"], "colour2": START["colour"]})
-    with pytest.raises(InputError, match="map is none of its parameters; it was made for colour, and would ignore it"):
+    with pytest.raises(
+        InputError, match="map is not one of its parameters; it was created for colour, and would ignore it"
+    ):
         renderer.render(START)
 
     class Optimizer:
@@ -425,7 +427,7 @@ def test_values_that_would_be_ignored_are_one_line() -> None:
             return self.values[key]
 
     renderer.render(Optimizer(colour=START["colour"], latent=np.zeros(3)))
-    with pytest.raises(InputError, match="map is none of its parameters"):
+    with pytest.raises(InputError, match="map is not one of its parameters"):
         renderer.render(Optimizer(**START))
 
 

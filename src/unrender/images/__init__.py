@@ -1,4 +1,4 @@
-"""Image estimators: what the loss is evaluated at."""
+"""Image estimators, which estimate the image at which the loss is evaluated."""
 
 from unrender.images.denoised import Denoised
 from unrender.images.plain import Plain

@@ -1,4 +1,4 @@
-"""The protocol of image estimators, which estimate the image that the loss is evaluated at."""
+"""Protocol of image estimators, which estimate the image at which the loss is evaluated."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from unrender.scene.sample_counts import SampleCounts
 
 @dataclass(frozen=True)
 class ImageEstimate:
-    """The image of one frame at one step: of a view, (H, W, 3), or of a mini-batch of N pixels, (N, 3).
+    """Image of one frame at one step: of a view, (H, W, 3), or of a mini-batch of N pixels, (N, 3).
 
     Attributes:
         images: (groups, H, W, 3) or (groups, N, 3), one estimate per sample group, independent of the other groups' samples.
-        paths: the renderer's record of the samples, for their replay.
-        info: for people, e.g. {"control_weight": array}.
-        previous: `images` of the previous step's parameters, from the same samples; None where they were not rendered.
-        variance: of `mean()`, (H, W, 3), as far as it is known; None where it is not.
-        filter: applied to an image (H, W, 3) before the loss is evaluated; None for no filter.
-        fresh: the same as `images`, from this step's samples alone; None where `images` are.
-        counts: how many samples each pixel has, where these differ: `images`, `previous` and `fresh` are the samples then, (1, N, 3).
+        paths: the renderer's record of the samples, for replay.
+        info: arrays for display, e.g. {"control_weight": array}.
+        previous: `images` at the previous step's parameters, from the same samples; None if not rendered.
+        variance: variance of `mean()`, (H, W, 3); None if unknown.
+        filter: function of an image (H, W, 3) that is applied before the loss is evaluated; None for no filter.
+        fresh: `images` from this step's samples only; None if `images` already are.
+        counts: number of samples of each pixel, if they differ. `images`, `previous` and `fresh` are then single samples, (1, N, 3).
     """
 
     images: Array
@@ -41,29 +41,31 @@ class ImageEstimate:
     counts: SampleCounts | None = None
 
     def mean(self) -> Array:
-        """The image of all samples together, (H, W, 3) or (N, 3)."""
+        """Return the image from all samples, (H, W, 3) or (N, 3)."""
         return self._mean(self.images)
 
     def previous_mean(self) -> Array:
-        """`mean()` of the previous step's parameters."""
+        """Return `mean()` at the previous step's parameters."""
         return self._mean(self.previous)
 
     def others(self) -> Array:
-        """Leave-one-out images: for each group, the image of all other groups' samples; its own where there is one group. With
-        `counts`, for each sample that of its pixel's others."""
+        """Return the leave-one-out images: for each group the image from all other groups, or its own if there is one group.
+
+        With `counts`, return for each sample the image from the other samples of its pixel.
+        """
         return self._left_out(self.images)
 
     def fresh_others(self) -> Array:
-        """`others()` of this step's samples alone."""
+        """Return `others()` from this step's samples only."""
         return self._left_out(self.images if self.fresh is None else self.fresh)
 
     def previous_others(self) -> Array:
-        """`others()` of the previous step's parameters."""
+        """Return `others()` at the previous step's parameters."""
         return self._left_out(self.previous)
 
     def _mean(self, images: Any) -> Array:
-        whole = arrays.mean_over_first(images) if self.counts is None else self.counts.means(images)
-        return whole if self.filter is None else self.filter(whole)
+        mean = arrays.mean_over_first(images) if self.counts is None else self.counts.means(images)
+        return mean if self.filter is None else self.filter(mean)
 
     def _left_out(self, images: Array) -> Array:
         return self._filtered(leave_one_out(images)) if self.counts is None else self.counts.others(images)
@@ -76,8 +78,10 @@ class ImageEstimate:
 
 
 def variance_of_mean(images: Array, counts: SampleCounts | None = None) -> Array | None:
-    """The variance of the mean of independent images (groups, H, W, 3), from what they differ by; None for a single one. With `counts`,
-    of the mean of each pixel's samples."""
+    """Return the variance of the mean of independent images (groups, H, W, 3), from their spread; None for a single group.
+
+    With `counts`, return the variance of the mean of each pixel's samples.
+    """
     if counts is not None:
         return counts.variance_of_mean(images)
     groups = images.shape[0]
@@ -88,23 +92,23 @@ def variance_of_mean(images: Array, counts: SampleCounts | None = None) -> Array
 
 
 def leave_one_out(images: Array) -> Array:
-    """Of images (groups, ...), for each group the mean of all others; the same where there is one group."""
+    """Return, for each of the images (groups, ...), the mean of the others; the image itself if there is one group."""
     groups = images.shape[0]
     return images if groups == 1 else (arrays.mean_over_first(images) * groups - images) / (groups - 1)
 
 
 @dataclass(frozen=True)
 class PairRequest:
-    """A request for the image of the previous parameters too, from the samples of the current one.
+    """Request for the image at the previous parameters too, from the samples of the current one.
 
     Attributes:
-        previous: the parameters of the last step that the estimator took.
-        space: in which to share samples, for image estimators without a space of their own.
-        step: how many steps of whole views the estimator has taken. Image estimators with a state of earlier steps require it to be their
-            own count.
-        batches: steps with pixel mini-batches since then: where there are any, `previous` is not of what such a state remembers.
-        difference_spp: samples per pixel of further paths, on which the gradients of both states are taken, with plain images; None to
-            take them on those of the images.
+        previous: parameters of the estimator's last step.
+        space: space in which samples are shared, for image estimators without their own.
+        step: number of steps of full views that the estimator has taken. Image estimators with a state require that it equals their own
+            count.
+        batches: number of later steps with pixel mini-batches. If it is not 0, the state of an image estimator is older than `previous`.
+        difference_spp: samples per pixel of additional paths, on which the gradients of both states are computed with plain images. None
+            computes them on the paths of the images.
     """
 
     previous: Tree
@@ -115,20 +119,20 @@ class PairRequest:
 
 
 class ImageEstimator(Protocol):
-    """Immutable; all that changes is in the state."""
+    """Immutable image estimator; everything that changes is in the state."""
 
     @property
     def space(self) -> Space | None:
-        """The space in which two states share samples; None where they do not."""
+        """Space in which two states share samples; None if they share none."""
         ...
 
     @property
     def pixelwise(self) -> bool:
-        """Whether it can estimate pixel mini-batches."""
+        """Whether pixel mini-batches can be estimated."""
         ...
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
-        """The state before the first step."""
+        """Return the state before the first step."""
         ...
 
     def estimate(
@@ -142,21 +146,22 @@ class ImageEstimator(Protocol):
         key: Key,
         pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, Any]:
-        """The image of one frame, and its contribution to the next state; with `pair_request`, that of the previous parameters too."""
+        """Return the image of one frame and its contribution to the next state; with `pair_request`, also the image at the previous
+        parameters."""
         ...
 
     def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:
-        """Whether the next step must render whole views, after `batches` steps of pixel mini-batches since the last that did."""
+        """Return whether the next step must render full views, after `batches` steps with mini-batches since the last full one."""
         ...
 
     def prepare(self, problem: Problem, state: Any) -> Any:
-        """The state after a step that rendered whole views, prepared for pixel mini-batches."""
+        """Return the state after a step of full views, prepared for pixel mini-batches."""
         ...
 
-    def learn(self, problem: Problem, state: Any, sample: PixelSample, kept: Any) -> Any:
-        """The state after a step with a mini-batch, from its contribution."""
+    def learn(self, problem: Problem, state: Any, sample: PixelSample, contribution: Any) -> Any:
+        """Return the state after a step with a mini-batch, from its contribution."""
         ...
 
-    def advance(self, parameters: Tree, state: Any, kept: tuple[Any, ...]) -> Any:
-        """The state after a step at `parameters` that rendered whole views, from the contributions of each."""
+    def advance(self, parameters: Tree, state: Any, contributions: tuple[Any, ...]) -> Any:
+        """Return the state after a step of full views at `parameters`, from the contribution of each view."""
         ...

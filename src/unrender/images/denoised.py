@@ -1,4 +1,4 @@
-"""Denoised images for the loss."""
+"""Image estimator that denoises another estimator's image."""
 
 from __future__ import annotations
 
@@ -26,24 +26,23 @@ from unrender.scene.problem import Problem
 class Denoised:
     """The image of another estimator, denoised before the loss is evaluated. Biased.
 
-    A denoiser trades variance for a systematic error, which no number of steps averages out: a descent converges to where the
-    *denoised* image fits the reference, near the truth at best. It pays where the loss derivative is not linear and the image so noisy
-    that the bias by noise is the larger one, and for previews. A control variate of `inner` is of the image before denoising.
+    A denoiser trades variance for a systematic error that no number of steps averages out. The optimisation converges to parameters whose
+    *denoised* image matches the reference, which are at best near the truth. Use it if the loss derivative is nonlinear and the image so
+    noisy that the bias from noise is larger, and for previews. A control variate in `inner` applies to the image before denoising.
 
-    Image and adjoint stay independent: for each sample group, the image of all *other* groups is denoised by itself, so that no adjoint
-    is weighted by an image of its own samples. Each is a call of the denoiser, so there are fewer groups than elsewhere.
+    Image and adjoint stay independent: for each sample group the image of all *other* groups is denoised separately, so no adjoint is
+    weighted by an image of its own samples. Each is a call of the denoiser, so fewer groups are used than elsewhere.
 
-    Every pixel of `unrender` has samples of its own, which denoisers need: where neighbouring pixels share samples, their
-    correlated noise is taken for texture.
+    Denoisers need independent noise per pixel. Pixels here do not share samples; otherwise a denoiser takes correlated noise for texture.
 
     Args:
-        inner: estimates the image, `images.Plain()` or `images.RecursiveControlVariate()`.
-        by: the denoiser: "auto" (OptiX on a GPU, else OIDN: `pip install 'unrender[denoise]'`), "oidn", "optix", or "variation".
-        groups: the most sample groups, >= 2; fewer where the number of samples has no such divisor. Two groups are two calls of the
-            denoiser beside that of the whole image; more groups make each image less noisy.
+        inner: image estimator, `images.Plain()` or `images.RecursiveControlVariate()`.
+        by: the denoiser: "auto" (OptiX on a GPU, else OIDN: `pip install 'unrender[denoise]'`), "oidn", "optix" or "variation".
+        groups: maximum number of sample groups, >= 2. Fewer are used if the number of samples has no such divisor. Two groups need two
+            calls of the denoiser in addition to the full image; more groups make each image less noisy.
 
     Raises:
-        InputError: at construction, a value out of range; from `init`, a denoiser that cannot run here.
+        InputError: at construction, a value out of range; from `init`, a denoiser that is not available.
     """
 
     inner: ImageEstimator = field(default_factory=Plain)
@@ -57,16 +56,16 @@ class Denoised:
 
     @property
     def space(self) -> Space | None:
-        """That of `inner`."""
+        """The space of `inner`."""
         return self.inner.space
 
     @property
     def pixelwise(self) -> bool:
-        """False: a denoiser needs the neighbours of a pixel."""
+        """False, because a denoiser needs the neighbours of a pixel."""
         return False
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
-        """See `ImageEstimator.init`. The state is that of `inner`."""
+        """Return the state of `inner`. Raises `InputError` if the denoiser is not available."""
         denoising.choose(self.by)
         return self.inner.init(problem, parameters)
 
@@ -81,13 +80,13 @@ class Denoised:
         key: Key,
         pair_request: PairRequest | None = None,
     ) -> tuple[ImageEstimate, Any]:
-        found, kept = self.inner.estimate(
+        estimate, contribution = self.inner.estimate(
             problem, parameters, state, frame, spp, self._groups(groups), key, pair_request
         )
-        return replace(found, filter=self._filter(problem), variance=None), kept
+        return replace(estimate, filter=self._filter(problem), variance=None), contribution
 
     def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:
-        """Always."""
+        """Return True."""
         del parameters, state, batches
         return True
 
@@ -95,23 +94,23 @@ class Denoised:
         del problem
         return state
 
-    def learn(self, problem: Problem, state: Any, sample: PixelSample, kept: Any) -> Any:
-        del problem, sample, kept
+    def learn(self, problem: Problem, state: Any, sample: PixelSample, contribution: Any) -> Any:
+        del problem, sample, contribution
         return state
 
-    def advance(self, parameters: Tree, state: Any, kept: tuple[Any, ...]) -> Any:
-        return self.inner.advance(parameters, state, kept)
+    def advance(self, parameters: Tree, state: Any, contributions: tuple[Any, ...]) -> Any:
+        return self.inner.advance(parameters, state, contributions)
 
-    def _groups(self, asked: int) -> int:
-        """The largest divisor of `asked` up to `groups`; its smallest one above 1 where there is none."""
-        divisors = [n for n in range(2, asked + 1) if asked % n == 0]
+    def _groups(self, requested: int) -> int:
+        """Return the largest divisor of `requested` that is at most `groups`, else its smallest divisor above 1."""
+        divisors = [n for n in range(2, requested + 1) if requested % n == 0]
         return max((n for n in divisors if n <= self.groups), default=min(divisors, default=1))
 
     def _filter(self, problem: Problem) -> Callable[[Array], Array]:
         def denoise(image: Array) -> Array:
             noisy = arrays.numpy(image)
             if not arrays.all_finite(noisy):
-                return image  # so that the loop skips the step
+                return image  # the loop then skips the step
             return problem.renderer.array(denoising.denoise(noisy, by=self.by))
 
         return denoise

@@ -1,7 +1,6 @@
-"""Taking the noise out of a picture or a map: Intel's Open Image Denoise on the CPU, OptiX on an NVIDIA GPU, total variation anywhere.
+"""Denoising of images and maps, by Intel's Open Image Denoise on the CPU, OptiX on an NVIDIA GPU, or total variation.
 
-Whatever is denoised is biased: a denoiser trades noise for error. Pictures must have a box filter, whose pixels do not share samples;
-all pictures of `unrender` have.
+Denoising biases: it trades noise for error. Images must have a box filter, so that pixels share no samples, as images of `unrender` do.
 """
 
 from __future__ import annotations
@@ -18,19 +17,21 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 
 Denoiser = Literal["auto", "oidn", "optix", "variation"]
-"""Who denoises: "oidn" (package pyoidn), "optix" (Mitsuba's, where its variant runs on a GPU), "variation" (scikit-image's total
-variation, for maps: it keeps the mean, and knows nothing of how pictures look), or "auto": optix where it runs, else oidn."""
+"""Denoisers: "oidn" (package pyoidn), "optix" (Mitsuba's, for GPU variants), "variation" (scikit-image's total variation, which preserves
+the mean and suits maps rather than images), or "auto": optix if available, else oidn."""
 
 _SMALLEST, _MULTIPLE = 32, 16
-"""Pixels a side that the networks get at least, and a multiple of which they work on: beyond the border they see black, which costs a
-picture of 4 x 4 a quarter of its light. Others are continued by their mirror images."""
+"""Smallest side in pixels, and its divisor, to which images are padded by mirroring.
+
+The networks see black beyond the border, which costs an image of 4 x 4 a quarter of its light.
+"""
 
 
 def choose(by: Denoiser = "auto") -> Denoiser:
-    """The denoiser that "auto" means on this machine; any other name is checked.
+    """Return the denoiser that "auto" selects on this machine; any other name is checked.
 
     Raises:
-        InputError: there is none of that name, or it cannot run here; one line that says what to install.
+        InputError: the name is unknown, or the denoiser is not available; the message says what to install.
     """
     if by not in ("auto", *_DENOISERS):
         known = ("auto", *_DENOISERS)
@@ -54,22 +55,22 @@ def denoise(
     by: Denoiser = "auto",
     fast: bool = False,
 ) -> np.ndarray:
-    """`image` without its noise. Biased; deterministic on the CPU.
+    """Remove the noise of `image`. Biased; deterministic on the CPU.
 
-    The scale does not matter: `denoise(c * image)` is `c * denoise(image)` up to rounding, for c > 0.
+    The result scales with the image: `denoise(c * image)` is `c * denoise(image)` up to rounding, for c > 0.
 
     Args:
-        image: (H, W) or (H, W, 3), linear, finite, of any size from 1 x 1. Values below 0 count as 0.
-        albedo: (H, W, 3) in [0, 1], of what the pixels see first; guides where edges are. Not for "variation".
-        normals: (H, W, 3) in [-1, 1], in the sensor's frame; only beside `albedo`. Not for "variation".
+        image: (H, W) or (H, W, 3), linear, finite, at least 1 x 1. Negative values count as 0.
+        albedo: (H, W, 3) in [0, 1], albedo of the first hit of each pixel, which guides the edges. Not for "variation".
+        normals: (H, W, 3) in [-1, 1], in the sensor's frame; requires `albedo`. Not for "variation".
         by: see `Denoiser`.
-        fast: of oidn, the smaller network: half the time, for maps that only steer. The others have one quality.
+        fast: whether oidn uses its smaller network, which takes half the time and suits maps for sampling. The others have one quality.
 
     Returns:
         float32 of the shape of `image`, >= 0.
 
     Raises:
-        InputError: shapes that do not fit, values that are not finite, a denoiser that cannot run here.
+        InputError: mismatched shapes, values that are not finite, or an unavailable denoiser.
     """
     by = choose(by)
     picture = _checked("image", image)
@@ -78,15 +79,15 @@ def denoise(
         if guide.shape != (*picture.shape[:2], 3):
             raise InputError(f"denoise: {name} must be of shape {(*picture.shape[:2], 3)}, got {guide.shape}")
         if by == "variation":
-            raise InputError(f"denoise: {name} guides no denoiser by total variation")
+            raise InputError(f"denoise: {name} is not supported by the denoiser variation")
     if "normals" in guides and "albedo" not in guides:
-        raise InputError("denoise: normals need albedo beside them")
+        raise InputError("denoise: normals require albedo")
     picture = np.maximum(picture, 0)
     scale = float(picture.mean(dtype=np.float64))
     if scale == 0:
         return picture
-    found = np.maximum(_DENOISERS[by](picture / np.float32(scale), guides, fast), 0)
-    return np.ascontiguousarray(found * np.float32(scale), np.float32)
+    denoised = np.maximum(_DENOISERS[by](picture / np.float32(scale), guides, fast), 0)
+    return np.ascontiguousarray(denoised * np.float32(scale), np.float32)
 
 
 def _checked(name: str, given: Any) -> np.ndarray:
@@ -130,14 +131,14 @@ def _optix_denoiser(width: int, height: int, albedo: bool, normals: bool) -> Any
 
 
 def _variation(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.ndarray:
-    """Rudin, Osher and Fatemi's model, with the noise seen in the differences between neighbours as its weight."""
+    """Apply the model of Rudin, Osher and Fatemi, weighted by the noise that the differences between neighbours show."""
     del guides, fast
     from skimage.restoration import denoise_tv_chambolle
 
     steps = np.concatenate([np.abs(np.diff(picture, axis=axis)).reshape(-1) for axis in (0, 1)])
     if steps.size == 0:
         return picture
-    # The median tells flat places from edges; 0.6745 is that of |N(0, 1)|, and a difference has twice the variance.
+    # The median excludes edges; 0.6745 is the median of |N(0, 1)|, and a difference has twice the variance.
     noise = float(np.median(steps)) / (0.6745 * np.sqrt(2))
     if noise == 0:
         return picture
@@ -153,14 +154,14 @@ _DENOISERS: dict[str, Callable[[np.ndarray, dict[str, np.ndarray], bool], np.nda
 
 
 def _continued(picture: np.ndarray) -> np.ndarray:
-    """(H, W) or (H, W, 3) as (H', W', 3), each side a multiple of `_MULTIPLE` and at least `_SMALLEST`."""
+    """Pad (H, W) or (H, W, 3) to (H', W', 3), with sides that are multiples of `_MULTIPLE` and at least `_SMALLEST`."""
     if picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=2)
     more = [(0, max(_SMALLEST - side, -side % _MULTIPLE)) for side in picture.shape[:2]]
     return np.ascontiguousarray(np.pad(picture, [*more, (0, 0)], mode="symmetric"), np.float32)
 
 
-def _as(found: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """The part of `found` that `picture` had, with its channels."""
-    part = found[: picture.shape[0], : picture.shape[1]]
+def _as(padded: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """Crop the padded result to the size and channels of `picture`."""
+    part = padded[: picture.shape[0], : picture.shape[1]]
     return part.mean(axis=2) if picture.ndim == 2 else part

@@ -1,4 +1,4 @@
-"""The plain Monte Carlo image."""
+"""Plain Monte Carlo image estimator."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from unrender.scene.upsampling import Upsampler
 
 @dataclass(frozen=True)
 class PlainState:
-    """Empty: there is no state."""
+    """Empty state."""
 
     def upsampled(self, upsampler: Upsampler) -> PlainState:
-        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        """Return this state, which has no array of a parameter's shape."""
         del upsampler
         return self
 
@@ -32,7 +32,7 @@ class Plain:
 
     @property
     def space(self) -> Space | None:
-        """None: steps share no samples."""
+        """None, because steps share no samples."""
         return None
 
     @property
@@ -68,7 +68,7 @@ class Plain:
         return ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance, counts=counts), None
 
     def needs_whole_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
-        """Never."""
+        """Return False."""
         del parameters, state, batches
         return False
 
@@ -76,10 +76,10 @@ class Plain:
         del problem
         return state
 
-    def learn(self, problem: Problem, state: PlainState, sample: PixelSample, kept: Any) -> PlainState:
-        del problem, sample, kept
+    def learn(self, problem: Problem, state: PlainState, sample: PixelSample, contribution: Any) -> PlainState:
+        del problem, sample, contribution
         return state
 
-    def advance(self, parameters: Tree, state: PlainState, kept: tuple[Any, ...]) -> PlainState:
-        del parameters, kept
+    def advance(self, parameters: Tree, state: PlainState, contributions: tuple[Any, ...]) -> PlainState:
+        del parameters, contributions
         return state

@@ -1,1 +1,1 @@
-"""A renderer for loops that people write themselves: images to their loss, gradients to their optimizer."""
+"""Differentiable renderer for user-written loops, with their own loss and optimizer."""

@@ -1,4 +1,4 @@
-"""A render as an operation of Dr.Jit's derivative graph."""
+"""Rendering as an operation of Dr.Jit's derivative graph."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from unrender.core.trees import Tree
 
 
 class _Render(dr.CustomOp):
-    """From parameters, tensors attached to the graph, to images that are already rendered."""
+    """Operation from parameters, tensors attached to the graph, to images that are already rendered."""
 
     def eval(self, backward: Callable[[tuple[Any, ...]], Tree], images: tuple[Any, ...], values: Tree) -> Any:
-        """See `dr.CustomOp`."""
+        """Return the images, see `dr.CustomOp`."""
         del values
         self._backward = backward
         self._shapes = [tuple(image.shape) for image in images]
@@ -22,33 +22,33 @@ class _Render(dr.CustomOp):
         return several if len(images) > 1 else several[0]
 
     def backward(self) -> None:
-        """See `dr.CustomOp`."""
-        found: Any = self.grad_out()
-        given: Any = found if isinstance(found, tuple) else (found,)
-        kind: Any = type(given[0])
-        # A derivative that is the same everywhere comes as a number.
-        whole = tuple(
+        """Propagate the images' derivatives to the parameters, see `dr.CustomOp`."""
+        gradient: Any = self.grad_out()
+        derivatives: Any = gradient if isinstance(gradient, tuple) else (gradient,)
+        kind: Any = type(derivatives[0])
+        # Dr.Jit passes a constant derivative as a scalar.
+        expanded = tuple(
             x if tuple(x.shape) == shape else x + dr.zeros(kind, shape)
-            for x, shape in zip(given, self._shapes, strict=True)
+            for x, shape in zip(derivatives, self._shapes, strict=True)
         )
-        self.set_grad_in("values", self._backward(whole))
+        self.set_grad_in("values", self._backward(expanded))
 
     def forward(self) -> None:
-        """See `dr.CustomOp`."""
-        raise RuntimeError("Renderer: forward-mode derivatives are not computed; use dr.backward")
+        """Raise `RuntimeError`: forward mode is not supported."""
+        raise RuntimeError("Renderer: forward-mode derivatives are not supported; use dr.backward")
 
     def name(self) -> str:
-        """For graphs."""
+        """Return the name of the operation in graphs."""
         return "unrender.Renderer"
 
 
 def apply(backward: Callable[[tuple[Any, ...]], Tree], images: tuple[Any, ...], values: Tree) -> tuple[Any, ...]:
-    """The images, attached to `values`.
+    """Attach the images to `values` in the derivative graph.
 
     Args:
-        backward: from the derivatives of the loss by the images to the gradient.
-        images: tensors, detached.
+        backward: function from the loss derivatives with respect to the images to the gradient.
+        images: detached tensors.
         values: {key: tensor}, attached or not.
     """
-    found: Any = dr.custom(_Render, backward, images, values)
-    return found if isinstance(found, tuple) else (found,)
+    attached: Any = dr.custom(_Render, backward, images, values)
+    return attached if isinstance(attached, tuple) else (attached,)

@@ -1,4 +1,4 @@
-"""What a `Renderer` is made of: its options, checked, and the problems without references that stand for its sensors."""
+"""Checked options of a `Renderer`, and the problems that represent its sensors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from unrender.scene.view import View
 
 @dataclass(frozen=True)
 class Options:
-    """The options of a `Renderer`, see there. Raises `InputError` for those that make no sense, or do not go together."""
+    """Options of a `Renderer`. Raises `InputError` for invalid or incompatible options."""
 
     keys: tuple[str, ...]
     image: ImageEstimator
@@ -39,7 +39,7 @@ class Options:
     coupled: bool
     sensors: tuple[int, ...]
     single: bool
-    """Whether one sensor was given by itself, so that its image stands for itself too."""
+    """Whether a single sensor was passed, so that a call returns its image and not a tuple."""
     max_depth: int
     seed: int
     references: tuple[Any, ...] = field(default=(), compare=False)
@@ -64,27 +64,27 @@ class Options:
             raise InputError(f"{owner}: groups must divide spp, {self.spp}, got {self.groups}")
         if self.groups > 1 and self.adjoint_spp is not None:
             raise InputError(
-                f"{owner}: adjoint_spp is for groups=1; with more groups the adjoint is on the image's paths"
+                f"{owner}: adjoint_spp needs groups=1; with more groups the adjoint uses the image's paths"
             )
         if self.coupled and self.groups > 1:
-            raise InputError(f"{owner}: coupled=True goes with groups=1, since its adjoint has paths of its own")
+            raise InputError(f"{owner}: coupled=True needs groups=1, because its adjoint uses separate paths")
         if self.coupled and not self.all_pixels:
             raise InputError(
                 f"{owner}: coupled=True needs the loss derivative of the last step at every pixel; use pixels=unrender.pixels.All()"
             )
         if not self.all_pixels and not isinstance(self.pixels, Uniform) and not self.references:
             raise InputError(
-                f"{owner}: {type(self.pixels).__name__} draws pixels by their loss derivative; give references=, the image that "
-                "each sensor should see, or use unrender.pixels.Uniform"
+                f"{owner}: {type(self.pixels).__name__} samples pixels by their loss derivative; set references=, the target image of "
+                "each sensor, or use unrender.pixels.Uniform"
             )
 
     @property
     def all_pixels(self) -> bool:
-        """Whether every step renders whole images."""
+        """Whether every step renders full images."""
         return isinstance(self.pixels, All)
 
     def describe(self) -> dict[str, Any]:
-        """What must be equal for a saved state to fit, in JSON's types."""
+        """Return the options that a saved state must match, in types of JSON."""
         return {
             "keys": list(self.keys),
             "image": repr(self.image),
@@ -99,7 +99,7 @@ class Options:
 
 
 def open_scene(scene: Any, keys: Any, max_depth: int | None) -> tuple[RendererPort, tuple[str, ...]]:
-    """The renderer port of a scene, and the keys as a tuple. Raises `InputError` where either makes no sense."""
+    """Return the renderer port of a scene, and the keys as a tuple. Raises `InputError` if either is invalid."""
     names = (keys,) if isinstance(keys, str) else keys
     if isinstance(names, (bytes, dict)) or not isinstance(names, Sequence) or not names:
         raise InputError(f"Renderer: keys must be a list of scene parameters, got {keys!r:.80}")
@@ -110,9 +110,9 @@ def open_scene(scene: Any, keys: Any, max_depth: int | None) -> tuple[RendererPo
 
 
 def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...], scene: Any) -> Problem:
-    """A problem whose views are these sensors, with black references where there are none: for the parts that ask for one."""
+    """Return a problem whose views are these sensors. Sensors without a reference get a black one, because a view needs one."""
     sizes = renderer.resolutions()
-    given = dict(zip(options.sensors, options.references, strict=True)) if options.references else {}
+    references = dict(zip(options.sensors, options.references, strict=True)) if options.references else {}
     for sensor in sensors:
         if isinstance(sensor, bool) or not isinstance(sensor, int) or not 0 <= sensor < len(sizes):
             have = f"0 to {len(sizes) - 1}" if len(sizes) > 1 else "0, the only one"
@@ -122,7 +122,10 @@ def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...
         return 1 if format_of(renderer, sensor).colour == "luminance" else 3
 
     views = [
-        View(given[sensor] if sensor in given else np.zeros((*sizes[sensor], channels(sensor)), np.float32), sensor)
+        View(
+            references[sensor] if sensor in references else np.zeros((*sizes[sensor], channels(sensor)), np.float32),
+            sensor,
+        )
         for sensor in sensors
     ]
     name = Path(scene).stem if isinstance(scene, (str, Path)) else "scene"

@@ -1,4 +1,4 @@
-"""`unrender.Renderer`: images for a loop of one's own, and the way back from their loss to the parameters."""
+"""`unrender.Renderer`: images for a user-written loop, and gradients from derivatives of its loss."""
 
 from __future__ import annotations
 
@@ -32,58 +32,57 @@ _MINI_BATCHES = "mini-batches"
 
 
 class Renderer:
-    """A differentiable renderer for a loop of one's own, with one's own loss and optimizer, in Dr.Jit, PyTorch or NumPy.
+    """A differentiable renderer for a user-written loop, loss and optimizer, in Dr.Jit, PyTorch or NumPy.
 
-    In Dr.Jit and PyTorch a call is differentiable, and stands where `mi.render` stood:
+    In Dr.Jit and PyTorch a call is differentiable, and replaces `mi.render`:
 
         renderer = ur.Renderer(scene, ["red.reflectance.value"], image=ur.images.RecursiveControlVariate(), spp=4)
         for step in range(steps):
             image = renderer(parameters)
 
-    and in NumPy, or with derivatives of one's own,
+    In NumPy, or with a separately computed loss derivative:
 
         image = renderer.render(parameters)
         gradient = renderer.backward(derivative)
 
-    `parameters` is {key: array}: a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`; or the array itself where there is one key.
-    Images are linear RGB with the film's reconstruction filter; gradients have the types of the parameters. What a step renders is a
-    function of the parameters and of `seed`, and each step draws anew.
+    `parameters` is {key: array}: a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`, or the array itself if there is one key.
+    Images are linear RGB with the film's reconstruction filter. Gradients have the types of the parameters. A step's image is a function
+    of the parameters and `seed`; each step uses new random numbers.
 
-    Image and adjoint come from independent samples. With `groups=1` the image is (H, W, 3), and the adjoint has paths of its own: three
-    traces a step, as in `mi.render`. With `groups` of 2 or more the image is (groups, H, W, 3), each from the samples of all *other*
-    groups, for a loss that is the mean over them (as `mean((image - reference) ** 2)` is): two traces. The gradient is unbiased
-    for a given derivative, so for a loss whose derivative is linear in the image; otherwise it is biased by the image's noise, which a
-    control variate reduces step by step.
+    Image and adjoint come from independent samples. With `groups=1` the image is (H, W, 3), and the adjoint has separate paths: three
+    traces per step, as in `mi.render`. With `groups` of 2 or more the image is (groups, H, W, 3), each from the samples of all *other*
+    groups, for a loss that is a mean over them (such as `mean((image - reference) ** 2)`): two traces. The gradient is unbiased for a
+    fixed derivative, and so for a loss whose derivative is linear in the image. Otherwise the image's noise biases it, which a control
+    variate reduces step by step.
 
-    With `coupled=True` the product of the image's Jacobian with the given derivative has that of the last step as its control variate
-    (`MetaEstimator(coupled=True)` where the loss lives outside): less noise of the adjoint's paths, a small bias toward zero, and
-    `variance` beside the gradient.
+    With `coupled=True` the previous step's gradient is a control variate of the current one (`MetaEstimator(coupled=True)` with an
+    external loss). This reduces the noise of the adjoint's paths, adds a small bias toward zero, and provides `variance`.
 
-    With pixel mini-batches the image is the rows (N, 3) of some pixels of all sensors; `batch` says which, `gather` takes the
-    same of the references, and sums of `batch.weights` times a loss per element are unbiased for its mean. Now and then, for
-    a control variate, they are all pixels.
+    With pixel mini-batches the image is the rows (N, 3) of some pixels of all sensors. `batch` identifies them, and `gather` selects the
+    same pixels of the references. Sums of `batch.weights` times an elementwise loss are unbiased estimates of its mean. With a control
+    variate, some steps render all pixels.
 
     Args:
-        scene: an .xml file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`. A loaded scene has one state: it is
-            set to what was last rendered, and control variates and `coupled` refuse it.
-        keys: the parameters, as `mi.traverse` names them.
-        image: what the loss sees: `images.Plain()`, `RecursiveControlVariate()` or `Denoised()`.
+        scene: an .xml file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`. A loaded scene has one state,
+            which is set to the last rendered parameters; control variates and `coupled` refuse it.
+        keys: the parameters, as named in `mi.traverse`.
+        image: image estimator: `images.Plain()`, `RecursiveControlVariate()` or `Denoised()`.
         pixels: `pixels.All()`, or a mini-batch by `Uniform`, or by `LossProportional` or `Adaptive`, which need `references`.
         spp: samples per pixel and step, >= 1; a multiple of `groups`.
-        adjoint_spp: of the adjoint's own paths, >= 1; None for `spp`.
+        adjoint_spp: samples per pixel of the adjoint's separate paths, >= 1; None for `spp`.
         groups: sample groups of the image, >= 1.
-        coupled: whether gradients keep those of earlier steps.
-        sensor: index of the scene's sensor, whose image a call returns; or several, for a tuple of images.
-        references: for guided mini-batches alone: the image that the sensor should see, file or (H, W, 3); of several sensors, a list.
-        loss: for guided mini-batches alone: one of `unrender.losses`, near to the loop's own; None is L2. Neither biases the gradient.
-        max_depth: longest light path in segments, >= 1; None for that of the scene's own integrator.
-        seed: of all random numbers, >= 0.
+        coupled: whether the previous gradient is a control variate.
+        sensor: index of the scene's sensor whose image a call returns; several indices for a tuple of images.
+        references: for guided mini-batches only: target image of the sensor, a file or (H, W, 3); a list for several sensors.
+        loss: for guided mini-batches only: one of `unrender.losses`, similar to the loop's loss; None is L2. Neither biases the gradient.
+        max_depth: maximum path length in segments, >= 1; None for that of the scene's integrator.
+        seed: seed of all random numbers, >= 0.
 
     Attributes:
-        batch: the pixels of the last render, with mini-batches.
-        variance: of the last gradient, {key: array} in NumPy, with `coupled=True`; summed over sensors.
+        batch: pixels of the last render, with mini-batches.
+        variance: variance of the last gradient, {key: array} in NumPy, with `coupled=True`; summed over sensors.
 
-    Raises `InputError` for options that do not go together, parameters that have no path gradient, arrays of another shape.
+    Raises `InputError` for incompatible options, parameters without a path gradient, and arrays of another shape.
     """
 
     def __init__(
@@ -126,16 +125,17 @@ class Renderer:
     # ------------------------------------------------------------------ rendering
 
     def __call__(self, values: Any = None, sensor: int | None = None) -> Any:
-        """The image, or the tuple of images, attached to the derivative graph of `values` in Dr.Jit and PyTorch; in NumPy as `render`.
+        """Return the image, or the tuple of images, attached to the derivative graph of `values` in Dr.Jit and PyTorch; as `render` in
+        NumPy.
 
         Args:
-            values: see the class; None for the scene's own.
-            sensor: another sensor than the renderer's; each keeps a state of its own. Not with mini-batches.
+            values: parameters, see the class; None for the scene's.
+            sensor: another sensor than the renderer's; each sensor has its own state. Not supported with mini-batches.
         """
-        given, done, images = self._render(values, sensor)
+        given, records, images = self._render(values, sensor)
 
         def backward(derivatives: tuple[Any, ...]) -> Tree:
-            return self._backward(done, derivatives)
+            return self._backward(records, derivatives)
 
         match given.framework:
             case "numpy":
@@ -149,7 +149,7 @@ class Renderer:
         return attached[0] if self._alone(sensor) else attached
 
     def render(self, values: Any = None, sensor: int | None = None) -> Any:
-        """The image, or the tuple of images, of the kind of `values` and detached from them; `backward` takes it from here.
+        """Return the image, or the tuple of images, detached and in the framework of `values`. Call `backward` for the gradient.
 
         Args:
             values, sensor: see `__call__`.
@@ -158,21 +158,24 @@ class Renderer:
         return images[0] if self._alone(sensor) else images
 
     def backward(self, derivative: Any) -> dict[str, Any]:
-        """{key: gradient} of a loss from its derivative by the image of the last `render`; of several images, a tuple of derivatives.
+        """Return {key: gradient} from the loss derivative with respect to the last rendered image; for several images, a tuple of
+        derivatives.
 
-        Raises `InputError` where nothing was rendered, or the derivative has another shape than the image.
+        Raises `InputError` if nothing was rendered, or the derivative has another shape than the image.
         """
         if self._last is None:
-            raise InputError("Renderer: backward comes after render")
+            raise InputError("Renderer: call render before backward")
         self._check_thread("backward")
-        given, done = self._last
+        given, records = self._last
         derivatives = tuple(derivative) if isinstance(derivative, (tuple, list)) else (derivative,)
-        if len(derivatives) != len(done):
-            raise InputError(f"Renderer: expected {len(done)} derivatives, one for each image, got {len(derivatives)}")
-        return self._exchange.gradient(self._backward(done, derivatives), given)
+        if len(derivatives) != len(records):
+            raise InputError(
+                f"Renderer: expected {len(records)} derivatives, one for each image, got {len(derivatives)}"
+            )
+        return self._exchange.gradient(self._backward(records, derivatives), given)
 
     def preview(self, values: Any = None, spp: int = 64, sensor: int | None = None, seed: int = 0) -> np.ndarray:
-        """A picture (H, W, 3) of `values`, NumPy, plain and whole, that leaves the renderer as it was."""
+        """Return an image (H, W, 3) of `values` in NumPy, rendered plainly with all pixels. The renderer's state is unchanged."""
         chosen = self._options.sensors[0] if sensor is None else sensor
         problem = problem_of(self._port, self._options, (chosen,), self._scene)
         return render_view(problem, numpy(self._exchange.tree(self._exchange.read(values))), 0, spp, seed)
@@ -181,28 +184,31 @@ class Renderer:
 
     @property
     def batch(self) -> Batch:
-        """The pixels of the last render, arrays of the kind of its values. Raises `InputError` where it was of whole images."""
+        """Pixels of the last render, in the framework of its values. Raises `InputError` if it rendered full images."""
         if self._last is None or (batch := self._last[1][0][1].batch) is None:
             raise InputError("Renderer: there is no mini-batch; it has pixels=All(), or nothing was rendered yet")
         self._check_thread("batch")
         given = self._last[0]
         if given.framework == "drjit":
             return batch
-        found = Batch(arrays.numpy(batch.sensors), arrays.numpy(batch.pixels), arrays.numpy(batch.weights))
+        on_host = Batch(arrays.numpy(batch.sensors), arrays.numpy(batch.pixels), arrays.numpy(batch.weights))
         if given.framework == "numpy":
-            return found
+            return on_host
         import torch  # pyright: ignore[reportMissingImports]
 
         like = next(value for value in given.values.values() if frameworks.is_torch(value))
-        whole = [torch.from_numpy(part.astype(np.int64)).to(like.device) for part in (found.sensors, found.pixels)]
-        return Batch(whole[0], whole[1], frameworks.to_torch(found.weights, like))
+        indices = [
+            torch.from_numpy(part.astype(np.int64)).to(like.device) for part in (on_host.sensors, on_host.pixels)
+        ]
+        return Batch(indices[0], indices[1], frameworks.to_torch(on_host.weights, like))
 
     def gather(self, images: Any) -> Any:
-        """The pixels of the last render, (N, C), of an image (H, W, C) or, with several sensors, of a list of them; unchanged where the
-        render was of whole images.
+        """Select the pixels of the last render, (N, C), from an image (H, W, C), or from a list of images with several sensors.
+
+        Images are unchanged if the render was of full images.
 
         Args:
-            images: of the kind of the values that were rendered; NumPy's become such.
+            images: in the framework of the rendered values, or NumPy.
         """
         if self._options.all_pixels:
             return images
@@ -234,7 +240,7 @@ class Renderer:
 
     @property
     def variance(self) -> dict[str, np.ndarray] | None:
-        """See the class; None without `coupled`, or before the first gradient."""
+        """Variance of the last gradient, see the class; None without `coupled`, or before the first gradient."""
         if not self._variances:
             return None
         total = self._variances[0]
@@ -244,24 +250,27 @@ class Renderer:
 
     @property
     def state(self) -> RendererState:
-        """All that decides what the next steps do, beside the parameters: a frozen dataclass of arrays."""
+        """Everything apart from the parameters that determines the next steps: a frozen dataclass of arrays."""
         return RendererState(self._step, self._options.seed, {name: one.state for name, one in self._streams.items()})
 
     def save(self, path: str | Path) -> Path:
-        """Write the state to a file, so that a renderer of the same options that loads it goes on as this one would, bit for bit where
-        sums have an order (see `optimize`). Returns the path. Raises `InputError` where it cannot be written."""
+        """Write the state to a file and return its path. Raises `InputError` if it cannot be written.
+
+        A renderer with the same options that loads it continues as this one would, bit for bit where sums have a fixed order (see
+        `optimize`).
+        """
         return saved.write(Path(path), self.state, self._options.describe())
 
     def load(self, path: str | Path) -> None:
-        """Go on from a state that `save` wrote. Raises `InputError` for a file that is damaged, or of other options."""
-        found = saved.read(Path(path), self._options.describe(), self.state)
-        streams = {name: self._stream(name) for name in found.streams}
+        """Continue from a state that `save` wrote. Raises `InputError` for a damaged file, or one with other options."""
+        loaded = saved.read(Path(path), self._options.describe(), self.state)
+        streams = {name: self._stream(name) for name in loaded.streams}
         for name, stream in streams.items():
-            stream.state = found.streams[name]
+            stream.state = loaded.streams[name]
         for name in set(self._streams) - set(streams):
             del self._streams[name]
-        self._step, self._last, self._variances = found.step, None, []
-        self._options = saved.with_seed(self._options, found.seed)
+        self._step, self._last, self._variances = loaded.step, None, []
+        self._options = saved.with_seed(self._options, loaded.seed)
 
     # ------------------------------------------------------------------ the two passes
 
@@ -269,24 +278,24 @@ class Renderer:
     def _render(self, values: Any, sensor: int | None) -> tuple[Given, list[tuple[Stream, Rendered]], tuple[Any, ...]]:
         given = self._exchange.read(values)
         parameters = self._exchange.tree(given)
-        key, done, images = Key(self._options.seed, self._step), [], []
+        key, records, images = Key(self._options.seed, self._step), [], []
         for name in self._names(sensor):
             stream = self._stream(name)
             number = 0 if name == _MINI_BATCHES else int(name)
             rendered, image = stream.render(parameters, key.fold(number))
-            done.append((stream, rendered))
+            records.append((stream, rendered))
             images.append(self._exchange.image(image, given))
         self._step += 1
-        self._last, self._thread = (given.detached(), done), threading.current_thread()
-        return given, done, tuple(images)
+        self._last, self._thread = (given.detached(), records), threading.current_thread()
+        return given, records, tuple(images)
 
     @exclusive("Renderer")
-    def _backward(self, done: list[tuple[Stream, Rendered]], derivatives: Sequence[Any]) -> Tree:
+    def _backward(self, records: list[tuple[Stream, Rendered]], derivatives: Sequence[Any]) -> Tree:
         total: Tree | None = None
         self._variances = []
-        for (stream, rendered), derivative in zip(done, derivatives, strict=True):
-            found = stream.backward(rendered, self._exchange.derivative(derivative, rendered.shape))
-            total = found if total is None else add(total, found)
+        for (stream, rendered), derivative in zip(records, derivatives, strict=True):
+            gradient = stream.backward(rendered, self._exchange.derivative(derivative, rendered.shape))
+            total = gradient if total is None else add(total, gradient)
             self._variances += [] if stream.variance is None else [stream.variance]
         if total is None:
             raise InputError("Renderer: nothing was rendered")
@@ -294,22 +303,22 @@ class Renderer:
         return total
 
     def _check_thread(self, what: str) -> None:
-        """Raise `InputError` where another thread has rendered last: what is asked for belongs to its image."""
+        """Raise `InputError` if another thread rendered last: the request belongs to its image."""
         if self._thread is not threading.current_thread():
             raise InputError(
-                f"Renderer: {what} in another thread than the last render, whose image it would belong to; give each thread a Renderer"
+                f"Renderer: {what} in another thread than the last render, to whose image it belongs; use one Renderer per thread"
             )
 
     def _with_torch(self, given: Given, images: tuple[Any, ...], backward: Callable[..., Tree]) -> tuple[Any, ...]:
         from unrender.own_loop import torch_operation
 
         tensors = {key: value for key, value in given.values.items() if frameworks.is_torch(value)}
-        alike = {key: value.detach() for key, value in tensors.items()}
+        detached = {key: value.detach() for key, value in tensors.items()}
         device = images[0].device
 
         def gradients(derivatives: tuple[Any, ...]) -> list[Any]:
-            found = backward(derivatives)
-            return [frameworks.to_torch(arrays.numpy(found[key]), x).to("cpu") for key, x in alike.items()]
+            gradient = backward(derivatives)
+            return [frameworks.to_torch(arrays.numpy(gradient[key]), x).to("cpu") for key, x in detached.items()]
 
         on_host = tuple(image.to("cpu") for image in images)
         return tuple(x.to(device) for x in torch_operation.apply(gradients, on_host, list(tensors.values())))
@@ -322,7 +331,7 @@ class Renderer:
     def _names(self, sensor: int | None) -> list[str]:
         if not self._options.all_pixels:
             if sensor is not None:
-                raise InputError("Renderer: a mini-batch is of all sensors; give them at construction, sensor=[...]")
+                raise InputError("Renderer: a mini-batch contains all sensors; pass them at construction, sensor=[...]")
             return [_MINI_BATCHES]
         return [str(one) for one in (self._options.sensors if sensor is None else [sensor])]
 

@@ -1,4 +1,4 @@
-"""The state of a `Renderer` as a file: tensors of safetensors, and in its header how they are put together."""
+"""State of a `Renderer` as a file: tensors in safetensors format, with their structure in its header."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class RendererState:
     """State between steps.
 
     Attributes:
-        step: renders so far.
-        seed: of the random numbers.
+        step: number of renders so far.
+        seed: seed of the random numbers.
         streams: {sensor, or "mini-batches": its state}.
     """
 
@@ -38,14 +38,14 @@ class RendererState:
 
 
 def write(path: Path, state: RendererState, options: dict[str, Any]) -> Path:
-    """Write a state and the options that it is of. Raises `InputError` where it cannot be written."""
+    """Write a state and its options. Raises `InputError` if it cannot be written."""
     packed = pack(state)
     notes = {"format": _FORMAT, "options": json.dumps(options), "state": json.dumps(packed.skeleton, allow_nan=False)}
     return files.write(path, safetensors.numpy.save(packed.tensors, metadata=notes), durable=True)
 
 
 def read(path: Path, options: dict[str, Any], pattern: RendererState) -> RendererState:
-    """The state in a file. Raises `InputError` for a file that `write` did not write, or of other options."""
+    """Return the state in a file. Raises `InputError` for a file that `write` did not write, or with other options."""
     size = path.stat().st_size if path.is_file() else 0
     data = bounded_files.read_bytes(path, min(size, _LARGEST), path.parent)
     length = int.from_bytes(data[:8], "little")
@@ -58,18 +58,18 @@ def read(path: Path, options: dict[str, Any], pattern: RendererState) -> Rendere
     try:
         tensors = {name: array.copy() for name, array in safetensors.numpy.load(data).items()}
     except (safetensors.SafetensorError, KeyError) as error:
-        raise InputError(f"{path}: not tensors that can be read: {str(error)[:200]}") from error
+        raise InputError(f"{path}: tensors cannot be read: {str(error)[:200]}") from error
     try:
-        found = unpack(Packed(skeleton, tensors), [pattern])
+        state = unpack(Packed(skeleton, tensors), [pattern])
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    if not _fits(found, pattern):
+    if not _fits(state, pattern):
         raise InputError(f"{path}: not the state of a Renderer with these options")
-    return found
+    return state
 
 
 def with_seed(options: Options, seed: int) -> Options:
-    """The same options with another seed."""
+    """Return the options with another seed."""
     return dataclasses.replace(options, seed=seed)
 
 
@@ -83,15 +83,15 @@ def _check_options(path: Path, saved: Any, options: dict[str, Any]) -> None:
             )
 
 
-def _fits(found: Any, pattern: RendererState) -> bool:
-    """Whether it is a state of the same components."""
-    if not isinstance(found, RendererState) or not isinstance(found.streams, dict):
+def _fits(state: Any, pattern: RendererState) -> bool:
+    """Return whether it is a state with the same components."""
+    if not isinstance(state, RendererState) or not isinstance(state.streams, dict):
         return False
     known = next(iter(pattern.streams.values()))
-    numbers = (found.step, found.seed)
+    numbers = (state.step, state.seed)
     if any(isinstance(n, bool) or not isinstance(n, int) or n < 0 for n in numbers):
         return False
-    names = found.streams.keys()
+    names = state.streams.keys()
     if any(name not in pattern.streams and not (isinstance(name, str) and name.isdecimal()) for name in names):
         return False
     return all(
@@ -99,5 +99,5 @@ def _fits(found: Any, pattern: RendererState) -> bool:
         and type(stream.image) is type(known.image)
         and type(stream.pixels) is type(known.pixels)
         and type(stream.coupled) is type(known.coupled)
-        for stream in found.streams.values()
+        for stream in state.streams.values()
     )

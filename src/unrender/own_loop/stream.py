@@ -1,4 +1,4 @@
-"""The images of one sensor, or the pixel mini-batches of several, from step to step."""
+"""Rendering of one sensor, or of pixel mini-batches of several, from step to step."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class CoupledState:
     """State between steps.
 
     Attributes:
-        parameters: of the last step that had a gradient; None before the first.
-        derivative: the loss derivative of that step, (1, H, W, 3).
+        parameters: parameters of the last step with a gradient; None before the first.
+        derivative: loss derivative of that step, (1, H, W, 3).
         elements: {key: meta-estimate and statistics of each element of the gradient}; empty before the first step.
     """
 
@@ -39,12 +39,12 @@ class CoupledState:
 
 @dataclass(frozen=True)
 class CoupledGradient:
-    """What a coupled step gives.
+    """Result of a coupled step.
 
     Attributes:
         gradient: {key: array}.
-        variance: of `gradient` per element, as the recurrence has it.
-        state: the next.
+        variance: variance of `gradient` per element, by the recurrence.
+        state: next state.
     """
 
     gradient: Tree
@@ -60,43 +60,43 @@ def coupled_gradient(
     derivative: Array,
     state: CoupledState,
 ) -> CoupledGradient:
-    """M_n = F_n + w (M_{n−1} − H_n), with F_n = J(θ_n)ᵀ g_n and H_n = J(θ_{n−1})ᵀ g_{n−1} from the same paths.
+    """Return M_n = F_n + w (M_{n−1} − H_n), with F_n = J(θ_n)ᵀ g_n and H_n = J(θ_{n−1})ᵀ g_{n−1} from the same paths.
 
-    The loss lives outside, so its derivatives g_n are given: H_n takes the one that the user gave at the last step. Given these, the
-    recursion reduces the noise of the paths of J, and leaves that of g_n to the image that the loss sees. Of `MetaEstimator(coupled=True)`
-    this is the recursion, per element, with w from the covariance of F and H. Differences are not divided by the step length
-    (Eq. 13), since g_n − g_{n−1} need not vanish with it.
+    The loss is external, so its derivatives g_n are inputs, and H_n uses the one of the last step. For fixed derivatives, the recursion
+    reduces the noise of the paths of J; the noise of g_n depends on the image estimator. It is the recursion of
+    `MetaEstimator(coupled=True)`, per element, with w from the covariance of F and H. Differences are not divided by the step length (Eq.
+    13), because g_n − g_{n−1} need not vanish with it.
 
-    Bias: that of MetaEstimator with shared statistics: w knows the samples that it weighs, which pulls the gradient toward zero, most
-    at the first steps.
+    Bias: as for MetaEstimator with shared statistics. The weight w depends on the samples that it weights, which pulls the gradient
+    toward zero, most in the first steps.
 
     Args:
-        session: of both states.
-        space: in which they share samples.
+        session: session for both states.
+        space: space in which they share samples.
         parameters: the current ones.
-        request: the samples of the adjoint, independent of those of the image; of one group.
+        request: samples of the adjoint, in one group, independent of those of the image.
         derivative: g_n, (1, H, W, 3).
-        state: the last.
+        state: the last state.
     """
-    previous, before, elements = state.parameters, state.derivative, state.elements
-    if previous is None or before is None or trees.shapes(previous) != trees.shapes(parameters):
-        previous, before, elements = parameters, derivative, {key: meta.init(x) for key, x in parameters.items()}
+    previous, earlier, elements = state.parameters, state.derivative, state.elements
+    if previous is None or earlier is None or trees.shapes(previous) != trees.shapes(parameters):
+        previous, earlier, elements = parameters, derivative, {key: meta.init(x) for key, x in parameters.items()}
     rendering = session.image_pair(parameters, previous, replace(request, both_gradients=True), space)
-    F, H = session.adjoint_pair(parameters, previous, rendering.paths, derivative, before)
-    found = {key: meta.update_coupled(elements[key], F[key], H[key], 1.0, decouple=False) for key in parameters}
-    gradient, variance, _, after = ({key: parts[n] for key, parts in found.items()} for n in range(4))
-    arrays.evaluate(gradient, variance, after)
-    return CoupledGradient(gradient, variance, CoupledState(parameters, derivative, after))
+    F, H = session.adjoint_pair(parameters, previous, rendering.paths, derivative, earlier)
+    estimates = {key: meta.update_coupled(elements[key], F[key], H[key], 1.0, decouple=False) for key in parameters}
+    gradient, variance, _, next_elements = ({key: parts[n] for key, parts in estimates.items()} for n in range(4))
+    arrays.evaluate(gradient, variance, next_elements)
+    return CoupledGradient(gradient, variance, CoupledState(parameters, derivative, next_elements))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """The pixels of the last render, for a loss over a mini-batch; N of all P pixels of all sensors. Arrays of the renderer.
+    """Pixels of the last render, for a loss over a mini-batch: N of all P pixels of all sensors. Arrays of the renderer.
 
     Attributes:
-        sensors: the place of each pixel's sensor in `sensor=`, (N,).
-        pixels: row-major index within its film, (N,).
-        weights: (N, 1): sums of them times a loss per element (N, 3) are unbiased for its mean over all P · 3 elements.
+        sensors: index into `sensor=` for each pixel, (N,).
+        pixels: row-major index in its film, (N,).
+        weights: (N, 1). Their sum times an elementwise loss (N, 3) is an unbiased estimate of its mean over all P · 3 elements.
     """
 
     sensors: Array
@@ -109,10 +109,10 @@ class StreamState:
     """State between steps.
 
     Attributes:
-        image: the image estimator's.
-        pixels: the pixel sampler's.
-        batches: mini-batches since whole images were last rendered.
-        coupled: that of coupled gradients.
+        image: state of the image estimator.
+        pixels: state of the pixel sampler.
+        batches: mini-batches since full images were last rendered.
+        coupled: state of coupled gradients.
     """
 
     image: Any
@@ -123,7 +123,7 @@ class StreamState:
 
 @dataclass(frozen=True)
 class _FrameRecord:
-    """One launch: its pixels, its paths in so many groups, the key of its draws, the shape of its image."""
+    """One launch: its pixels, its paths, their number of groups, the key of its random numbers, and the shape of its image."""
 
     frame: Frame
     paths: Any
@@ -134,13 +134,13 @@ class _FrameRecord:
 
 @dataclass(frozen=True)
 class Rendered:
-    """What `Stream.backward` needs of one render.
+    """Record of one render for `Stream.backward`.
 
     Attributes:
-        parameters: that were rendered.
-        frames: what was launched.
-        shape: of the image that was handed out.
-        batch: its pixels; None for a whole image.
+        parameters: rendered parameters.
+        frames: records of the launches.
+        shape: shape of the returned image.
+        batch: its pixels; None for a full image.
     """
 
     parameters: Tree
@@ -150,17 +150,17 @@ class Rendered:
 
 
 class Stream:
-    """Renders steps, and takes the derivative of each back to the parameters.
+    """Renders steps, and backpropagates the derivative of each.
 
     Args:
-        problem: with the sensors as its views.
-        options: of the `Renderer`.
+        problem: problem with the sensors as its views.
+        options: options of the `Renderer`.
 
     Attributes:
-        state: between steps.
-        variance: of the last gradient, {key: array}; None but for coupled gradients.
+        state: state between steps.
+        variance: variance of the last gradient, {key: array}; None except for coupled gradients.
 
-    Raises `InputError` for a parameter that has no path gradient, or that cannot be compared with an earlier value of itself.
+    Raises `InputError` for a parameter without a path gradient, or one that does not support comparison with its earlier value.
     """
 
     def __init__(self, problem: Problem, options: Options):
@@ -173,32 +173,33 @@ class Stream:
         self.state = StreamState(options.image.init(problem, start), options.pixels.init(problem, start))
 
     def render(self, parameters: Tree, key: Key) -> tuple[Rendered, Array]:
-        """The image of a step, and what its backward pass needs. Advances the state.
+        """Return the image of a step and the record for its backward pass, and advance the state.
 
-        The image is (H, W, 3) or, of a mini-batch, (N, 3); with several groups (groups, ...), each from the samples of all other groups.
+        The image is (H, W, 3) or, for a mini-batch, (N, 3). With several groups it is (groups, ...), each from the samples of all other
+        groups.
         """
         options, state, problem = self._options, self.state, self.problem
         batch, pixels = MiniBatch(None), state.pixels
         if not options.all_pixels and not options.image.needs_whole_views(parameters, state.image, state.batches):
             batch, pixels = options.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
         frames = whole_views(problem) if batch.sample is None else [PixelBatch(problem, batch.sample)]
-        records, images, kept = [], [], []
+        records, images, contributions = [], [], []
         for index, frame in enumerate(frames):
-            of_frame = key.fold(index)
-            found, part = options.image.estimate(
-                problem, parameters, state.image, frame, options.spp, options.groups, of_frame.fold(0)
+            frame_key = key.fold(index)
+            estimate, part = options.image.estimate(
+                problem, parameters, state.image, frame, options.spp, options.groups, frame_key.fold(0)
             )
-            shown = found.mean() if options.groups == 1 else found.others()
-            groups = arrays.shape(found.images)[0]
-            records.append(_FrameRecord(frame, found.paths, groups, of_frame, arrays.shape(shown)))
+            shown = estimate.mean() if options.groups == 1 else estimate.others()
+            groups = arrays.shape(estimate.images)[0]
+            records.append(_FrameRecord(frame, estimate.paths, groups, frame_key, arrays.shape(shown)))
             images.append(shown)
-            kept.append(part)
+            contributions.append(part)
         after, count = state.image, state.batches + 1
         if batch.sample is None:
-            after, count = options.image.advance(parameters, state.image, tuple(kept)), 0
+            after, count = options.image.advance(parameters, state.image, tuple(contributions)), 0
             after = after if options.all_pixels else options.image.prepare(problem, after)
         else:
-            after = options.image.learn(problem, after, batch.sample, kept[0])
+            after = options.image.learn(problem, after, batch.sample, contributions[0])
         self.state = replace(state, image=after, pixels=pixels, batches=count)
         image = images[0] if options.all_pixels else self._as_rows(images)
         arrays.evaluate(image, self.state)
@@ -206,8 +207,10 @@ class Stream:
         return Rendered(parameters, tuple(records), arrays.shape(image), chosen), image
 
     def backward(self, rendered: Rendered, derivative: Array) -> Tree:
-        """The gradient of a loss with this derivative by the image of `rendered`, of its shape. Unbiased for a given one that does not know
-        the adjoint's samples."""
+        """Return the gradient of a loss from its derivative with respect to the image of `rendered`, of the same shape.
+
+        Unbiased for a derivative that is independent of the adjoint's samples.
+        """
         parts = [
             self._frame_gradient(rendered.parameters, record, part)
             for record, part in zip(rendered.frames, self._per_frame(rendered, derivative), strict=True)
@@ -232,9 +235,9 @@ class Stream:
             return session.adjoint(parameters, session.image(parameters, request).paths, weights)
         space = self._space()
         session = self.problem.renderer.prepare(keys, space)
-        found = coupled_gradient(session, space, parameters, request, weights, self.state.coupled)
-        self.variance, self.state = found.variance, replace(self.state, coupled=found.state)
-        return found.gradient
+        coupled = coupled_gradient(session, space, parameters, request, weights, self.state.coupled)
+        self.variance, self.state = coupled.variance, replace(self.state, coupled=coupled.state)
+        return coupled.gradient
 
     def _space(self) -> Space:
         if self._options.image.space is not None:
@@ -243,7 +246,7 @@ class Stream:
         return "path" if all(known[key].shares_paths for key in self._options.keys) else "primary"
 
     def _as_rows(self, images: Sequence[Array]) -> Array:
-        """Images (H, W, 3) or (N, 3) of all frames, one behind the other: (N, 3); with several groups (groups, N, 3)."""
+        """Concatenate the images (H, W, 3) or (N, 3) of all frames: (N, 3); with several groups (groups, N, 3)."""
         if self._options.groups == 1:
             return arrays.concatenate([arrays.rows(image) for image in images])
         groups = range(arrays.shape(images[0])[0])
@@ -251,16 +254,16 @@ class Stream:
         return arrays.concatenate([arrays.add_first_axis(rows) for rows in per_group])
 
     def _per_frame(self, rendered: Rendered, derivative: Array) -> list[Array]:
-        """The derivative of each frame's image, of its shape."""
+        """Return the derivative of each frame's image, with the image's shape."""
         if rendered.batch is None:
             return [derivative]
-        found, start = [], 0
+        parts, start = [], 0
         for record in rendered.frames:
             end = start + record.frame.pixels
             part = derivative[start:end] if self._options.groups == 1 else derivative[:, start:end]
-            found.append(arrays.reshape(part, record.shape))
+            parts.append(arrays.reshape(part, record.shape))
             start = end
-        return found
+        return parts
 
     def _batch(self, drawn: MiniBatch, like: Array) -> Batch:
         resolutions = self.problem.renderer.resolutions()

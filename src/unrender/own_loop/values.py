@@ -1,4 +1,4 @@
-"""Parameters, images and gradients between a loop's framework and the renderer's own arrays."""
+"""Conversion of parameters, images and gradients between a loop's framework and the renderer's arrays."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from unrender.rendering.renderer import ParameterInfo, Renderer
 
 @dataclass(frozen=True)
 class Given:
-    """Parameters as the loop has them.
+    """Parameters in the loop's framework.
 
     Attributes:
-        framework: of the loop.
-        values: {key: array} of it, in the order of the renderer's keys.
+        framework: framework of the loop.
+        values: {key: array} in that framework, in the order of the renderer's keys.
     """
 
     framework: Framework
     values: dict[str, Any]
 
     def detached(self) -> Given:
-        """The same values, without what the loop's graph has before them."""
+        """Return the same values, detached from the loop's graph."""
 
         def detach(x: Any) -> Any:
             return x.detach() if frameworks.is_torch(x) else dr.detach(x) if arrays.is_drjit(x) else x
@@ -43,8 +43,8 @@ class Exchange:
     """Converts between a loop's arrays and the renderer's.
 
     Args:
-        renderer: whose arrays.
-        keys: of the parameters, in order.
+        renderer: renderer that makes the arrays.
+        keys: keys of the parameters, in order.
     """
 
     def __init__(self, renderer: Renderer, keys: tuple[str, ...]):
@@ -53,8 +53,11 @@ class Exchange:
         self._on_device = arrays.is_drjit(renderer.array(np.zeros(1)))
 
     def read(self, values: Any) -> Given:
-        """What the loop gave: a mapping with at least the keys (a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`), or where
-        there is one key the array itself; None for the scene's own values. Raises `InputError`."""
+        """Read the loop's parameters, and check the keys. Raises `InputError`.
+
+        They are a mapping with at least the keys (a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`), the array itself if there
+        is one key, or None for the scene's values.
+        """
         if values is None:
             return Given("numpy", {key: arrays.numpy(x) for key, x in self._renderer.values(list(self._keys)).items()})
         if not isinstance(values, Mapping) and not (hasattr(values, "keys") and hasattr(values, "__getitem__")):
@@ -67,14 +70,14 @@ class Exchange:
             if key not in known:
                 raise InputError(f"Renderer: no value for parameter {key}{did_you_mean(key, others)}")
         self._refuse_unused(values, others)
-        found = {key: values[key] for key in self._keys}
-        return Given(frameworks.framework(found.values(), "Renderer"), found)
+        parameters = {key: values[key] for key in self._keys}
+        return Given(frameworks.framework(parameters.values(), "Renderer"), parameters)
 
     def _refuse_unused(self, values: Any, others: list[Any]) -> None:
         """Raise `InputError` for values that would be ignored.
 
-        A dictionary may hold nothing but the parameters. An optimizer may hold other variables, but no parameter of the scene, whose
-        gradient would stay zero. `mi.SceneParameters` always hold all of the scene.
+        A dictionary may contain only the parameters. An optimizer may contain other variables, but no other parameter of the scene, whose
+        gradient would stay zero. `mi.SceneParameters` always contain all of the scene.
         """
         if hasattr(values, "hierarchy"):  # mi.SceneParameters
             return
@@ -82,22 +85,22 @@ class Exchange:
             others = [name for name in others if name in self._renderer.parameters()]
         if others:
             raise InputError(
-                f"Renderer: {others[0]} is none of its parameters{did_you_mean(str(others[0]), self._keys)}; "
-                f"it was made for {', '.join(self._keys)}, and would ignore it"
+                f"Renderer: {others[0]} is not one of its parameters{did_you_mean(str(others[0]), self._keys)}; "
+                f"it was created for {', '.join(self._keys)}, and would ignore it"
             )
 
     def tree(self, given: Given) -> Tree:
-        """The parameters as the renderer's arrays, detached. Raises `InputError` for a shape that none has."""
+        """Return the parameters as arrays of the renderer, detached. Raises `InputError` for a wrong shape."""
         if given.framework == "drjit" and self._on_device:
             from unrender.rendering.mitsuba.tensors import to_tensor
 
-            found = {key: self._fit(key, self._native(key, value, to_tensor)) for key, value in given.values.items()}
-            dr.make_opaque(found)
-            return found
+            tree = {key: self._fit(key, self._native(key, value, to_tensor)) for key, value in given.values.items()}
+            dr.make_opaque(tree)
+            return tree
         return {key: self._renderer.array(self._host(key, value)) for key, value in given.values.items()}
 
     def attached(self, given: Given) -> Tree:
-        """As `tree`, of Dr.Jit's arrays, still attached to the derivative graph of the loop."""
+        """Return the parameters as Dr.Jit arrays that are still attached to the loop's derivative graph."""
         import mitsuba as mi
 
         def tensor(key: str, value: Any) -> Any:
@@ -112,7 +115,7 @@ class Exchange:
         }
 
     def image(self, image: Array, given: Given) -> Any:
-        """An image of the renderer as one of the loop's: float32, or float64 where its parameters are."""
+        """Convert an image of the renderer to the loop's framework: float32, or float64 if its parameters are."""
         match given.framework:
             case "numpy":
                 return arrays.numpy(image)
@@ -124,22 +127,25 @@ class Exchange:
                 return frameworks.to_torch(arrays.numpy(image), like)
 
     def derivative(self, derivative: Any, shape: tuple[int, ...]) -> Array:
-        """The derivative of the loop's loss by an image of this shape, as the renderer's array. Raises `InputError`."""
-        found = frameworks.shape(derivative)
-        if found != shape:
-            raise InputError(f"Renderer: expected the derivative of the loss by the image, {shape}, got {found}")
+        """Return the derivative of the loop's loss with respect to an image of this shape as the renderer's array.
+
+        Raises `InputError`.
+        """
+        got = frameworks.shape(derivative)
+        if got != shape:
+            raise InputError(f"Renderer: expected the derivative of the loss by the image, {shape}, got {got}")
         if self._on_device and arrays.is_drjit(derivative):
             detached = dr.detach(derivative)
             if not arrays.all_finite(detached):
                 _refuse_derivative(arrays.numpy(detached))
             return detached
-        found = frameworks.host(derivative, "Renderer: the derivative of the loss")
-        if not np.isfinite(found).all():
-            _refuse_derivative(found)
-        return self._renderer.array(found)
+        values = frameworks.host(derivative, "Renderer: the derivative of the loss")
+        if not np.isfinite(values).all():
+            _refuse_derivative(values)
+        return self._renderer.array(values)
 
     def gradient(self, gradient: Tree, given: Given) -> dict[str, Any]:
-        """A gradient as arrays of the loop, each of the type of its parameter."""
+        """Return a gradient as arrays of the loop, each of the type of its parameter."""
         return {key: self._like(gradient[key], value, given) for key, value in given.values.items()}
 
     def _like(self, gradient: Array, value: Any, given: Given) -> Any:
@@ -165,13 +171,13 @@ class Exchange:
             raise InputError(f"parameter {key}: expected shape {self._info[key].shape}, got {_kind(value)}") from error
 
     def _host(self, key: str, value: Any) -> np.ndarray:
-        found = frameworks.host(value, f"parameter {key}")
-        if not np.isfinite(found).all():
-            raise InputError(f"parameter {key}: expected finite numbers, got {_first_of(found)}")
-        return self._fit(key, found)
+        array = frameworks.host(value, f"parameter {key}")
+        if not np.isfinite(array).all():
+            raise InputError(f"parameter {key}: expected finite numbers, got {_first_of(array)}")
+        return self._fit(key, array)
 
     def _fit(self, key: str, value: Array) -> Array:
-        """Of the parameter's shape; of another resolution where it has several."""
+        """Return the value if it has the parameter's shape, or another supported resolution; else raise `InputError`."""
         shape, expected = arrays.shape(value), self._info[key].shape
         if shape == expected:
             return value
@@ -200,7 +206,7 @@ def _refuse_derivative(values: np.ndarray) -> None:
 
 
 def _first_of(values: np.ndarray) -> str:
-    """Return how many values are not finite, and the first of them."""
+    """Return a phrase with the first value that is not finite and the number of such values."""
     wrong = np.argwhere(~np.isfinite(values))
     place = tuple(int(n) for n in wrong[0])
     return f"{values[place]} at {place}, one of {len(wrong)} of {values.size} values"

@@ -1,4 +1,4 @@
-"""Which pixels a step renders: all, or a mini-batch."""
+"""Pixel samplers, which choose the pixels that a step renders: all, or a mini-batch."""
 
 from unrender.pixels.adaptive import Adaptive
 from unrender.pixels.adaptive_counts import AdaptiveCounts

@@ -1,5 +1,5 @@
-"""Pixel mini-batches drawn where the variance of the gradient is: "Image-space Adaptive Sampling for Fast Inverse Rendering"
-(SIGGRAPH 2025)."""
+"""Pixel mini-batches that reduce the variance of the gradient: "Image-space Adaptive Sampling for Fast Inverse Rendering" (SIGGRAPH
+2025)."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
 
 _FEWEST = 4096
-"""Pixels of a mini-batch whose paths take as long as the rest of a step: on 2 cores, with 2 samples a pixel of `caustic`."""
+"""Number of pixels of a mini-batch whose paths take as long as the rest of a step (2 cores, 2 samples per pixel, problem `caustic`)."""
 
 
 def default_count(problem: Problem) -> int:
-    """How many pixels a mini-batch has where that is not given."""
+    """Return the default number of pixels of a mini-batch."""
     return min(problem.pixels, max(problem.pixels // 4, _FEWEST))
 
 
 @dataclass(frozen=True)
 class _Options:
-    """See `GuidedOptions`."""
+    """Options of the guided sampler, see `GuidedOptions`."""
 
     count: int
     refresh: int
@@ -42,48 +42,46 @@ class _Options:
 @register
 @dataclass(frozen=True)
 class Adaptive:
-    """p_j = λ u_j + (1 - λ) q_j with q_j ∝ sqrt(E[(∂L/∂I_j)²] · Σ_k E[(∂I_j/∂θ_k)²] / c_j), Eq. 12, summed over colours: of all
-    probabilities, those whose gradient has the least variance, summed over the parameters, when the two factors come from independent
-    paths; per cost c_j of a path, and mixed with uniform sampling u.
+    """Importance sampling of pixels, p_j = λ u_j + (1 - λ) q_j with uniform u_j and q_j ∝ sqrt(E[(∂L/∂I_j)²] · Σ_k E[(∂I_j/∂θ_k)²] / c_j)
+    (Eq. 12).
 
-    Both factors are estimated from a few paths per tile of pixels, denoised; the second by one pass in forward mode with random ±1
-    tangents (`RenderSession.tangent_moment`), where shapes move with the derivative by the borders of silhouettes and shadows. The
-    samples of the first steps, and of one between two updates, add to both (`LearningSampler`), where the estimator can tell what they
-    saw. Parameters with a preconditioner count as u, where x = S u, the coordinates of the descent. The gradient is unbiased for any
-    positive probabilities, so errors of these estimates change its variance only.
+    The sums include the colour channels. If the two factors come from independent paths, q minimises the gradient's variance, summed over
+    the parameters, per cost c_j of a path. Both factors are estimated from a few paths per tile of pixels and denoised. The second factor
+    uses one forward-mode pass with random ±1 tangents (`RenderSession.tangent_moment`); for moving shapes it includes the derivative of
+    visibility discontinuities. Samples of the first steps, and of one step between two updates, contribute to both factors
+    (`LearningSampler`) if the estimator reports them. Parameters with a preconditioner S count as u, where x = S u. The gradient is
+    unbiased for any positive probabilities, so errors of these estimates affect only its variance.
 
-    Few paths know nothing of rare bright ones, and a map that has missed them can make the variance many times that of uniform
-    sampling. Since p_j >= λ u_j, the second moment of the gradient is at most 1 / λ times uniform sampling's. λ is 0.8 at first, so at
-    most 1.25 times; it falls as samples confirm the map: each tells, with its probability, the second moment under any other
+    A few paths may miss rare bright ones, and such a map can make the variance many times that of uniform sampling. Because p_j >= λ u_j,
+    the second moment of the gradient is at most 1 / λ times that of uniform sampling. λ starts at 0.8, a factor of at most 1.25, and
+    decreases as samples confirm the map: each sample, weighted by its probability, gives an estimate of the second moment under any other
     probabilities (`uniform_share.choose`).
 
-    With `levels` = D > 0 the probabilities of D + 1 resolutions are averaged (Eq. 18). Each coarser one compares renders with references
-    averaged over blocks of 2^d × 2^d tiles, which draws more pixels where the reference varies within a block. (The paper's blocks are
-    of pixels; the two are the same where there are as many tiles as pixels.) The paper has D = 4, because in a sum of plain variances
-    uniform regions can outweigh textured ones; relative variances need it less, and without levels the variance is smaller:
-    the paper's is
-    `Adaptive(count, levels=4, relative=False, uniform=0.1, learn_from_draws=False, by_cost=False)`.
+    With `levels` = D > 0 the probabilities of D + 1 resolutions are averaged (Eq. 18). Each coarser level compares renderings with
+    references averaged over blocks of 2^d × 2^d tiles, which favours pixels where the reference varies within a block. (The paper's
+    blocks consist of pixels; both are equal if there are as many tiles as pixels.) The paper uses D = 4, because in a sum of plain
+    variances uniform regions can outweigh textured ones. Relative variances need it less, and the variance is smaller without levels. The
+    paper's variant is `Adaptive(count, levels=4, relative=False, uniform=0.1, learn_from_draws=False, by_cost=False)`.
 
     Args:
-        count: pixels a step, >= 1, drawn with replacement from all pixels of all views. None for a quarter of these, but for 4096 at least
-            where there are as many: on a processor the fixed cost of a step is that of so many pixels, so fewer are hardly faster.
+        count: pixels per step, >= 1, sampled with replacement from all pixels of all views. None takes a quarter of all pixels, but at
+            least 4096 or all: on a processor, fewer pixels are hardly faster because of a step's fixed cost.
         levels: D, >= 0.
         refresh: steps between importance-map updates, >= 1.
-        samples: paths of an update, >= 1, which also sets how fine the tiles are: one path in each, or several where tiles are
-            pixels. None for a third of `count`, but 4096 at least (or twice `count`, of the first eight times), for each 20 steps
-            between updates: a few hundredths of the cost of the steps.
-        uniform: λ, fraction of the draws that is uniform over all pixels, in (0, 1]. None for 0.8 at first, and then between 0.1 and 0.8
-            by what the samples tell.
-        stratified: stratify the draws over the distribution (`tiles.InverseCdfTable.draw`); otherwise they are independent, as in the
+        samples: paths per update, >= 1, which also determines the size of the tiles: one path in each, or several if tiles are single
+            pixels. None takes a third of `count`, but at least 4096 (or twice `count`; eight times for the tiles), for each 20 steps
+            between updates: a few percent of the cost of the steps.
+        uniform: λ, fraction of uniform samples, in (0, 1]. None starts at 0.8 and then chooses between 0.1 and 0.8 from the samples.
+        stratified: whether samples are stratified over the distribution (`tiles.InverseCdfTable.draw`); independent otherwise, as in the
             paper.
-        relative: weigh each parameter element's variance by one over its mean squared gradient, which is what Adam divides by: noise counts
-            in units of Adam's steps, and the mean over each parameter's elements is summed. The sum of plain variances, the paper's,
-            is dominated by the parameters with the largest gradients.
-        denoiser: of the estimated maps: "oidn", "optix", "variation" (see `evaluation.denoising`), "pooling" with the tiles around
-            (`pooling.pool`), "none", or "auto": optix on a GPU, oidn where it is installed, else pooling.
-        learn_from_draws: learn from the samples of the steps, too; otherwise from the updates alone, as in the paper.
-        by_cost: c_j = 1 + v / 2 for the mean number v of vertices of a path through the pixel, counted: the probabilities with the least
-            variance times cost of a step, since a path into the sky costs little. λ follows the cost, too. Otherwise c_j = 1.
+        relative: whether each parameter element's variance is divided by its mean squared gradient, as Adam does. Noise then counts in
+            units of Adam's steps, and the means over each parameter's elements are summed. In the paper's sum of plain variances the
+            parameters with the largest gradients dominate.
+        denoiser: denoiser of the maps: "oidn", "optix", "variation" (see `images.denoising`), "pooling" with neighbouring tiles
+            (`map_denoising.pool`), "none", or "auto": optix on a GPU, oidn if installed, else pooling.
+        learn_from_draws: whether samples of the steps update the maps; otherwise only the updates do, as in the paper.
+        by_cost: whether c_j = 1 + v / 2 with the mean number v of vertices of a path through the pixel, which minimises variance times
+            cost, because paths that leave the scene are cheap. λ accounts for the cost, too. Otherwise c_j = 1.
     """
 
     count: int | None = None
@@ -104,34 +102,34 @@ class Adaptive:
         options = _Options(count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser)
         return GuidedSampler("Adaptive", options, _GradientVariance(self.levels, self.learn_from_draws, self.by_cost))
 
-    def _of(self, problem: Problem) -> GuidedSampler:
+    def _sampler_for(self, problem: Problem) -> GuidedSampler:
         return self._sampler(default_count(problem) if self.count is None else self.count)
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         del parameters
-        return self._of(problem).init(problem)
+        return self._sampler_for(problem).init(problem)
 
     def draw(
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[MiniBatch, GuidedSamplerState]:
-        return self._of(problem).draw(problem, parameters, state, key)
+        return self._sampler_for(problem).draw(problem, parameters, state, key)
 
     def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
-        return self._of(problem).redraw(problem, state, key)
+        return self._sampler_for(problem).redraw(problem, state, key)
 
     def learn(
         self, problem: Problem, state: GuidedSamplerState, sample: PixelSample, draws: DrawStatistics
     ) -> GuidedSamplerState:
-        return self._of(problem).learn(problem, state, sample, draws)
+        return self._sampler_for(problem).learn(problem, state, sample, draws)
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
-        """Update the mean square of the gradient's elements, where variances are `relative`."""
-        return self._of(problem).observe(problem, state, gradient) if self.relative else state
+        """Update the running mean square of the gradient's elements if variances are `relative`."""
+        return self._sampler_for(problem).observe(problem, state, gradient) if self.relative else state
 
 
 @dataclass(frozen=True)
 class _GradientVariance:
-    """The importance of Eq. 12, averaged over levels by Eq. 18."""
+    """Importance of Eq. 12, averaged over levels by Eq. 18."""
 
     levels: int
     learns: bool
@@ -139,11 +137,11 @@ class _GradientVariance:
     needs_second_moment: bool = True
 
     def maps(self, statistics: PixelStatistics) -> Maps:
-        """Second moment of the parameter derivatives, then per level that of the loss derivative."""
+        """Return the second moment of the parameter derivatives, then that of the loss derivative per level."""
         return (statistics.second_moment, *statistics.squares)
 
     def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
-        """The sum over the levels of their probabilities (Eq. 18). Coarser levels are means over blocks and need no denoising."""
+        """Return the sum of the levels' probabilities (Eq. 18). Coarser levels are means over blocks and need no denoising."""
         second_moment, *squares = maps
         total = np.zeros(len(second_moment))
         for level, square in enumerate(squares):

@@ -1,4 +1,4 @@
-"""Whole views with more samples in the pixels where the variance of the gradient is."""
+"""Full views with more samples in pixels of high gradient variance."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from unrender.scene.sample_counts import SampleShares
 from unrender.scene.upsampling import SQUARES, Upsampler
 
 _TILES = 1 << 16
-"""Of all views together at most; of single pixels where these are no more."""
+"""Maximum number of tiles of all views; tiles are single pixels if there are no more pixels."""
 
 _FIRST = 4
-"""Steps at the beginning that are all learnt from."""
+"""Number of initial steps that all update the maps."""
 
 _COUNTED = 8
-"""Times that were learnt from, after which the vertices of paths are counted again."""
+"""Number of map updates between two counts of path vertices."""
 
 _MEMORY = 0.8 ** (1 / 20)
-"""Weight, after each further step, of what was learnt before."""
+"""Decay per step of the weight of earlier samples."""
 
 _PRIOR = 64.0
-"""Paths that a tile's own mean needs to count as much as its surroundings (`pooling.pool`)."""
+"""Number of paths at which a tile's own mean weighs as much as its surroundings (`map_denoising.pool`)."""
 
 
 @dataclass(frozen=True)
@@ -43,17 +43,17 @@ class AdaptiveCountsState:
     """State between steps.
 
     Attributes:
-        step: steps drawn so far.
-        maps: second moments of the parameter derivatives and of the loss derivative, (tiles, 3) each; empty before the first are known.
-        counts: paths behind each tile, (tiles,); earlier ones count less.
-        pooled: the maps, pooled.
-        density: what the numbers of samples go by, mean 1 over the pixels, (tiles,).
-        uniform: fraction of them that is equal for all pixels.
-        evidence: for that fraction.
-        since: steps since the maps were last changed.
-        costs: what a path through each tile costs, relative to one that meets nothing, (tiles,).
-        learnt: how many steps were learnt from.
-        second_moment: running mean square of each element of the gradient, in the coordinates of the descent; {} where it is not observed.
+        step: number of steps so far.
+        maps: second moments of the parameter derivatives and of the loss derivative, (tiles, 3) each; empty before the first update.
+        counts: weighted number of paths of each tile, (tiles,); earlier ones count less.
+        pooled: the pooled maps.
+        density: relative density of additional samples, with mean 1 over the pixels, (tiles,).
+        uniform: fraction of these that is equal for all pixels.
+        evidence: evidence for that fraction.
+        since: number of steps since the last map update.
+        costs: cost of a path through each tile, relative to one without an intersection, (tiles,).
+        learnt: number of map updates from steps.
+        second_moment: running mean square of each element of the gradient, in the coordinates of the optimisation; {} if not observed.
     """
 
     step: int
@@ -69,35 +69,35 @@ class AdaptiveCountsState:
     second_moment: Tree = field(default_factory=dict)
 
     def upsampled(self, upsampler: Upsampler) -> AdaptiveCountsState:
-        """See `Upsamplable`: the mean squares of the gradient are interpolated, maps of pixels stay."""
+        """Return the state with the mean squares of the gradient interpolated; maps of pixels are unchanged."""
         return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES))
 
 
 @register
 @dataclass(frozen=True)
 class AdaptiveCounts:
-    """Every pixel of every view at each step, and of the samples more where the variance of the gradient is:
+    """All pixels of all views at each step, with more samples in pixels of high gradient variance:
 
         n_j = m + (s - m) (λ + (1 - λ) q_j),        q_j ∝ sqrt(E[(∂L/∂I_j)²] · Σ_k E[(∂I_j/∂θ_k)²] / c_j),
 
-    for s samples per pixel on average (the estimator's `spp`), m in each, mean 1 of q over a view, and c_j the cost of a path. The variance
-    of the gradient is that of all pixels' over their n_j, and q minimises it at equal cost. The numbers are rounded at random before the
-    samples are taken, from what earlier steps' samples told; each pixel's samples are weighted by 1 / n_j, and a sample's loss
-    derivative is that at the mean of its pixel's other samples. So the gradient is as unbiased as with equal numbers, and every pixel keeps
-    its memory of earlier steps: for control variates, too. Where maps are wrong its variance is at most s / m times that of equal
-    numbers, or s (s - 1) / (m (m - 1)) times where it is the noise of the images that dominates.
+    for s samples per pixel on average (the estimator's `spp`), at least m per pixel, mean 1 of q over a view, and cost c_j of a path. The
+    gradient's variance is the sum of the pixels' variances divided by n_j, which q minimises at equal cost. Random rounding of n_j
+    precedes the sampling and uses earlier steps' samples only. Each sample is weighted by 1 / n_j, and its loss derivative is evaluated
+    at the mean of its pixel's other samples. So the gradient is as unbiased as with equal numbers, and every pixel keeps its state, as
+    control variates need. If maps are wrong, the variance is at most s / m times that of equal numbers, or s (s - 1) / (m (m - 1)) times
+    if the images' noise dominates.
 
-    Both factors are measured by the samples of the steps, the second along random ±1 tangents (`RenderSession.tangent_moment`), in the
-    first steps and one of `refresh`; tiles that few paths have met are pooled with those around (`pooling.pool`). λ is 0.8 at first,
-    and falls to 0.1 as samples confirm the maps (`uniform_share.choose`), judged as if the noise of the images dominated. Each view
-    has its own s samples a pixel.
+    The samples of the first steps, and of every `refresh`-th step, estimate both factors, the second along random ±1 tangents
+    (`RenderSession.tangent_moment`). Tiles with few paths are pooled with neighbouring ones (`map_denoising.pool`). λ starts at 0.8 and
+    decreases to 0.1 as samples confirm the maps (`uniform_share.choose`), under the assumption that the images' noise dominates. Each
+    view has its own s samples per pixel.
 
     Args:
-        least: m, samples in each pixel, >= 2; `spp` must be more.
-        refresh: steps between those that are learnt from, >= 1.
-        uniform: λ, in (0, 1]; None for 0.8 at first, and then by what the samples tell.
-        relative: weigh each parameter element's variance by one over its mean squared gradient; see `Adaptive`.
-        by_cost: c_j = 1 + v / 2 for v vertices of a path, see `Adaptive`; otherwise c_j = 1.
+        least: m, samples in each pixel, >= 2; `spp` must be larger.
+        refresh: steps between two map updates, >= 1.
+        uniform: λ, in (0, 1]; None starts at 0.8 and then chooses from the samples.
+        relative: whether each parameter element's variance is divided by its mean squared gradient; see `Adaptive`.
+        by_cost: whether c_j = 1 + v / 2 for v vertices of a path, see `Adaptive`; otherwise c_j = 1.
     """
 
     least: int = 2
@@ -114,11 +114,11 @@ class AdaptiveCounts:
             raise InputError(f"AdaptiveCounts: uniform must be a share in (0, 1], got {share!r}")
 
     def init(self, problem: Problem, parameters: Tree) -> AdaptiveCountsState:
-        """See `PixelSampler.init`. Raises `InputError` where the loss of a pixel depends on others."""
+        """Return the state before the first step. Raises `InputError` for a loss that is not pixelwise."""
         del parameters
         if not problem.loss.pixelwise:
             raise InputError(
-                f"AdaptiveCounts: {type(problem.loss).__name__} is of whole images, in which each pixel needs as many samples; "
+                f"AdaptiveCounts: {type(problem.loss).__name__} is a loss of full images, in which each pixel needs as many samples; "
                 "use unrender.pixels.All()"
             )
         ones = np.ones(len(_tiles(problem).views))
@@ -144,7 +144,7 @@ class AdaptiveCounts:
         tiles = _tiles(problem)
         maps = tiles.split((1 - state.uniform) * state.density + state.uniform)
         films = [problem.renderer.resolutions()[view.sensor] for view in problem.views]
-        pixels = [_of_pixels(part, grid.side, film) for part, grid, film in zip(maps, tiles.grids, films, strict=True)]
+        pixels = [_per_pixel(part, grid.side, film) for part, grid, film in zip(maps, tiles.grids, films, strict=True)]
         offsets = np.random.default_rng(key.fold(1).uint32()).random(len(pixels))
         shares = SampleShares(self.least, tuple(pixels), tuple(offsets.tolist()))
         return MiniBatch(None, probability=dict(enumerate(part.astype(np.float32) for part in maps)), shares=shares)
@@ -155,14 +155,14 @@ class AdaptiveCounts:
         del sample
         tiles, decay, evidence = _tiles(problem), _MEMORY**state.since, state.evidence
         tile = _tile_of_each_pixel(problem, tiles)
-        found = finite(draws.moments), finite(draws.squares)
+        factors = finite(draws.moments), finite(draws.squares)
         counts = np.ones(len(tile)) if draws.counts is None else draws.counts
-        samples = TileSamples(tile, found, np.ones(len(tile)), counts)
+        samples = TileSamples(tile, factors, np.ones(len(tile)), counts)
         values = samples.normalised()
         gain = self._gain(float(counts.mean()))
         if state.pooled:
-            told = samples.judged(values, state.pooled)
-            evidence = uniform_share.observed(evidence, told, state.density[tile], decay, gain)
+            judgements = samples.judged(values, state.pooled)
+            evidence = uniform_share.observed(evidence, judgements, state.density[tile], decay, gain)
         maps, paths = list(state.maps), state.counts * decay
         for index, value in enumerate(values):
             total, number = samples.summed(value, len(tiles.views))
@@ -170,14 +170,16 @@ class AdaptiveCounts:
                 total, number = total + maps[index] * paths[:, None], number + paths
             maps[index : index + 1] = [total / np.maximum(number, 1e-30)[:, None]]
         _, number = samples.summed(values[0], len(tiles.views))
-        learnt = replace(
+        updated = replace(
             state, maps=tuple(maps), counts=paths + number, evidence=evidence, since=0, learnt=state.learnt + 1
         )
-        return self._mapped(tiles, learnt, gain)
+        return self._with_density(tiles, updated, gain)
 
     def _gain(self, spp: float) -> Callable[[np.ndarray], np.ndarray]:
-        """One over the variance of a pixel for its number of samples relative to equal ones beyond `least`, where noise of the image is
-        all of it: that of n samples goes with 1 / (n (n - 1)), the noise of one times that of the others."""
+        """Return the inverse of a pixel's variance as a function of its relative number of additional samples, if image noise dominates.
+
+        The variance for n samples is then proportional to 1 / (n (n - 1)): the noise of one sample times that of the others.
+        """
 
         def gain(share: np.ndarray) -> np.ndarray:
             number = self.least + (spp - self.least) * share
@@ -186,15 +188,15 @@ class AdaptiveCounts:
         return gain
 
     def observe(self, problem: Problem, state: AdaptiveCountsState, gradient: Tree) -> AdaptiveCountsState:
-        """Update the mean square of the gradient's elements, where variances are `relative`."""
+        """Update the running mean square of the gradient's elements if variances are `relative`."""
         if not self.relative:
             return state
         return replace(state, second_moment=pixel_statistics.observed(problem, state.second_moment, gradient))
 
-    def _mapped(
+    def _with_density(
         self, tiles: Tiles, state: AdaptiveCountsState, gain: Callable[[np.ndarray], np.ndarray]
     ) -> AdaptiveCountsState:
-        """The state with numbers of samples by its maps and its evidence."""
+        """Return the state with a density of samples from its maps and its evidence."""
         pooled = tuple(pool(tiles, values, state.counts, _PRIOR) for values in state.maps)
         density = np.sqrt((pooled[0] * pooled[1]).sum(axis=1) / state.costs)
         parts = zip(tiles.split(density), tiles.split(tiles.sizes), strict=True)
@@ -213,15 +215,15 @@ def _tiles(problem: Problem) -> Tiles:
     return cut(problem, max(_TILES, len(problem.views)))
 
 
-def _of_pixels(values: np.ndarray, side: int, film: tuple[int, int]) -> np.ndarray:
-    """A map of tiles (rows, columns) as one of pixels."""
+def _per_pixel(values: np.ndarray, side: int, film: tuple[int, int]) -> np.ndarray:
+    """Expand a map of tiles (rows, columns) to pixels."""
     height, width = film
     return values if side == 1 else values.repeat(side, axis=0)[:height].repeat(side, axis=1)[:, :width]
 
 
 def _tile_of_each_pixel(problem: Problem, tiles: Tiles) -> np.ndarray:
-    """Of all views, concatenated."""
+    """Return the tile index of each pixel of all views, concatenated."""
     numbers = tiles.split(np.arange(len(tiles.views)))
     films = [problem.renderer.resolutions()[view.sensor] for view in problem.views]
-    parts = [_of_pixels(part, grid.side, film) for part, grid, film in zip(numbers, tiles.grids, films, strict=True)]
+    parts = [_per_pixel(part, grid.side, film) for part, grid, film in zip(numbers, tiles.grids, films, strict=True)]
     return np.concatenate([part.ravel() for part in parts])

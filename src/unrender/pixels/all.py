@@ -1,4 +1,4 @@
-"""Every pixel of every view, every step."""
+"""Sampler of all pixels of all views."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from unrender.scene.upsampling import Upsampler
 
 @dataclass(frozen=True)
 class AllState:
-    """Empty: there is no state."""
+    """Empty state."""
 
     def upsampled(self, upsampler: Upsampler) -> AllState:
-        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        """Return this state, which has no array of a parameter's shape."""
         del upsampler
         return self
 
@@ -25,7 +25,7 @@ class AllState:
 @register
 @dataclass(frozen=True)
 class All:
-    """Every step renders all pixels of all views."""
+    """All pixels of all views at every step."""
 
     def init(self, problem: Problem, parameters: Tree) -> AllState:
         del problem, parameters
@@ -40,6 +40,6 @@ class All:
         return MiniBatch(None)
 
     def observe(self, problem: Problem, state: AllState, gradient: Tree) -> AllState:
-        """Unchanged: the gradient is not used."""
+        """Return the state unchanged."""
         del problem, gradient
         return state

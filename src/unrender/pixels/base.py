@@ -1,4 +1,4 @@
-"""The protocol of pixel samplers, which choose the pixels that a step renders, and their weights."""
+"""Protocol of pixel samplers, which choose the pixels that a step renders and their weights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from unrender.scene.sample_counts import SampleShares
 
 _FEWEST_REFUSED = 1 << 16
 _MOST_DRAWS = 4
-"""Draws per pixel of all views beyond which a mini-batch is refused, where it is large at all."""
+"""Number of samples per pixel of all views above which a large mini-batch is refused."""
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,12 @@ class MiniBatch:
 
     Attributes:
         sample: the pixels; None for all pixels of all views.
-        samples: paths traced to estimate their probabilities.
-        probability: per view, the probability of its pixels relative to uniform sampling: a map (rows, columns), coarser than
-            the film; empty where it is uniform.
-        tangents: of the parameters, along which the squared derivatives of the drawn pixels are asked for (`DrawStatistics`); {} where
-            they are not.
-        shares: of the samples of whole views; None where all pixels have as many.
+        samples: number of paths traced to estimate their probabilities.
+        probability: per view, the pixels' probability relative to uniform sampling, as a map (rows, columns) coarser than the film; empty
+            if uniform.
+        tangents: parameter tangents along which the squared derivatives of the pixels are requested (`DrawStatistics`); {} for no
+            request.
+        shares: distribution of the samples over full views; None for equal numbers.
     """
 
     sample: PixelSample | None
@@ -42,13 +42,13 @@ class MiniBatch:
 
 @dataclass(frozen=True)
 class DrawStatistics:
-    """What the samples of a mini-batch, or of whole views, tell of the second moment of their pixels' gradients, on the host.
+    """Second moments of the pixels' derivatives from the samples of a mini-batch or of full views, on the host.
 
     Attributes:
-        squares: (∂L/∂I)² of each drawn pixel, without the pixel's weight: the mean over its sample groups, (N, 3). Of whole views: of
-            the pixels of all views, concatenated, the mean over its samples.
-        moments: (Σ_k v_k ∂I/∂θ_k)² along the tangents v of the mini-batch, likewise.
-        counts: samples behind each, (N,); None where all are of as many.
+        squares: (∂L/∂I)² of each sampled pixel, without the pixel's weight, as mean over its sample groups, (N, 3). For full views, the
+            mean over its samples for the concatenated pixels of all views.
+        moments: (Σ_k v_k ∂I/∂θ_k)² along the mini-batch's tangents v, in the same layout.
+        counts: number of samples of each pixel, (N,); None for equal numbers.
     """
 
     squares: np.ndarray
@@ -57,74 +57,74 @@ class DrawStatistics:
 
 
 class PixelSampler(Protocol):
-    """Immutable; all that changes is in the state.
+    """Immutable pixel sampler; everything that changes is in the state.
 
-    A mini-batch is drawn from the pixels of all views at once. Weighted sums over it are unbiased, since its probabilities are positive
-    for every pixel and known exactly.
+    A mini-batch is sampled from the pixels of all views at once. Its probabilities are known exactly and positive for every pixel, so its
+    weighted sums are unbiased.
     """
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
-        """The state before the first step. Raises `InputError` for mini-batches of a problem whose loss is not pixelwise."""
+        """Return the state before the first step. Raises `InputError` for mini-batches with a loss that is not pixelwise."""
         ...
 
     def draw(self, problem: Problem, parameters: Tree, state: Any, key: Key) -> tuple[MiniBatch, Any]:
-        """The pixels of one step, and the next state."""
+        """Return the pixels of one step, and the next state."""
         ...
 
     def observe(self, problem: Problem, state: Any, gradient: Tree) -> Any:
-        """The state after a step with this gradient by u (`Problem.coordinates`), before preconditioning."""
+        """Return the state after a step with this gradient with respect to u (`Problem.coordinates`), before preconditioning."""
         ...
 
 
 @runtime_checkable
 class RepeatableSampler(PixelSampler, Protocol):
-    """A pixel sampler that can draw several mini-batches of one step: for estimators that render more than one.
+    """A pixel sampler that can sample several mini-batches per step, for estimators that render more than one.
 
-    Without `redraw` each further mini-batch counts as a step of the sampler: an importance map ages the faster.
+    Without `redraw`, each further mini-batch counts as a step of the sampler, so an importance map ages faster.
     """
 
     def redraw(self, problem: Problem, state: Any, key: Key) -> MiniBatch:
-        """Another mini-batch of the step that `draw` returned `state` for, with the same probabilities; the state stays as it is."""
+        """Return another mini-batch for the step of `state`, as returned by `draw`, with the same probabilities."""
         ...
 
 
 @runtime_checkable
 class LearningSampler(PixelSampler, Protocol):
-    """A pixel sampler that asks by `MiniBatch.tangents` for what the samples of a step tell, and learns from it.
+    """A pixel sampler that requests derivative statistics of a step's samples by `MiniBatch.tangents`, and learns from them.
 
-    An estimator that cannot tell does not call `learn`.
+    An estimator without these statistics does not call `learn`.
     """
 
     def learn(self, problem: Problem, state: Any, sample: PixelSample | None, draws: DrawStatistics) -> Any:
-        """The state after the step that `draw` returned `state` for, with what its samples tell; `sample`: None for whole views."""
+        """Return the state updated by the samples of the step for which `draw` returned `state`; `sample` is None for full views."""
         ...
 
 
 def learned(
     sampler: PixelSampler, problem: Problem, state: Any, sample: PixelSample | None, draws: DrawStatistics | None
 ) -> Any:
-    """The state of a sampler with what a step's samples tell, where it learns from them and they were asked for."""
+    """Return a sampler's state, updated by a step's samples if it learns from them and requested them."""
     if draws is None or not isinstance(sampler, LearningSampler):
         return state
     return sampler.learn(problem, state, sample, draws)
 
 
 def check_batch(owner: str, problem: Problem, count: int) -> None:
-    """Raise `InputError` where the loss of a pixel depends on others, or the mini-batch is far larger than all views together.
+    """Raise `InputError` if the loss is not pixelwise, or the mini-batch is far larger than all views together.
 
     Args:
-        owner: the sampler, for the message.
-        problem: what is rendered.
-        count: pixels a step.
+        owner: name of the sampler, for the message.
+        problem: the problem to render.
+        count: pixels per step.
     """
     if not problem.loss.pixelwise:
         raise InputError(
-            f"pixels: {type(problem.loss).__name__} is of whole images, so it takes no pixel mini-batches; "
+            f"pixels: {type(problem.loss).__name__} is a loss of full images, which does not support pixel mini-batches; "
             "use unrender.pixels.All()"
         )
     pixels = problem.pixels
     if count > max(_MOST_DRAWS * pixels, _FEWEST_REFUSED):
         raise InputError(
-            f"{owner}: {count} pixels a step, but all views together have {pixels}; give fewer, or take unrender.pixels.All() "
+            f"{owner}: {count} pixels a step, but all views together have {pixels}; use fewer, or unrender.pixels.All() "
             "(methods plain and rcv)"
         )

@@ -1,4 +1,4 @@
-"""Pixel mini-batches from an importance map, of a few paths every `refresh` steps and of the samples of the steps between them."""
+"""Pixel mini-batches from an importance map, which is updated from pilot paths and from the samples of the steps."""
 
 from __future__ import annotations
 
@@ -24,21 +24,26 @@ from unrender.scene.upsampling import SQUARES, Upsampler
 __all__ = ["GuidedOptions", "GuidedSampler", "GuidedSamplerState", "ImportanceRule", "Maps"]
 
 _FEWEST_PATHS, _FIRST_PATHS = 4096, 8
-"""The default of `samples` at least: fewer do not resolve where in the images the importance is. Of small mini-batches, for each pixel of
-one: updates are then the rarer."""
+"""Default minimum of `samples`: fewer paths do not resolve the importance over the images.
+
+For small mini-batches it is a multiple of their pixels, and tiles are updated less often.
+"""
 
 _OBSERVED = 4
 """Steps between updates of the gradient's second moment."""
 
 _MEMORY = 0.8 ** (1 / 20)
-"""Weight, after each further step, of what was learnt before. The scene changes little from step to step, so averaging reduces noise."""
+"""Decay per step of the weight of earlier samples. The scene changes little from step to step, so averaging reduces noise."""
 
 _FIRST = 4
-"""Steps at the beginning whose samples change the probabilities of the next step. Later the samples of one step between two updates are
-learnt from, and the next update is by them, too: to tell costs a pass over their paths, to change the probabilities a denoising."""
+"""Number of initial steps whose samples change the probabilities of the next step.
+
+Later, the samples of one step between two updates contribute to the next update: statistics cost a pass over their paths, and new
+probabilities a denoising.
+"""
 
 _COUNTED = 8
-"""Updates after which the vertices of paths are counted again."""
+"""Importance-map updates between two counts of path vertices."""
 
 
 @dataclass(frozen=True)
@@ -46,22 +51,21 @@ class GuidedSamplerState:
     """State between steps.
 
     Attributes:
-        age: mini-batches drawn since the last importance-map update.
-        maps: the statistics behind the importance map; empty before the first draw.
-        uniform_table: of all tiles, every pixel equally likely.
-        table: that mini-batches are drawn from; `uniform_table` before the first update.
+        age: number of mini-batches since the last importance-map update.
+        maps: statistics of the importance map; empty before the first mini-batch.
+        uniform_table: table of all tiles with equal pixel probabilities.
+        table: table that mini-batches are sampled from; `uniform_table` before the first update.
         shares: probability of a pixel of each tile relative to uniform sampling, (tiles,).
         references: mean references of the tiles, (tiles, 3).
         refreshes: number of importance-map updates.
-        second_moment: running mean square of each element of the gradient, in the coordinates of the descent; empty where it is not
-            observed.
-        counts: paths behind each tile of each map, (tiles,) each; earlier ones count less.
-        denoised: the first maps, denoised, by which samples are judged.
-        density: the importance map, relative to uniform sampling, (tiles,).
-        uniform: fraction of the draws that is uniform.
-        evidence: for that fraction.
-        since: steps since the maps were last changed.
-        costs: what a path through each tile costs, relative to one that meets nothing, (tiles,); ones where it is not counted.
+        second_moment: running mean square of each element of the gradient, in the coordinates of the optimisation; empty if not observed.
+        counts: weighted number of paths of each tile and map, (tiles,) each; earlier ones count less.
+        denoised: the denoised first maps, against which samples are compared.
+        density: importance map relative to uniform sampling, (tiles,).
+        uniform: fraction of uniform samples.
+        evidence: evidence for that fraction.
+        since: number of steps since the last map update.
+        costs: cost of a path through each tile, relative to one without an intersection, (tiles,); ones if not counted.
     """
 
     age: int
@@ -81,12 +85,12 @@ class GuidedSamplerState:
     costs: np.ndarray = field(default_factory=lambda: np.ones(0))
 
     def upsampled(self, upsampler: Upsampler) -> GuidedSamplerState:
-        """See `Upsamplable`: the mean squares of the gradient are interpolated, maps of pixels stay."""
+        """Return the state with the mean squares of the gradient interpolated; maps of pixels are unchanged."""
         return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES))
 
 
 class GuidedOptions(Protocol):
-    """The options that the samplers with an importance map share; `Adaptive` documents them."""
+    """Options that the samplers with an importance map share; `Adaptive` documents them."""
 
     @property
     def count(self) -> int: ...
@@ -108,45 +112,45 @@ class GuidedOptions(Protocol):
 
 
 class ImportanceRule(Protocol):
-    """What distinguishes one sampler from another: which statistics it needs, and how they become an importance map."""
+    """Rule that distinguishes the samplers: which statistics they need, and how these become an importance map."""
 
     @property
     def levels(self) -> int:
-        """Coarser resolutions at which the loss derivative is estimated, >= 0."""
+        """Number of coarser resolutions at which the loss derivative is estimated, >= 0."""
         ...
 
     @property
     def learns(self) -> bool:
-        """Whether the samples of the steps are learnt from."""
+        """Whether the samples of the steps update the maps."""
         ...
 
     @property
     def by_cost(self) -> bool:
-        """Whether pixels count less the more a path through them costs."""
+        """Whether a pixel's importance is divided by the root of its cost."""
         ...
 
     @property
     def needs_second_moment(self) -> bool:
-        """Whether the second moment of the pixels' parameter derivatives is estimated, at the cost of as many paths again."""
+        """Whether the second moment of the pixels' parameter derivatives is estimated, which doubles the number of paths."""
         ...
 
     def maps(self, statistics: pixel_statistics.PixelStatistics) -> Maps:
-        """The maps that are averaged over updates."""
+        """Return the maps that are averaged over updates."""
         ...
 
     def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
-        """What the probability of a pixel of each tile is proportional to, (tiles,), >= 0; of the first maps also denoised."""
+        """Return the unnormalised pixel probability of each tile, (tiles,), >= 0; `denoised` holds the denoised first maps."""
         ...
 
 
 @dataclass(frozen=True)
 class GuidedSampler:
-    """Mini-batches drawn in proportion to an importance map, mixed with uniform sampling.
+    """Sampler of mini-batches in proportion to an importance map, mixed with uniform sampling.
 
     Attributes:
-        owner: for messages.
-        options: of the public sampler.
-        rule: that makes the importance map.
+        owner: name for messages.
+        options: options of the public sampler.
+        rule: rule that computes the importance map.
     """
 
     owner: str
@@ -204,7 +208,7 @@ class GuidedSampler:
         return MiniBatch(sample, probability=dict(enumerate(maps)))
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
-        """Update the running mean square of the gradient, at the first step and every few, since preconditioning costs time.
+        """Update the running mean square of the gradient, at the first step and every few steps, because preconditioning takes time.
 
         Elements that are not finite count as zeros.
         """
@@ -219,8 +223,11 @@ class GuidedSampler:
         return cut(problem, max(most, len(problem.views)))
 
     def _paths(self) -> int:
-        """Paths of an importance-map update: `samples`, or a third of a mini-batch's pixels for each twenty steps between updates,
-        but 4096 at least, or for small mini-batches twice their pixels: on the average over updates, where there are more tiles."""
+        """Return the mean number of paths per importance-map update.
+
+        It is `samples`, or a third of a mini-batch's pixels for each twenty steps between updates, but at least 4096, or twice the pixels
+        of a small mini-batch. If there are more tiles than paths, only some updates trace paths.
+        """
         options = self.options
         if options.samples is not None:
             return options.samples
@@ -230,15 +237,17 @@ class GuidedSampler:
     def _update_importance_map(
         self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
     ) -> tuple[GuidedSamplerState, int]:
-        """The state with an importance map at these parameters, and how many paths were traced for it."""
+        """Return the state with an importance map at these parameters, and the number of paths traced for it."""
         tiles, paths, counted = self._tiles(problem), self._paths(), 0
         if self.rule.by_cost and state.refreshes % _COUNTED == 0:
             table = state.uniform_table
             costs, counted = pixel_statistics.costs(problem, parameters, tiles, table, key.fold(3))
             state = replace(state, costs=costs)
         if state.maps and state.refreshes % math.ceil(len(tiles.views) / paths):
-            # Each tile has a path in an update, of which there are fewer: in between, what was learnt from the steps.
-            return self._mapped(problem, tiles, replace(state, age=0, refreshes=state.refreshes + 1)), counted
+            # One path per tile exceeds the budget, so only some updates trace paths; the others use samples of the steps.
+            return self._with_probabilities(
+                problem, tiles, replace(state, age=0, refreshes=state.refreshes + 1)
+            ), counted
         spp = max(1, paths // len(tiles.views))
         references = [
             problem.renderer.array(tiles.coarsen(state.references, level)) for level in range(1, self.rule.levels + 1)
@@ -247,10 +256,12 @@ class GuidedSampler:
         statistics = pixel_statistics.estimate_statistics(
             problem, parameters, tiles, state.uniform_table, spp, key, references, scales
         )
-        found = tuple(finite(values) for values in self.rule.maps(statistics))
+        factors = tuple(finite(values) for values in self.rule.maps(statistics))
         every = np.arange(len(tiles.views))
-        updated = self._added(state, tiles, TileSamples(every, found, tiles.sizes.astype(np.float64), float(spp)))
-        updated = self._mapped(problem, tiles, replace(updated, age=0, refreshes=state.refreshes + 1))
+        updated = self._with_samples(
+            state, tiles, TileSamples(every, factors, tiles.sizes.astype(np.float64), float(spp))
+        )
+        updated = self._with_probabilities(problem, tiles, replace(updated, age=0, refreshes=state.refreshes + 1))
         return updated, statistics.samples + counted
 
     def learn(
@@ -258,18 +269,18 @@ class GuidedSampler:
     ) -> GuidedSamplerState:
         tiles = self._tiles(problem)
         tile = tiles.locate(arrays.numpy(sample.views).astype(np.int64), arrays.numpy(sample.pixels))
-        found = finite(draws.moments), finite(draws.squares)
-        learnt = self._added(state, tiles, TileSamples(tile, found, 1 / state.shares[tile]))
+        factors = finite(draws.moments), finite(draws.squares)
+        updated = self._with_samples(state, tiles, TileSamples(tile, factors, 1 / state.shares[tile]))
         early = state.refreshes == 1 and state.age <= _FIRST
-        return self._mapped(problem, tiles, learnt) if early else learnt
+        return self._with_probabilities(problem, tiles, updated) if early else updated
 
-    def _added(self, state: GuidedSamplerState, tiles: Tiles, samples: TileSamples) -> GuidedSamplerState:
-        """The state with what samples tell of its maps and, where there were some before, of the share of uniform draws."""
+    def _with_samples(self, state: GuidedSamplerState, tiles: Tiles, samples: TileSamples) -> GuidedSamplerState:
+        """Return the state with samples added to its maps and, if it had maps before, to the evidence for the uniform fraction."""
         decay, evidence = _MEMORY**state.since, state.evidence
         values = samples.normalised()
         if self.rule.needs_second_moment and state.denoised:
-            told = samples.judged(values, state.denoised)
-            evidence = uniform_share.observed(evidence, told, state.density[samples.tile], decay)
+            judgements = samples.judged(values, state.denoised)
+            evidence = uniform_share.observed(evidence, judgements, state.density[samples.tile], decay)
         maps, counts = list(state.maps), [count * decay for count in state.counts]
         for index, value in enumerate(values):
             total, count = samples.summed(value, len(tiles.views))
@@ -279,8 +290,8 @@ class GuidedSampler:
             maps[index : index + 1], counts[index : index + 1] = [mean], [count]
         return replace(state, maps=tuple(maps), counts=tuple(counts), evidence=evidence, since=0)
 
-    def _mapped(self, problem: Problem, tiles: Tiles, state: GuidedSamplerState) -> GuidedSamplerState:
-        """The state with probabilities by its maps and its evidence."""
+    def _with_probabilities(self, problem: Problem, tiles: Tiles, state: GuidedSamplerState) -> GuidedSamplerState:
+        """Return the state with probabilities from its maps and its evidence."""
         denoised = tuple(
             np.maximum(denoise_map(tiles, values, self.options.denoiser, counts), 0.0)
             for values, counts in zip(state.maps[:FACTORS], state.counts[:FACTORS], strict=True)
@@ -289,7 +300,7 @@ class GuidedSampler:
         total = float((density * tiles.sizes).sum())
         if total > 0 and math.isfinite(total):
             density = density * (float(tiles.sizes.sum()) / total)
-        else:  # no importance was found
+        else:  # the importance is zero everywhere
             density = np.ones(len(density))
         uniform = self.options.uniform
         if uniform is None:

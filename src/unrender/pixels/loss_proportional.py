@@ -1,4 +1,4 @@
-"""Pixel mini-batches drawn in proportion to the magnitude of the loss derivative (Su and Gkioulekas 2024)."""
+"""Pixel mini-batches in proportion to the magnitude of the loss derivative (Su and Gkioulekas 2024)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from unrender.scene.problem import Problem
 @register
 @dataclass(frozen=True)
 class LossProportional:
-    """p_j ∝ |∂L/∂I_j| (Eq. 5 of the paper of `Adaptive`): neither noise nor the derivatives of a pixel by the parameters count.
+    """Importance sampling of pixels with p_j ∝ |∂L/∂I_j| (Eq. 5 of the paper of `Adaptive`), without noise and parameter derivatives.
 
     Args:
         count, refresh, samples, uniform, stratified, denoiser: see `Adaptive`.
@@ -53,14 +53,14 @@ class LossProportional:
         return self._sampler.redraw(problem, state, key)
 
     def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
-        """Unchanged: the gradient is not used."""
+        """Return the state unchanged."""
         del problem, gradient
         return state
 
 
 @dataclass(frozen=True)
 class _LossDerivative:
-    """The importance of Eq. 5."""
+    """Importance of Eq. 5."""
 
     levels: int = 0
     learns: bool = False
@@ -68,10 +68,10 @@ class _LossDerivative:
     needs_second_moment: bool = False
 
     def maps(self, statistics: PixelStatistics) -> Maps:
-        """The mean magnitude of the loss derivative."""
+        """Return the mean magnitude of the loss derivative."""
         return (statistics.magnitudes[0],)
 
     def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
-        """Summed over the channels."""
+        """Return the sum over the channels."""
         del tiles, maps
         return denoised[0].sum(axis=1)

@@ -1,4 +1,4 @@
-"""Denoising of the maps that an importance map is made of."""
+"""Denoising of the maps from which an importance map is computed."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from unrender.pixels.tiles import Tiles
 
 
 def pool(tiles: Tiles, means: np.ndarray, counts: np.ndarray, prior: float) -> np.ndarray:
-    """The means of tiles, each drawn towards that of the block around it by what is not known of it:
+    """Shrink the means of tiles towards those of surrounding blocks, according to their number of paths:
 
         m̂_b = (n_b m_b + κ m̂_parent(b)) / (n_b + κ),
 
-    from all views together down to one view, blocks of 2^d × 2^d tiles, and single tiles. A tile of many paths keeps its own mean; one of
-    few has that of the smallest block with about κ paths. So a single bright path raises its surroundings, and a tile where no path
-    was bright is not taken for dark.
+    from all views together down to one view, blocks of 2^d × 2^d tiles, and single tiles. A tile of many paths keeps its own mean. A tile
+    of few paths gets that of the smallest block with about κ paths. So a single bright path raises its surroundings, and a tile without a
+    bright path is not mistaken for dark.
 
     Args:
-        tiles: of all views.
+        tiles: tiles of all views.
         means: (tiles, C).
-        counts: n, paths behind each, (tiles,), >= 0.
+        counts: n, number of paths of each tile, (tiles,), >= 0.
         prior: κ > 0, in paths.
 
     Returns:
-        (tiles, C); zeros where no tile has a path.
+        (tiles, C); zeros if no tile has a path.
     """
     counts = counts[:, None]
     sums = means * counts
     overall = sums.sum(axis=0) / max(float(counts.sum()), 1e-30)
-    found = []
+    estimates = []
     for total, count in zip(tiles.split(sums), tiles.split(counts), strict=True):
         levels = [(total, count)]
         while max(levels[-1][0].shape[:2]) > 1:
@@ -44,12 +44,12 @@ def pool(tiles: Tiles, means: np.ndarray, counts: np.ndarray, prior: float) -> n
             rows, columns = sum_.shape[:2]
             parent = estimate.repeat(2, axis=0)[:rows].repeat(2, axis=1)[:, :columns]
             estimate = (sum_ + prior * parent) / (weight + prior)
-        found.append(estimate)
-    return tiles.join(found)
+        estimates.append(estimate)
+    return tiles.join(estimates)
 
 
 def _halved(x: np.ndarray) -> np.ndarray:
-    """Sums over blocks of 2 × 2."""
+    """Return the sums over blocks of 2 × 2."""
     rows, columns = np.arange(0, x.shape[0], 2), np.arange(0, x.shape[1], 2)
     return np.add.reduceat(np.add.reduceat(x, rows, axis=0), columns, axis=1)
 
@@ -58,21 +58,21 @@ MapDenoiser = Literal["auto", "oidn", "optix", "pooling", "variation", "none"]
 MAP_DENOISERS: tuple[MapDenoiser, ...] = ("auto", "oidn", "optix", "pooling", "variation", "none")
 
 _MARGIN = 4
-"""Tiles of padding around each map where several are denoised in one image."""
+"""Tiles of padding around each map if several are denoised in one image."""
 
 _PRIOR = 64.0
-"""Paths that a tile's own mean needs to count as much as its surroundings, where these are pooled."""
+"""Number of paths at which a tile's own mean weighs as much as its surroundings."""
 
 
 def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser, counts: np.ndarray) -> np.ndarray:
-    """A map (tiles, 3) denoised, the tiles of each view as an image; unchanged by "none".
+    """Denoise a map (tiles, 3), with the tiles of each view as an image; unchanged for "none".
 
     Args:
-        tiles: of all views.
-        values: the mean of each tile's paths.
-        by: "auto": optix on a GPU, oidn where it is installed, else pooling (`pooling.pool`): single bright paths, of which second
-            moments consist, are neither kept nor lost.
-        counts: paths behind each tile, (tiles,).
+        tiles: tiles of all views.
+        values: mean over each tile's paths.
+        by: "auto" is optix on a GPU, oidn if it is installed, else pooling (`pool`). Pooling spreads single bright paths, which dominate
+            second moments, without losing them.
+        counts: number of paths of each tile, (tiles,).
     """
     if by == "none":
         return values
@@ -83,19 +83,19 @@ def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser, counts: np.nd
     maps = tiles.split(values)
     denoised: list[np.ndarray] = [np.empty(0)] * len(maps)
     for shape in {part.shape for part in maps}:
-        alike = [index for index, part in enumerate(maps) if part.shape == shape]
-        found = denoise_side_by_side(
-            np.stack([maps[index] for index in alike]), lambda x: denoising.denoise(x, by=by, fast=True)
+        same_shape = [index for index, part in enumerate(maps) if part.shape == shape]
+        results = denoise_side_by_side(
+            np.stack([maps[index] for index in same_shape]), lambda x: denoising.denoise(x, by=by, fast=True)
         )
-        for index, part in zip(alike, found, strict=True):
+        for index, part in zip(same_shape, results, strict=True):
             denoised[index] = part
     return tiles.join(denoised).astype(np.float64)
 
 
 def denoise_side_by_side(maps: np.ndarray, denoise: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """`denoise` applied to maps (n, rows, columns, 3) side by side in one image, since each call has a fixed cost.
+    """Apply `denoise` to maps (n, rows, columns, 3) side by side in one image, because each call has a fixed cost.
 
-    Mirrored margins keep the filter from mixing neighbouring maps.
+    Mirrored margins prevent the filter from mixing neighbouring maps.
     """
     count, rows, columns, _ = maps.shape
     across = math.ceil(math.sqrt(count))

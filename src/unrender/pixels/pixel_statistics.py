@@ -1,5 +1,7 @@
-"""Per-tile statistics of the loss derivative and of the squared parameter derivatives of pixels, from a few paths (Stage 1 of the
-method's algorithm)."""
+"""Per-tile statistics of the loss derivative and of the squared parameter derivatives of pixels, from a few paths.
+
+This is stage 1 of the algorithm of "Image-space Adaptive Sampling for Fast Inverse Rendering".
+"""
 
 from __future__ import annotations
 
@@ -20,29 +22,29 @@ from unrender.scene.batches import PixelBatch, PixelSample
 from unrender.scene.problem import Problem
 
 ROUNDS = 16
-"""Sign patterns of an estimate at most. Products of different derivatives average to zero over patterns; squares remain."""
+"""Maximum number of sign patterns of an estimate. Products of different derivatives average to zero over patterns; squares remain."""
 
 
 _DECAY = 0.9
-"""Of the running mean of the gradient's squares."""
+"""Decay of the running mean of the gradient's squares."""
 
 _FLOOR, _LEAST = 0.1, 1e-30
 """Lower bounds of an element's second moment: relative to the typical one of its parameter, and absolute."""
 
 
 _COST_PRIOR = 4.0
-"""Paths that a tile's own cost needs to count as much as its surroundings: how many vertices paths have varies little."""
+"""Number of paths at which a tile's own cost weighs as much as its surroundings. Numbers of vertices vary little."""
 
 
 @dataclass(frozen=True)
 class PixelStatistics:
-    """Statistics from a few paths per tile; every map (tiles, 3), float64, means over the tile's pixels.
+    """Statistics from a few paths per tile; every map is (tiles, 3), float64, the mean over the tile's pixels.
 
     Attributes:
         magnitudes: per level, E|∂L/∂I|.
         squares: per level, E[(∂L/∂I)²].
-        second_moment: Σ_k E[(∂I/∂θ_k)²]; (0, 3) where no tangents were given.
-        samples: paths traced.
+        second_moment: Σ_k E[(∂I/∂θ_k)²]; (0, 3) without tangents.
+        samples: number of paths traced.
     """
 
     magnitudes: tuple[np.ndarray, ...]
@@ -53,13 +55,13 @@ class PixelStatistics:
 
 @dataclass(frozen=True)
 class PilotRequest:
-    """A request for one path through each pixel of a sample, to be carried out by `Problem.executor`.
+    """Request for one path through each pixel of a sample, for `Problem.executor`.
 
     Attributes:
         parameters: Current parameters.
         sample: Pixels, with weights of 1.
-        key: Random numbers.
-        references: (N, 3) each; compared with the paths besides the pixels' own references.
+        key: Key of the random numbers.
+        references: Further references, (N, 3) each, with which the paths are compared.
         tangents: Tangents of the parameters; {} for none.
     """
 
@@ -81,17 +83,17 @@ class PilotRequest:
         rendering = session.image(self.parameters, batch.request(1, self.key.uint32()))
         image = rendering.images[0]
         _, factor = batch.targets
-        found = [batch.loss_derivative(image)]
-        found += [problem.loss.derivative(image, reference) * factor for reference in self.references]
+        results = [batch.loss_derivative(image)]
+        results += [problem.loss.derivative(image, reference) * factor for reference in self.references]
         if self.tangents:
-            found.append(session.tangent_moment(self.parameters, rendering.paths, self.tangents))
-        arrays.evaluate(found)
-        return [arrays.numpy(x) for x in found]
+            results.append(session.tangent_moment(self.parameters, rendering.paths, self.tangents))
+        arrays.evaluate(results)
+        return [arrays.numpy(x) for x in results]
 
 
 def reference_means(problem: Problem, tiles: Tiles) -> np.ndarray:
-    """The mean reference of each tile, float32 (tiles, 3)."""
-    found = []
+    """Return the mean reference of each tile, float32 (tiles, 3)."""
+    means = []
     for view, grid in zip(problem.views, tiles.grids, strict=True):
         image = np.asarray(view.reference)
         rows, columns = np.arange(grid.rows) * grid.side, np.arange(grid.columns) * grid.side
@@ -100,8 +102,8 @@ def reference_means(problem: Problem, tiles: Tiles) -> np.ndarray:
             np.diff([*rows, image.shape[0]]),
             np.diff([*columns, image.shape[1]]),
         )
-        found.append(sums / sizes[..., None])
-    return tiles.join(found).astype(np.float32)
+        means.append(sums / sizes[..., None])
+    return tiles.join(means).astype(np.float32)
 
 
 def estimate_statistics(
@@ -114,17 +116,17 @@ def estimate_statistics(
     references: list[Array],
     scales: Tree,
 ) -> PixelStatistics:
-    """Trace `spp` paths in each tile, each through a random pixel of it.
+    """Estimate statistics from `spp` paths per tile, each through a random pixel of it.
 
     Args:
         problem, parameters: what to render.
-        tiles: of all views.
-        uniform_table: of these tiles, every pixel equally likely.
+        tiles: tiles of all views.
+        uniform_table: table of these tiles with equal pixel probabilities.
         spp: paths per tile, >= 1.
-        key: of the random numbers.
-        references: per level from 1 on, the reference that the tile's paths are compared with, (tiles, 3); level 0 uses the pixels' own.
-        scales: of the tangents, in the coordinates of the descent; empty for no tangents. They are propagated in up to `ROUNDS` rounds,
-            each with signs of its own, since all paths of a launch share them.
+        key: key of the random numbers.
+        references: per level from 1 on, the reference of each tile, (tiles, 3); level 0 uses the pixels' own.
+        scales: scales of the tangents, in the coordinates of the optimisation; empty for no tangents. Tangents are propagated in up to
+            `ROUNDS` rounds with separate signs, because all paths of a launch share them.
     """
     rounds = max(n for n in range(1, min(spp, ROUNDS) + 1) if spp % n == 0) if scales else 1
     parts = [
@@ -148,17 +150,18 @@ def estimate_statistics(
 def costs(
     problem: Problem, parameters: Tree, tiles: Tiles, uniform_table: InverseCdfTable, key: Key
 ) -> tuple[np.ndarray, int]:
-    """What a path through each tile costs to trace, relative to one that meets nothing, (tiles,), >= 1; and how many paths that took.
+    """Return the cost of a path through each tile relative to one without an intersection, (tiles,), >= 1, and the number of paths
+    traced.
 
-    1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor a path into the sky costs as
-    much as half a vertex in mini-batches of 16384 pixels, as four in ones of 2048, where launches themselves cost.) From one path in
-    each tile, pooled; ones where the renderer does not count.
+    The cost is 1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor, a path that leaves
+    the scene costs as much as half a vertex in mini-batches of 16384 pixels, and as four in batches of 2048, where launches dominate.) It
+    is estimated from one path per tile, and pooled. Ones if the renderer does not count vertices.
 
     Args:
         problem, parameters: what to render.
-        tiles: of all views.
-        uniform_table: of these tiles, every pixel equally likely.
-        key: of the random numbers.
+        tiles: tiles of all views.
+        uniform_table: table of these tiles with equal pixel probabilities.
+        key: key of the random numbers.
     """
     session = problem.renderer.prepare(list(parameters), None)
     if not isinstance(session, CountingSession):
@@ -178,9 +181,9 @@ def _round(
     references: list[Array],
     scales: Tree,
 ) -> list[np.ndarray]:
-    """Per path (tiles * spp, 3): the loss derivative on each level and, last, the squared derivative along the tangents.
+    """Return, per path, (tiles * spp, 3): the loss derivative on each level and, last, the squared derivative along the tangents.
 
-    Where the problem's views are dealt to workers, they trace the paths.
+    If the problem's views are distributed, the workers trace the paths.
     """
     sample = uniform_table.draw_per_tile(spp, key.fold(0))
     count = arrays.shape(sample.weights)[0]
@@ -194,21 +197,23 @@ def _round(
 
 
 def random_tangents(problem: Problem, parameters: Tree, scales: Tree, key: Key) -> Tree:
-    """Tangents of the parameters: scales times random signs, in the coordinates of the descent."""
+    """Return tangents of the parameters: scales times random signs, in the coordinates of the optimisation."""
     signs = random_signs(parameters, key)
     scaled = {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
     return problem.coordinates.push_forward(scaled, problem.coordinates.slopes(parameters))
 
 
 def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:
-    """±1 for every element of every parameter, all independent."""
+    """Return independent random signs ±1 for every element of every parameter."""
     rng = np.random.default_rng(key.uint32())
     return {name: rng.choice(np.array([-1.0, 1.0]), size=shape) for name, shape in trees.shapes(like).items()}
 
 
 def observed(problem: Problem, second_moment: Tree, gradient: Tree) -> Tree:
-    """The running mean square of the gradient, in the coordinates of the descent, with one more gradient by u; elements that are not finite
-    count as zeros."""
+    """Return the running mean square of the gradient, in the coordinates of the optimisation, after a further gradient with respect to u.
+
+    Elements that are not finite count as zeros.
+    """
     pulled = problem.coordinates.pull_back(gradient, {})
     squares = trees.map(lambda g: arrays.where(arrays.is_finite(g), g * g, 0.0), pulled)
     if not second_moment or trees.shapes(second_moment) != trees.shapes(squares):
@@ -217,11 +222,12 @@ def observed(problem: Problem, second_moment: Tree, gradient: Tree) -> Tree:
 
 
 def scales(parameters: Tree, second_moment: Tree) -> Tree:
-    """The factor of each element's derivative: one or, where mean squared gradients are known, one over the root of the element's own
-    times the number of elements of its parameter, so that a colour counts as much as a texture.
+    """Return the scale of each element's derivative.
 
-    A tenth of the parameter's typical second moment, the geometric mean over elements with a non-zero one, is added as a floor: it
-    bounds the factor of elements that hardly any path has met. (The arithmetic mean would be dominated by a few bright paths.)
+    It is one, or, with known mean squared gradients, 1 / √(m n) for an element's mean square m and the number n of its parameter's
+    elements, so that a colour counts as much as a texture. A tenth of the parameter's typical second moment, the geometric mean over
+    non-zero elements, is added as a floor. It bounds the scale of elements that hardly any path has hit. (A few bright paths would
+    dominate the arithmetic mean.)
     """
     if not second_moment or trees.shapes(second_moment) != trees.shapes(parameters):
         return trees.map(lambda x: x * 0.0 + 1.0, parameters)

@@ -1,7 +1,7 @@
-"""The films of all views divided into square tiles, on which pixel probabilities are estimated and from which pixels are drawn.
+"""Square tiles of the films of all views, on which pixel probabilities are estimated and from which pixels are sampled.
 
-All pixels of a tile are equally likely. The cost of estimating and drawing grows with the number of tiles, not of pixels, so it does
-not depend on the number and size of the images.
+All pixels of a tile are equally likely. The cost of estimation and sampling depends on the number of tiles, not of pixels, and thus not
+on the number and size of the images.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _RANGE = 1 << 32
 
 @dataclass(frozen=True)
 class Grid:
-    """The tiles of one view, row by row: `rows` × `columns`, `side` pixels wide but for the last of a row or column."""
+    """Tiles of one view in row-major order: `rows` × `columns`, `side` pixels wide except at the right and lower border."""
 
     rows: int
     columns: int
@@ -34,13 +34,13 @@ class Grid:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Tiles of all views, concatenated view by view; every array (tiles,), integers.
+    """Tiles of all views, concatenated; every array is (tiles,), integers.
 
     Attributes:
-        grids: one per view.
+        grids: one grid per view.
         views: index of the view.
-        x, y: the first pixel.
-        widths, heights: in pixels.
+        x, y: first pixel.
+        widths, heights: size in pixels.
         films: width of the view's film.
     """
 
@@ -54,15 +54,15 @@ class Tiles:
 
     @property
     def sizes(self) -> np.ndarray:
-        """How many pixels each has."""
+        """Number of pixels of each tile."""
         return self.widths * self.heights
 
     def locate(self, views: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """The tile of each pixel.
+        """Return the tile index of each pixel.
 
         Args:
             views: index of the view, (N,).
-            pixels: row-major index within its film, (N,).
+            pixels: row-major index in its film, (N,).
         """
         starts = np.cumsum([0, *(grid.rows * grid.columns for grid in self.grids)])[:-1]
         columns, sides = np.array([(grid.columns, grid.side) for grid in self.grids]).T
@@ -72,7 +72,7 @@ class Tiles:
         return starts[views] + row // side * columns[views] + column // side
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
-        """(tiles, ...) to one array (rows, columns, ...) per view."""
+        """Split (tiles, ...) into one array (rows, columns, ...) per view."""
         ends = np.cumsum([grid.rows * grid.columns for grid in self.grids])[:-1]
         parts = np.split(values, ends)
         return [
@@ -81,19 +81,20 @@ class Tiles:
         ]
 
     def join(self, maps: list[np.ndarray]) -> np.ndarray:
-        """The inverse of `split`."""
+        """Concatenate maps of all views; the inverse of `split`."""
         return np.concatenate([part.reshape(-1, *part.shape[2:]) for part in maps])
 
     def coarsen(self, values: np.ndarray, level: int) -> np.ndarray:
-        """Means over blocks of 2^level × 2^level tiles, weighted by their numbers of pixels, repeated for each tile of the block.
+        """Return means over blocks of 2^level × 2^level tiles, weighted by their numbers of pixels, and repeated for each tile of the
+        block.
 
         Args:
             values: (tiles, ...).
-            level: 0 leaves `values` as they are.
+            level: number of doublings; 0 returns `values`.
         """
         if level == 0:
             return values
-        found = []
+        means_per_view = []
         for part, size, grid in zip(self.split(values), self.split(self.sizes), self.grids, strict=True):
             rows, columns = np.arange(0, grid.rows, 2**level), np.arange(0, grid.columns, 2**level)
             weight = size.reshape(size.shape + (1,) * (part.ndim - 2)).astype(np.float64)
@@ -101,12 +102,12 @@ class Tiles:
                 np.add.reduceat(np.add.reduceat(x, rows, axis=0), columns, axis=1) for x in (part * weight, weight)
             )
             means = (sums / weights).repeat(2**level, axis=0)[: grid.rows].repeat(2**level, axis=1)
-            found.append(means[:, : grid.columns])
-        return self.join(found)
+            means_per_view.append(means[:, : grid.columns])
+        return self.join(means_per_view)
 
 
 def cut(problem: Problem, most: int) -> Tiles:
-    """The finest tiles of at most `most` in all, but one per view at least; of equal side in all views."""
+    """Return the finest tiles with at most `most` in total, but at least one per view; the side is the same in all views."""
     return _cut(tuple(problem.renderer.resolutions()[view.sensor] for view in problem.views), min(most, MOST_TILES))
 
 
@@ -139,12 +140,13 @@ def _cut(resolutions: tuple[tuple[int, int], ...], most: int) -> Tiles:
 
 @dataclass(frozen=True)
 class InverseCdfTable:
-    """The inverse of the tiles' cumulative distribution, the unit interval as integers in [0, 2³²), so that probabilities are exact.
+    """Inverse of the tiles' cumulative distribution. The unit interval is represented by integers in [0, 2³²), so probabilities are
+    exact.
 
     Attributes:
-        starts: the cumulative distribution before each tile, (tiles,), ascending.
+        starts: cumulative distribution before each tile, (tiles,), ascending.
         weights: 1 / p of a pixel of the tile, (tiles, 1).
-        places: view, x, y, width, height, film width of each tile: (tiles,) each.
+        places: view, x, y, width, height and film width of each tile, (tiles,) each.
     """
 
     starts: Array
@@ -153,12 +155,12 @@ class InverseCdfTable:
 
     @classmethod
     def of(cls, tiles: Tiles, probabilities: np.ndarray, array: Callable[[np.ndarray], Array]) -> InverseCdfTable:
-        """From the tiles' probabilities (tiles,), all above 0; rounded to multiples of 2⁻³², never to 0.
+        """Build the table from the tiles' probabilities (tiles,), all positive; they are rounded to multiples of 2⁻³², never to 0.
 
         Args:
-            tiles: to draw from.
-            probabilities: of any positive sum.
-            array: makes the renderer's arrays.
+            tiles: tiles to sample.
+            probabilities: probabilities with any positive sum.
+            array: function that makes arrays of the renderer.
         """
         shares = np.asarray(probabilities, np.float64)
         ends = np.rint(np.cumsum(shares / shares.sum()) * _RANGE).astype(np.int64)
@@ -176,20 +178,20 @@ class InverseCdfTable:
         )
 
     def draw(self, count: int, key: Key, stratified: bool) -> PixelSample:
-        """`count` pixels with replacement.
+        """Sample `count` pixels with replacement.
 
         Args:
-            count: how many.
-            key: of the random numbers.
-            stratified: one draw from each of `count` equal strata of the unit interval, with a common random offset modulo 1: the
-                marginal distribution of each draw is the table's. Otherwise all are independent.
+            count: number of pixels.
+            key: key of the random numbers.
+            stratified: whether to take one sample in each of `count` equal strata of the unit interval, with a common random offset
+                modulo 1. The marginal distribution of each sample is that of the table. Otherwise samples are independent.
         """
         number = _stratified(self.weights, count, key) if stratified else _independent(self.weights, count, key)
         tile = arrays.searchsorted(self.starts, number)
         return self._draw_within(tile, arrays.gather_rows(self.weights, tile) / count, key)
 
     def draw_per_tile(self, count: int, key: Key) -> PixelSample:
-        """`count` pixels of every tile, consecutive; weights of 1."""
+        """Sample `count` consecutive pixels of every tile, with weights of 1."""
         tile = arrays.arange(self.weights, arrays.shape(self.weights)[0] * count) // count
         return self._draw_within(tile, arrays.gather_rows(self.weights * 0 + 1, tile), key)
 
@@ -208,7 +210,7 @@ def _independent(like: Array, count: int, key: Key) -> Array:
 
 
 def _stratified(like: Array, count: int, key: Key) -> Array:
-    if count == 1:  # one stratum, which is the whole interval: one integer more than 32 bits can count
+    if count == 1:  # the single stratum is the entire interval, whose size does not fit into 32 bits
         return _independent(like, 1, key)
     stride = _RANGE // count
     jitter = arrays.random_integers(like, key.fold(0).uint32(), count, stride)
@@ -216,7 +218,7 @@ def _stratified(like: Array, count: int, key: Key) -> Array:
 
 
 FACTORS = 2
-"""The maps of which the samples of a step tell: second moments of the parameter derivatives, and of the loss derivative."""
+"""Number of maps that a step's samples update: second moments of the parameter derivatives, and of the loss derivative."""
 
 Maps = tuple[np.ndarray, ...]
 """Statistics of each tile and channel, (tiles, 3) each."""
@@ -224,13 +226,13 @@ Maps = tuple[np.ndarray, ...]
 
 @dataclass(frozen=True)
 class TileSamples:
-    """What some paths tell.
+    """Statistics of some paths.
 
     Attributes:
-        tile: of each sample, (N,).
-        values: per map, (N, 3).
-        weights: one over the probability of each sample's pixel relative to that of the others, (N,).
-        paths: behind each sample, a number or (N,).
+        tile: tile index of each sample, (N,).
+        values: value per map, (N, 3).
+        weights: inverse of each sample's relative pixel probability, (N,).
+        paths: number of paths of each sample, a number or (N,).
     """
 
     tile: np.ndarray
@@ -239,19 +241,19 @@ class TileSamples:
     paths: float | np.ndarray = 1.0
 
     def normalised(self) -> Maps:
-        """The values over their mean over all pixels, so that samples count alike whatever the loss or the units of its variance have
-        become in between."""
+        """Return the values divided by their mean over all pixels, so that samples count equally when the loss or its scale changes."""
         means = [float(np.average(value.mean(axis=1), weights=self.weights)) for value in self.values]
         return tuple(value / (mean or 1.0) for value, mean in zip(self.values, means, strict=True))
 
     def summed(self, values: np.ndarray, tiles: int) -> tuple[np.ndarray, np.ndarray]:
-        """Sums and numbers of paths per tile, (tiles, 3) and (tiles,)."""
+        """Return the sums and numbers of paths per tile, (tiles, 3) and (tiles,)."""
         paths = np.broadcast_to(np.asarray(self.paths, np.float64), self.tile.shape)
         sums = [np.bincount(self.tile, value * paths, tiles) for value in values.T]
         return np.stack(sums, axis=1), np.bincount(self.tile, paths, tiles)
 
     def judged(self, values: Maps, denoised: Maps) -> np.ndarray:
-        """`uniform_share.observed`'s samples: each factor of Eq. 12 by the samples, times the other by the map, (2, N)."""
+        """Return the `samples` of `uniform_share.observed`: each factor of Eq. 12 from the samples times the other from the map, (2,
+        N)."""
         factors = [
             (values[index] * denoised[1 - index][self.tile]).sum(axis=1) * self.weights for index in range(FACTORS)
         ]
@@ -259,5 +261,5 @@ class TileSamples:
 
 
 def finite(values: np.ndarray) -> np.ndarray:
-    """Values that are not finite count as zeros."""
+    """Replace values that are not finite by zeros."""
     return np.where(np.isfinite(values), values, 0.0)

@@ -16,12 +16,12 @@ from unrender.scene.upsampling import Upsampler
 
 @dataclass(frozen=True)
 class UniformState:
-    """State between steps: the table that pixels are drawn from, which is constant."""
+    """State between steps: the constant table that pixels are sampled from."""
 
     table: InverseCdfTable
 
     def upsampled(self, upsampler: Upsampler) -> UniformState:
-        """See `Upsamplable`: nothing in it has a parameter's shape."""
+        """Return this state, which has no array of a parameter's shape."""
         del upsampler
         return self
 
@@ -29,11 +29,11 @@ class UniformState:
 @register
 @dataclass(frozen=True)
 class Uniform:
-    """Every pixel of every view is equally likely.
+    """Uniform sampling of the pixels of all views.
 
     Args:
-        count: pixels a step, >= 1, drawn with replacement.
-        stratified: stratify the draws over all pixels (`tiles.InverseCdfTable.draw`); otherwise they are independent.
+        count: pixels per step, >= 1, sampled with replacement.
+        stratified: whether samples are stratified over all pixels (`tiles.InverseCdfTable.draw`); independent otherwise.
     """
 
     count: int
@@ -57,6 +57,6 @@ class Uniform:
         return MiniBatch(state.table.draw(self.count, key, self.stratified))
 
     def observe(self, problem: Problem, state: UniformState, gradient: Tree) -> UniformState:
-        """Unchanged: the gradient is not used."""
+        """Return the state unchanged."""
         del problem, gradient
         return state

@@ -1,4 +1,4 @@
-"""How much of a mini-batch is drawn uniformly: as much as the evidence for an importance map asks for."""
+"""Choice of the fraction of uniform samples in a mini-batch, from the evidence for the importance map."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from dataclasses import dataclass, field
 import numpy as np
 
 SHARES = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
-"""Those that are compared."""
+"""Candidate fractions."""
 MOST = float(SHARES[-1])
-"""The share without evidence. The second moment of the gradient is then at most 1 / 0.8 = 1.25 times that of uniform sampling, whatever
-the map."""
+"""Fraction without evidence. The second moment of the gradient is then at most 1 / 0.8 = 1.25 times that of uniform sampling, for any
+map."""
 
 
 _UNKNOWN = 3.0
-"""Samples' worth of second moment that n effective samples may have missed: 3 of 3 + n at most, with 95 % confidence (rule of three)."""
+"""Second moment that n effective samples may have missed, in samples: at most 3 of 3 + n with 95 % confidence (rule of three)."""
 
 
 @dataclass(frozen=True)
 class ShareEvidence:
-    """Second moments of the gradient under other probabilities, from samples drawn since the map that they judge.
+    """Second moments of the gradient under other probabilities, from samples that are newer than the map.
 
-    One row for each of the two factors, ∂L/∂I and ∂I/∂θ: a sample's own factor, times the map of the other.
+    Each of the two factors, ∂L/∂I and ∂I/∂θ, has one row: the sample's own factor times the map of the other.
 
     Attributes:
-        moments: running sums of y / p(λ) for each share λ, and last for uniform sampling, (2, shares + 1).
+        moments: running sums of y / p(λ) for each fraction λ, and last for uniform sampling, (2, fractions + 1).
         squares: running sums of (y / p(1))², (2,).
     """
 
@@ -40,16 +40,16 @@ def observed(
     decay: float,
     gain: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> ShareEvidence:
-    """The evidence with further samples.
+    """Return the evidence updated by further samples.
 
     Args:
-        evidence: so far.
-        samples: y, second moments that a sample tells over its own probability relative to uniform sampling, (2, N): their sum
-            estimates the second moment under uniform sampling.
+        evidence: evidence so far.
+        samples: y, second moments of the samples divided by their probability relative to uniform sampling, (2, N). Their sum estimates
+            the second moment under uniform sampling.
         density: q, the map at each sample, relative to uniform sampling, (N,).
-        decay: weight of what was known before.
-        gain: one over the second moment under a probability relative to uniform sampling, for that of a sample under uniform sampling;
-            None for the probability itself.
+        decay: weight of the earlier evidence.
+        gain: inverse of the second moment as a function of the probability relative to uniform sampling, in units of its value for
+            uniform sampling; None for the probability itself.
     """
     mixed = SHARES[:, None] + (1 - SHARES[:, None]) * density
     mixed = mixed if gain is None else gain(mixed)
@@ -58,19 +58,20 @@ def observed(
 
 
 def choose(evidence: ShareEvidence, cost: float = 1.0, gain: Callable[[np.ndarray], np.ndarray] | None = None) -> float:
-    """The share λ of uniform draws in p = λ + (1 - λ) q that minimises a pessimistic estimate of the gradient's second moment over that of
-    uniform sampling:
+    """Return the fraction λ of uniform samples in p = λ + (1 - λ) q with the smallest pessimistic second moment.
+
+    The estimate is relative to the second moment of uniform sampling:
 
         J(λ) = (1 - ε) R(λ) / R(1) + ε / λ,        R(λ) = Σ y / p(λ),        ε = 3 / (3 + n),        n = (Σ y)² / Σ y².
 
-    n is the effective number of samples, and ε the share of the second moment that they may have missed, as much as three more samples
-    like them (the rule of three: 95 % confidence). The map may be zero there, which costs 1 / λ. J is the larger of that of the two
-    factors. Without evidence λ is `MOST`; heavy tails, of which few samples are all, keep it large.
+    n is the effective number of samples. ε is the share of the second moment that they may have missed, as much as three more such
+    samples (rule of three: 95 % confidence). The map may be zero there, which costs 1 / λ. J is the larger of both factors' values.
+    Without evidence λ is `MOST`. Heavy tails, which a few samples dominate, keep λ large.
 
     Args:
-        evidence: of samples.
-        cost: of a path drawn by the map, over that of one drawn uniformly: J is multiplied by λ + (1 - λ) times it.
-        gain: that of `observed`: of λ, in place of λ in ε / λ.
+        evidence: evidence from samples.
+        cost: relative cost of a path sampled by the map; J is multiplied by λ + (1 - λ) times it.
+        gain: `gain` of `observed`; gain(λ) replaces λ in ε / λ.
     """
     least = SHARES if gain is None else gain(SHARES)
     worst = np.zeros(len(SHARES))

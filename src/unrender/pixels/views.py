@@ -1,4 +1,4 @@
-"""Mini-batches of whole views."""
+"""Mini-batches of full views."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from unrender.scene.problem import Problem
 @register
 @dataclass(frozen=True)
 class Views:
-    """Draw some views per step, each set of `count` views with equal probability, and render all of their pixels. Unbiased.
+    """Mini-batch of full views: each set of `count` views is equally likely, and all its pixels are rendered. Unbiased.
 
-    The fixed cost of a view falls with the number of views: borders of moving shapes, small pictures. Pixels drawn from all views at once
-    (`Uniform`) leave it as it is. The variance of the gradient grows by the differences between views.
+    The cost per step that grows with the number of views decreases: silhouettes of moving shapes, small images. Sampling pixels of all
+    views (`Uniform`) does not reduce it. The differences between views add to the variance of the gradient.
 
     Args:
-        count: Views per step, >= 1; all views where the problem has no more.
+        count: Views per step, >= 1; all views if the problem has no more.
     """
 
     count: int
@@ -34,7 +34,7 @@ class Views:
         checks.integer("Views", "count", self.count, at_least=1)
 
     def init(self, problem: Problem, parameters: Tree) -> None:
-        """See `PixelSampler.init`: there is no state."""
+        """Return None, as there is no state. Raises `InputError` for a loss that is not pixelwise."""
         del parameters
         check_batch("Views", problem, 1)
 
@@ -47,15 +47,15 @@ class Views:
         total = len(problem.views)
         count, random = min(self.count, total), np.random.default_rng(key.uint32())
         chosen = np.sort(random.choice(total, count, replace=False))
-        return _whole(problem, chosen, np.full(count, total / count))
+        return _all_pixels(problem, chosen, np.full(count, total / count))
 
     def observe(self, problem: Problem, state: None, gradient: Tree) -> None:
-        """See `PixelSampler.observe`: there is nothing to remember."""
+        """Return None."""
         del problem, state, gradient
 
 
-def _whole(problem: Problem, chosen: np.ndarray, weights: np.ndarray) -> MiniBatch:
-    """All pixels of the chosen views, with the views' weights."""
+def _all_pixels(problem: Problem, chosen: np.ndarray, weights: np.ndarray) -> MiniBatch:
+    """Return all pixels of the chosen views, with the views' weights."""
     known = problem.sizes
     sizes = [math.prod(known[view]) for view in chosen]
     like = problem.renderer.array(np.repeat(weights, sizes)[:, None].astype(np.float32))

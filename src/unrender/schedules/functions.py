@@ -1,7 +1,7 @@
-"""Factors of the learning rate, or of a smoothing's width, as functions of the step.
+"""Schedules: factors of a learning rate or of a smoothing width, as functions of the step.
 
-A schedule is a callable that takes the number of steps already made (>= 0) and returns a factor >= 0. The number need not be whole: who
-measures progress otherwise than in steps (`SmoothedDerivatives(adaptive_annealing=True)`) asks by that.
+A schedule is a callable that takes the number of completed steps (>= 0) and returns a factor >= 0. The number may be fractional:
+`SmoothedDerivatives(adaptive_annealing=True)` measures progress in other units than steps.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from unrender.core.registry import register
 
 
 class Schedule(Protocol):
-    """A pure function of the step."""
+    """A pure function from a step to a factor."""
 
     def __call__(self, step: float) -> float:
-        """The factor of the learning rate at `step`, which counts from 0."""
+        """Return the factor at `step`, which counts from 0."""
         ...
 
 
@@ -29,7 +29,7 @@ class Constant:
     """The same factor at every step.
 
     Args:
-        factor: >= 0.
+        factor: the factor, >= 0.
     """
 
     factor: float = 1.0
@@ -44,11 +44,11 @@ class Constant:
 @register(position=2)
 @dataclass(frozen=True)
 class Exponential:
-    """2^(−step / half_life), and never below `floor`.
+    """2^(−step / half_life), but at least `floor`.
 
     Args:
-        half_life: steps after which the rate has halved, > 0.
-        floor: the least factor, >= 0.
+        half_life: number of steps that halve the factor, > 0.
+        floor: smallest factor, >= 0.
     """
 
     half_life: float
@@ -65,10 +65,10 @@ class Exponential:
 @register(position=3)
 @dataclass(frozen=True)
 class InverseRoot:
-    """1 / √(1 + step / time): a rate that falls early and never stops, whatever the number of steps.
+    """1 / √(1 + step / time), which decreases early and has no end.
 
     Args:
-        time: steps after which the rate is 1/√2 of the first, > 0.
+        time: step at which the factor is 1/√2, > 0.
     """
 
     time: float
@@ -83,10 +83,10 @@ class InverseRoot:
 @register(position=7)
 @dataclass(frozen=True)
 class Inverse:
-    """1 / (1 + step / time): the rate of Newton's steps with noise, which averages all of it (Robbins and Monro 1951).
+    """1 / (1 + step / time), the rate at which Newton steps average out noise (Robbins and Monro 1951).
 
     Args:
-        time: steps after which the rate is half of the first, > 0.
+        time: step at which the factor is 1/2, > 0.
     """
 
     time: float
@@ -101,11 +101,11 @@ class Inverse:
 @register(position=4)
 @dataclass(frozen=True)
 class Cosine:
-    """Half a cosine from 1 at step 0 down to `floor` at step `steps`, and `floor` ever after.
+    """Half a cosine from 1 at step 0 to `floor` at step `steps`, then constant.
 
     Args:
-        steps: length of the descent, >= 1.
-        floor: the last factor, >= 0.
+        steps: length of the decay, >= 1.
+        floor: last factor, >= 0.
     """
 
     steps: int
@@ -123,11 +123,11 @@ class Cosine:
 @register(position=5)
 @dataclass(frozen=True)
 class Steps:
-    """Multiplied by `factor` once every `every` steps.
+    """Multiplication by `factor` after every `every` steps.
 
     Args:
-        every: >= 1.
-        factor: > 0, usually below 1.
+        every: number of steps, >= 1.
+        factor: factor, > 0, usually below 1.
     """
 
     every: int
@@ -144,12 +144,11 @@ class Steps:
 @register(position=6)
 @dataclass(frozen=True)
 class Warmup:
-    """A linear rise over the first `steps` steps, 1/steps, 2/steps … 1, then another schedule, which starts at its
-    own step 0.
+    """A linear increase over the first `steps` steps, 1/steps, 2/steps … 1, followed by another schedule from its step 0.
 
     Args:
-        steps: length of the rise, >= 1.
-        then: what follows; None stays at 1.
+        steps: length of the increase, >= 1.
+        then: the following schedule; None stays at 1.
     """
 
     steps: int

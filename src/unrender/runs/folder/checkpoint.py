@@ -191,12 +191,12 @@ def _tensors(path: Path, manifest: Manifest) -> dict[str, Any]:
         data[8 : 8 + min(int.from_bytes(data[:8], "little"), len(data))], f"{path}: header"
     )
     if not isinstance(header, dict):
-        raise InputError(f"{path}: not tensors that can be read: its header is no object")
+        raise InputError(f"{path}: tensors cannot be read: its header is not an object")
     try:
         # Checks every type, shape and offset against the bytes that are there before it takes memory for any.
         return {name: array.copy() for name, array in safetensors.numpy.load(data).items()}
     except safetensors.SafetensorError as error:
-        raise InputError(f"{path}: not tensors that can be read: {str(error)[:200]}") from error
+        raise InputError(f"{path}: tensors cannot be read: {str(error)[:200]}") from error
     except KeyError as error:
         raise InputError(f"{path}: tensors of type {error}, which no state has") from error
 
