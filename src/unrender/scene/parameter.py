@@ -30,27 +30,27 @@ class Parameter:
     Args:
         key: name in `mitsuba.traverse`, e.g. ``"back.bsdf.reflectance.data"``. With `keys`, any name; "" takes the first of the keys.
         initial: initial value: a number, a colour, an array, a file, or None for the scene's value. A number or a colour fills the
-        parameter. A file is converted as Mitsuba converts it when it loads the scene: the sRGB curve, the repeated columns of an
-        environment map, the transform of a mesh. Images and `.vol` grids of another resolution are resized. A `.npy` file, or an `.npz`
-        archive of one array, must have the parameter's shape; a last axis of length 1 and the repeated columns of an environment map may
-        be missing.
+            parameter. A file is converted as Mitsuba converts it when it loads the scene: the sRGB curve, the repeated columns of an
+            environment map, the transform of a mesh. Images and `.vol` grids of another resolution are resized. A `.npy` file, or an `.npz`
+            archive of one array, must have the parameter's shape; a last axis of length 1 and the repeated columns of an environment map may
+            be missing.
         bounds: (low, high); either may be None. None takes the physical range if it is known (a reflectance: 0 to 1).
         learning_rate: learning rate of this parameter; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
         coarse_to_fine: `CoarseToFine`, or its steps, for a texture or grid with a coarse initial resolution; None for one resolution.
         parameterisation: "identity", "log", "logit", "softplus" or "softplus(0.1)", or one of `unrender.parameterisations`. It is the
-        variable that preconditioner, optimizer and learning rate act on; values, bounds and results remain those of the parameter. None
-        for the identity.
+            variable that preconditioner, optimizer and learning rate act on; values, bounds and results remain those of the parameter. None
+            for the identity.
         regularizer: for the vertex positions of a mesh, an additional term of the loss: `MeshRegularizer`, or a table of its options such
-        as {"bilaplacian": 0.001}; None for none.
+            as {"bilaplacian": 0.001}; None for none.
         prior: prior knowledge of the values: `Prior`, or a table of its options such as {"smoothness": 0.05}; None for none.
         remeshing: for the vertex positions of a mesh, steps at which it is remeshed: `Remeshing`, its steps, or a table of its options
-        such as {"steps": [100], "method": "subdivide"}; None for never.
+            such as {"steps": [100], "method": "subdivide"}; None for never.
         self_intersection: for the vertex positions of a mesh, treatment of self-intersections. "warn" checks occasionally and at the end,
-        and reports in one line. "prevent" checks every step and shortens steps that would cause one, which takes about 25 ms for 1000
-        triangles. "ignore" never checks.
+            and reports in one line. "prevent" checks every step and shortens steps that would cause one, which takes about 25 ms for 1000
+            triangles. "ignore" never checks.
         keys: parameters of the scene that share this one value, or {key: factor} if each is a factor times it. Initial value, bounds,
-        learning rate and preconditioner apply to the shared value.
+            learning rate and preconditioner apply to the shared value.
     """
 
     key: str = ""
