@@ -58,7 +58,7 @@ def test_it_is_the_loss_that_it_computes(name: str, framework: str) -> None:
 
 @pytest.mark.parametrize("name", [name for name in ESTIMATORS if "pixels" in name][:1])
 def test_it_takes_no_mini_batches(name: str) -> None:
-    with pytest.raises(InputError, match="of whole images, so it takes no pixel mini-batches"):
+    with pytest.raises(InputError, match="is a loss of full images, which does not support pixel mini-batches"):
         ur.estimate(problem(of_drjit), ESTIMATORS[name]())
 
 
@@ -131,7 +131,7 @@ def test_what_it_is_called_with() -> None:
     [
         (lambda image, reference: image - reference, r"with Dr.Jit's tensors: it returns TensorXf of shape \(4, 4, 3\), exp"),
         (lambda image, reference: 3.0, "it returns float, expected a scalar"),
-        (lambda image, reference: dr.mean(dr.detach(image), axis=None), "does not depend on the image, or was detached from it"),
+        (lambda image, reference: dr.mean(dr.detach(image), axis=None), "does not depend on the image, or is detached from it"),
         (lambda image, reference: dr.mean(image, axis=None) * dr.nan, "its value at an image that is nearly the reference is nan"),
         (lambda image, reference: image.nonsense(), "has no attribute 'nonsense'"),
         (lambda image, reference, more: 0, r"expected a function of \(image\) or of \(image, reference\), it takes image, ref"),

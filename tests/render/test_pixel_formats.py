@@ -146,7 +146,7 @@ def test_alpha_of_eight_bits_is_a_mask_and_that_of_floats_is_left_out(tmp_path: 
         np.testing.assert_allclose(both, mask * own)
     assert problem("rgb", picture.astype(np.float32)).views[0].mask is None
     picture[..., 3] = 0
-    with pytest.raises(ur.InputError, match="alpha, with the mask, is 0 everywhere"):
+    with pytest.raises(ur.InputError, match="alpha times the mask is 0 everywhere"):
         problem("rgb", picture)
 
 

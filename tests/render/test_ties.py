@@ -200,7 +200,7 @@ def test_a_problem_file_has_keys_and_factors_and_a_run_folder_keeps_them(tmp_pat
             "problem.toml:4",
             "no parameter sky.radiance.valu",
         ),
-        ('keys = "a.bsdf.reflectance.value"', "problem.toml:4", "several scene parameters of one value"),
+        ('keys = "a.bsdf.reflectance.value"', "problem.toml:4", "scene parameters that share one value"),
         ('keys = { "a.bsdf.reflectance.value" = 0 }', "problem.toml:4", "expected a factor other than 0"),
     ],
 )

@@ -217,7 +217,7 @@ def test_a_mini_batch_says_its_pixels() -> None:
     assert np.mean(totals) == pytest.approx(np.mean(numbers), abs=4 * np.std(totals) / np.sqrt(len(totals)))
     with pytest.raises(InputError, match="expected 2 images"):
         renderer.gather(numbers[0])
-    with pytest.raises(InputError, match="mini-batch is of all sensors"):
+    with pytest.raises(InputError, match="mini-batch contains all sensors"):
         renderer.render(START, sensor=1)
     whole = ur.Renderer(scene(), KEYS, pixels=Uniform(8), image=CV())
     assert whole.render(START).shape == (16, 3)  # the control variate's first step
@@ -449,7 +449,7 @@ def test_backward_of_another_threads_image_is_one_line() -> None:
     thread.start()
     thread.join()
     with pytest.raises(
-        InputError, match=r"backward in another thread than the last render.*give each thread a Renderer"
+        InputError, match=r"backward in another thread than the last render.*use one Renderer per thread"
     ):
         renderer.backward(np.ones_like(image))
     image = renderer.render(START)

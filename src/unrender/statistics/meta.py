@@ -165,7 +165,7 @@ def update_coupled(
         previous: H_i, the estimate for step i − 1 from the samples of F_i; ignored at the first step.
         observed: (F, H) from which variances are estimated in place of the summed ones.
 
-        The other arguments and the result are those of `update`.
+    The other arguments and the result are those of `update`.
     """
     F, H = observed or (current, previous)
     state, var_f, var_d, var_m, started = _observe(
