@@ -305,7 +305,7 @@ def test_refuses_views(view: View, message: str):
         ({"loss": losses.L1}, "loss: expected one of unrender.losses"),
         ({"loss": "L1"}, "loss: expected one of unrender.losses"),
         ({"max_depth": 0}, "max_depth: expected a whole number of at least 1, got 0"),
-        ({"max_depth": -1}, "max_depth: expected a whole number of at least 1, got -1; for Mitsuba's -1 (no limit)"),
+        ({"max_depth": -1}, "max_depth: expected a whole number of at least 1, got -1; for Mitsuba's -1"),
         ({"max_depth": 2.5}, "max_depth: expected a whole number of at least 1, got 2.5"),
         ({"truth": {"wall.valu": 0.5}}, r"truth\.wall\.valu: not one of the parameters; did you mean wall.value\?"),
         ({"truth": {"wall.value": [0.5, 0.5]}}, r"truth\.wall\.value: expected"),
