@@ -51,7 +51,7 @@ def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
         def close(self) -> None: ...
 
     monkeypatch.setattr(stored_pictures.tempfile, "TemporaryFile", lambda prefix: Full())
-    with pytest.raises(ur.InputError, match="No space left on device; TMPDIR names another folder"):
+    with pytest.raises(ur.InputError, match="No space left on device; set TMPDIR to another folder"):
         PictureStore().add(np.zeros((2, 2, 3)))
 
 

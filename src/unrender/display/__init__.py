@@ -1,1 +1,1 @@
-"""Numbers, charts and pictures for people, wherever they are shown: on a terminal, on a page, in a notebook."""
+"""Formatting of numbers, charts and images for terminals, pages and notebooks."""

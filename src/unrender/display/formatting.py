@@ -1,4 +1,4 @@
-"""Numbers as people read them."""
+"""Formatting of numbers for display."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _UNKNOWN = "–"
 
 
 def number(value: float | None) -> str:
-    """Three significant digits: 0.0213, 1.5, −2.27·10⁻⁹, ∞; a dash for what is not known."""
+    """Format a value with three significant digits: 0.0213, 1.5, −2.27·10⁻⁹, ∞; a dash for None and NaN."""
     if value is None or value != value:
         return _UNKNOWN
     sign, size = ("−" if value < 0 else ""), abs(value)
@@ -25,7 +25,7 @@ def number(value: float | None) -> str:
 
 
 def count(value: float) -> str:
-    """500, 20 k, 1.5 M."""
+    """Format a large number with a unit: 500, 20 k, 1.5 M."""
     for size, unit in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:.3g} {unit}"
@@ -33,19 +33,19 @@ def count(value: float) -> str:
 
 
 def duration(seconds: float | None) -> str:
-    """12.3 s, 3 min 20 s, 1 h 05 min; a dash for what is not known."""
+    """Format a duration: 12.3 s, 3 min 20 s, 1 h 05 min; a dash for None."""
     if seconds is None:
         return _UNKNOWN
-    whole = round(seconds)
-    if whole < 60:
+    rounded = round(seconds)
+    if rounded < 60:
         return f"{seconds:.3g} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    if rounded < 3600:
+        return f"{rounded // 60} min {rounded % 60:02d} s"
+    return f"{rounded // 3600} h {rounded % 3600 // 60:02d} min"
 
 
 def with_error(value: float, error: float) -> str:
-    """A measured value >= 0 and its standard error: 0.0312 ± 0.0004. Where it is not above twice its error: below 0.012."""
+    """Format a measured value >= 0 with its standard error: 0.0312 ± 0.0004. A value within two standard errors of 0: below 0.012."""
     if not (math.isfinite(value) and math.isfinite(error)):
         return number(value)
     if error <= 0:
@@ -59,6 +59,6 @@ def with_error(value: float, error: float) -> str:
 
 
 def phases(seconds: Mapping[str, float]) -> str:
-    """Where time went: "loading 2.1 s, steps 30 s"; phases shorter than 0.05 s are left out, unless they are a hundredth of all."""
+    """Format the seconds of each phase: "loading 2.1 s, steps 30 s". Phases below 0.05 s and below 1 % of the total are omitted."""
     least = min(0.05, 0.01 * sum(seconds.values()))
     return ", ".join(f"{name} {duration(float(f'{spent:.2g}'))}" for name, spent in seconds.items() if spent >= least)

@@ -1,4 +1,4 @@
-"""Pieces of the HTML by which a notebook shows an object: complete in themselves, nothing fetched, no script, every text escaped."""
+"""HTML fragments that display objects in a notebook. They are self-contained, have no scripts, and escape all text."""
 
 from __future__ import annotations
 
@@ -16,47 +16,47 @@ _SHOWN_WIDTH = 180
 
 
 def block(title: str, *parts: str) -> str:
-    """The whole: a heading, and parts that are HTML already."""
+    """Return the HTML of an object: a heading, followed by parts that are already HTML."""
     head = f'<div style="font-weight:600;margin-bottom:.3em">{escape(title)}</div>'
     return f'<div style="font-family:system-ui,sans-serif;font-size:13px;line-height:1.4">{head}{"".join(parts)}</div>'
 
 
 def lines(texts: Sequence[str], prefix: str = "") -> str:
-    """One line of text each."""
+    """Return one line of HTML per text."""
     return "".join(f"<div>{escape(prefix + text)}</div>" for text in texts)
 
 
 def facts(rows: Mapping[str, str]) -> str:
-    """A table of names and values."""
+    """Return an HTML table of names and values."""
     cell = 'style="text-align:left;padding:1px 12px 1px 0;vertical-align:top;background:none;border:none"'
-    found = (
+    cells = (
         f"<tr style='background:none'><th {cell}>{escape(name)}</th><td {cell}>{escape(value)}</td></tr>"
         for name, value in rows.items()
     )
-    return f'<table style="border:none;margin:.3em 0;font-size:inherit">{"".join(found)}</table>'
+    return f'<table style="border:none;margin:.3em 0;font-size:inherit">{"".join(cells)}</table>'
 
 
 def picture_row(shown: Mapping[str, np.ndarray]) -> str:
-    """Pictures side by side, {caption: (H, W, 3) in [0, 1]}; "" for none."""
+    """Return images side by side, from {caption: (H, W, 3) in [0, 1]}; "" for none."""
     if not shown:
         return ""
-    found = []
+    figures = []
     for caption, colours in shown.items():
         height, width = colours.shape[:2]
         sharp = "image-rendering:pixelated;" if max(width, height) < _FEW_PIXELS else ""
         size = f"width:{_SHOWN_WIDTH}px;height:auto;aspect-ratio:{width}/{height}"
-        found.append(
+        figures.append(
             f'<figure style="margin:0;width:{_SHOWN_WIDTH}px"><img src="{pictures.data_uri(colours)}" alt="{escape(caption)}" '
             f'style="{sharp}{size};display:block">'
             f'<figcaption style="opacity:.75;overflow-wrap:anywhere">{escape(caption)}</figcaption></figure>'
         )
-    return f'<div style="display:flex;flex-wrap:wrap;gap:10px;margin:.4em 0">{"".join(found)}</div>'
+    return f'<div style="display:flex;flex-wrap:wrap;gap:10px;margin:.4em 0">{"".join(figures)}</div>'
 
 
 def charts(drawn: Sequence[Chart | None]) -> str:
-    """Charts side by side; those that are None are left out."""
-    found = "".join(_chart(chart) for chart in drawn if chart is not None)
-    return f'<div style="display:flex;flex-wrap:wrap;gap:14px;margin:.4em 0">{found}</div>' if found else ""
+    """Return charts side by side; None entries are skipped."""
+    parts = "".join(_chart(chart) for chart in drawn if chart is not None)
+    return f'<div style="display:flex;flex-wrap:wrap;gap:14px;margin:.4em 0">{parts}</div>' if parts else ""
 
 
 def _chart(chart: Chart) -> str:

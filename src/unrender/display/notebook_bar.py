@@ -1,4 +1,4 @@
-"""A progress bar in a notebook's output: plain HTML that is replaced as things go on, without widgets. Elsewhere, nothing."""
+"""Progress bar in a notebook's output, as plain HTML without widgets. Outside of notebooks it does nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _INTERVAL = 0.2
 
 
 def in_notebook() -> bool:
-    """Whether this code is a cell of a notebook, whose output shows HTML."""
+    """Return whether this code runs in a notebook cell whose output shows HTML."""
     ipython = sys.modules.get("IPython")
     shell: Any = ipython.get_ipython() if ipython is not None else None
     return shell is not None and type(shell).__name__ == "ZMQInteractiveShell"
@@ -23,7 +23,7 @@ def in_notebook() -> bool:
 
 @contextmanager
 def shown() -> Iterator[None]:
-    """Show the phases of what is called within, where this is a notebook and they take time. The bar goes when they are done."""
+    """Display the phases of the calls within this context, if it is in a notebook. The bar disappears at the end."""
     if not in_notebook():
         yield
         return
@@ -36,7 +36,7 @@ def shown() -> Iterator[None]:
 
 
 class NotebookBar:
-    """One bar with a line of text. As a listener to phases it shows the name of the innermost, and how far it is."""
+    """Progress bar with a line of text. As a listener it displays the name and progress of the innermost phase."""
 
     def __init__(self) -> None:
         self._handle: Any = None
@@ -45,27 +45,27 @@ class NotebookBar:
         self._updated = -1.0
 
     def on_phase(self, name: str) -> None:
-        """See `phases.Listener.on_phase`."""
+        """Display the name of a phase that starts."""
         self._within.append(name)
         self.show(name, None, at_once=True)
 
     def on_progress(self, share: float) -> None:
-        """See `phases.Listener.on_progress`."""
+        """Display the progress of the innermost phase."""
         if self._within:
             self.show(self._within[-1], share)
 
     def on_phase_end(self, name: str) -> None:
-        """See `phases.Listener.on_phase_end`."""
+        """Return to the enclosing phase."""
         del name
         self._within.pop()
 
     def show(self, text: str, share: float | None, at_once: bool = False) -> None:
-        """Replace the line of text and the bar; no oftener than five times a second, unless `at_once`.
+        """Replace the line of text and the bar, at most five times per second.
 
         Args:
-            text: what is done.
-            share: how far it is, in [0, 1]; None where that is not known.
-            at_once: however short a time ago the last one was shown.
+            text: description of the activity.
+            share: progress in [0, 1]; None if unknown.
+            at_once: whether to ignore the time limit.
         """
         now = time.perf_counter()
         if not at_once and now - self._updated < _INTERVAL:
@@ -75,7 +75,7 @@ class NotebookBar:
         self._put(f'<progress max="1"{value} style="width:160px;vertical-align:middle"></progress> {escape(text)}')
 
     def close(self, text: str = "") -> None:
-        """Leave this line of text in place of the bar, or nothing."""
+        """Replace the bar by this line of text, or by nothing."""
         if self._handle is not None or text:
             self._put(escape(text))
 

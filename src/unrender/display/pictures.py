@@ -1,4 +1,4 @@
-"""Arrays as PNG pictures that a browser shows, within the text of a page."""
+"""Arrays as PNG images embedded in a page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from unrender.losses.metrics import exposure, srgb
 
 
 def png(colours: np.ndarray, effort: int = 6) -> bytes:
-    """(H, W, 3) in [0, 1], as they are to be seen, as a PNG file; `effort` of compression, 0 to 9."""
+    """Encode a display image (H, W, 3) in [0, 1] as a PNG file; `effort` is the compression level, 0 to 9."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -21,21 +21,21 @@ def png(colours: np.ndarray, effort: int = 6) -> bytes:
 
 
 def data_uri(colours: np.ndarray) -> str:
-    """(H, W, 3) in [0, 1] as the `src` of an image."""
+    """Return a display image (H, W, 3) in [0, 1] as the `src` of an HTML image."""
     return f"data:image/png;base64,{base64.b64encode(png(colours)).decode('ascii')}"
 
 
 def shown_image(linear: np.ndarray, like: np.ndarray | None = None, largest: int = 320) -> np.ndarray:
-    """Linear RGB (H, W, 3) in sRGB, as bright as suits `like` (by default itself), its sides at most `largest`: values in [0, 1]."""
+    """Convert linear RGB (H, W, 3) to sRGB in [0, 1] at the exposure of `like` (default: itself), with sides of at most `largest`."""
     factor = exposure(np.asarray(linear if like is None else like)[..., :3])
     with np.errstate(over="ignore", invalid="ignore"):
         return srgb(reduced(np.asarray(linear)[..., :3], largest) * factor)
 
 
 def shown_map(values: np.ndarray, like: np.ndarray | None = None, largest: int = 320) -> np.ndarray | None:
-    """A texture or the middle slice of a volume, as colours (H, W, 3) in [0, 1]; None for a parameter that is no picture.
+    """Convert a texture, or the middle slice of a volume, to colours (H, W, 3) in [0, 1]; None if the parameter is not an image.
 
-    One channel is grey over the range of `like` (by default its own); three are sRGB, exposed only where values pass 1.
+    One channel is grey over the range of `like` (default: its own). Three channels are sRGB, scaled down if values exceed 1.
     """
     picture = plane(np.asarray(values))
     if picture is None:
@@ -56,7 +56,7 @@ _VALUES_IN_A_TABLE = 16
 
 
 def is_map(array: np.ndarray) -> bool:
-    """Whether a parameter is shown as a picture: textures (H, W), (H, W, 1 | 3 | 4), volumes (Z, Y, X, 1 | 3 | 4)."""
+    """Return whether a parameter is displayed as an image: textures (H, W), (H, W, 1 | 3 | 4), volumes (Z, Y, X, 1 | 3 | 4)."""
     if array.size == 0:
         return False
     if array.ndim == 2:
@@ -65,21 +65,21 @@ def is_map(array: np.ndarray) -> bool:
 
 
 def plane(array: np.ndarray) -> np.ndarray | None:
-    """(H, W, C) of a map: the texture itself or a volume's first middle slice; None for what is no map."""
+    """Return a texture, or the first middle slice of a volume, (H, W, C); None for other parameters."""
     return next(iter(planes(array).values()), None)
 
 
 def planes(array: np.ndarray | None) -> dict[str, np.ndarray]:
-    """{label: (H, W, C)}: the texture itself, or a volume's middle slices along its axes."""
+    """Return {label: (H, W, C)}: the texture itself, or the middle slices of a volume along its axes."""
     if array is None or not is_map(array):
         return {}
     if array.ndim == 2:
         return {"": array[..., None]}
     if array.ndim == 3:
         return {"": array}
-    found = {}
+    slices = {}
     for axis, name in enumerate("zyx"):
         plane = np.take(array, array.shape[axis] // 2, axis=axis)
         if min(plane.shape[:2]) > 1:
-            found[f"middle slice along {name}"] = plane
-    return found or {"slice": array.reshape(-1, *array.shape[2:])}
+            slices[f"middle slice along {name}"] = plane
+    return slices or {"slice": array.reshape(-1, *array.shape[2:])}

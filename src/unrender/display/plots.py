@@ -1,4 +1,4 @@
-"""Line charts as SVG within the page: the geometry is made here, the picture and the colours are the template's."""
+"""Geometry of line charts, which a page draws as SVG."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from unrender.display import formatting
 
 AXES = ("seconds", "samples")
-"""Horizontal axes."""
+"""Possible horizontal axes."""
 WIDTH, HEIGHT = 420, 270
 LEFT, RIGHT, TOP, BOTTOM = 54, 14, 10, 40
 _LOGARITHMIC_FROM = 4.0
@@ -21,13 +21,13 @@ _LARGEST = 1e280
 
 @dataclass(frozen=True)
 class Line:
-    """One curve; x ascending, all arrays of one length.
+    """A curve; x is ascending, and all arrays have the same length.
 
     Attributes:
-        name: for the legend.
-        x, y: the curve.
-        low, high: the band around it, or None.
-        colour: which colour of the page, from 0.
+        name: name in the legend.
+        x, y: points of the curve.
+        low, high: limits of the band around it, or None.
+        colour: index into the page's colours, from 0.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Axis:
-    """A mapping of values to [0, 1], linear or logarithmic, and its ticks."""
+    """A map from values to [0, 1], linear or logarithmic, with ticks."""
 
     low: float
     high: float
@@ -48,7 +48,7 @@ class Axis:
     ticks: tuple[tuple[float, str], ...]
 
     def position(self, values: np.ndarray) -> np.ndarray:
-        """Positions in [0, 1]; values beyond the ends are clipped."""
+        """Return positions in [0, 1]; values beyond the ends are clipped."""
         low, high = self.low, self.high
         if self.logarithmic:
             values, low, high = np.log(np.maximum(values, low)), math.log(low), math.log(high)
@@ -57,7 +57,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class Curve:
-    """A line in the chart's own coordinates."""
+    """A line in the chart's coordinates, as SVG paths."""
 
     name: str
     path: str
@@ -67,15 +67,15 @@ class Curve:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart as the template draws it.
+    """A chart for the page's template.
 
     Attributes:
-        title, x_label: words.
-        description: the text alternative.
-        curves: in picture order.
+        title, x_label: labels of the axes.
+        description: text alternative.
+        curves: curves in drawing order.
         x_ticks, y_ticks: (coordinate, label).
-        logarithmic: of the vertical axis.
-        more: how many lines were left out.
+        logarithmic: whether the vertical axis is logarithmic.
+        more: number of omitted lines.
     """
 
     title: str
@@ -94,32 +94,32 @@ class Chart:
 
 
 def axis_format(axis: str) -> tuple[str, Callable[[float], str]]:
-    """The label of the axis "seconds" or "samples", and the formatter of its values."""
+    """Return the label of the axis "seconds" or "samples", and the formatter of its values."""
     return ("Seconds", formatting.number) if axis == "seconds" else ("Samples (paths)", formatting.count)
 
 
 def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | None:
-    """A chart of at most six lines, or None where there is nothing to draw.
+    """Return a chart of at most six lines, or None if there is nothing to draw.
 
     Args:
-        title: of the vertical axis.
-        lines: parts that are not finite leave a gap.
-        axis: the horizontal one, "seconds" or "samples", from 0.
-        end: where it ends.
+        title: label of the vertical axis.
+        lines: curves; values that are not finite leave a gap.
+        axis: horizontal axis, "seconds" or "samples", from 0.
+        end: end of the horizontal axis.
     """
     x_label, format_value = axis_format(axis)
-    drawn = [line for line in lines if np.isfinite(line.y).any()]
-    more, drawn = max(0, len(drawn) - _COLOURS), drawn[:_COLOURS]
-    if not drawn:
+    shown = [line for line in lines if np.isfinite(line.y).any()]
+    more, shown = max(0, len(shown) - _COLOURS), shown[:_COLOURS]
+    if not shown:
         return None
     end = end if end > 0 else 1.0
     x_axis = Axis(0.0, end, False, _even_ticks(0.0, end, 5, format_value))
-    y_axis = _vertical(drawn)
+    y_axis = _vertical(shown)
     return Chart(
         title,
         x_label,
-        "; ".join(f"{line.name}: from {_end(line, 0)} to {_end(line, -1)}" for line in drawn),
-        tuple(_curve(line, x_axis, y_axis) for line in drawn),
+        "; ".join(f"{line.name}: from {_end(line, 0)} to {_end(line, -1)}" for line in shown),
+        tuple(_curve(line, x_axis, y_axis) for line in shown),
         tuple((float(_to_x(x_axis, np.array([v]))[0]), label) for v, label in x_axis.ticks),
         tuple((float(_to_y(y_axis, np.array([v]))[0]), label) for v, label in y_axis.ticks),
         y_axis.logarithmic,
@@ -128,17 +128,17 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
 
 
 def is_logarithmic(values: np.ndarray) -> bool:
-    """Whether these values, all finite, are better seen on a logarithmic axis."""
+    """Return whether these values, all finite, suit a logarithmic axis: they are positive and span at least a factor of four."""
     return bool(values.size and values.min() > 0 and values.max() / values.min() >= _LOGARITHMIC_FROM)
 
 
 def _vertical(lines: Sequence[Line]) -> Axis:
     parts = [line.y for line in lines] + [b for line in lines for b in (line.low, line.high) if b is not None]
-    # Beyond what doubles hold with a margin, marks on the axis would overflow.
+    # Values near the largest double would overflow in the computation of ticks.
     values = np.clip(np.concatenate([part[np.isfinite(part)] for part in parts]), -_LARGEST, _LARGEST)
     middle = np.clip(np.concatenate([line.y[np.isfinite(line.y)] for line in lines]), -_LARGEST, _LARGEST)
     if is_logarithmic(middle):
-        # A band that touches zero must not stretch the axis without end.
+        # A band that touches zero must not stretch the logarithmic axis indefinitely.
         low, high = max(values[values > 0].min(), middle.min() / 10), values.max()
         low, high = low / (high / low) ** 0.04, high * (high / low) ** 0.04
         return Axis(low, high, True, _logarithmic_ticks(low, high))
@@ -190,7 +190,7 @@ def _curve(line: Line, x_axis: Axis, y_axis: Axis) -> Curve:
 
 
 def _path(line: Line, x_axis: Axis, y_axis: Axis) -> str:
-    """Pieces of consecutive finite points; one point alone becomes a dot (a line of no length with a round cap)."""
+    """Return the SVG path: pieces of consecutive finite points. A single point becomes a dot, a line of length zero with a round cap."""
     finite = np.isfinite(line.y)
     across, down = _to_x(x_axis, line.x), _to_y(y_axis, np.where(finite, line.y, 1.0))
     pieces: list[list[str]] = [[]]

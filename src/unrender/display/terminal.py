@@ -1,4 +1,4 @@
-"""What is printed: text of others reaches the terminal without the characters that a terminal obeys."""
+"""Terminal output, in which control characters of untrusted text are escaped."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _KEPT = "\n\t"
 
 
 class Console(console.Console):
-    """Rich's console, with every control character of a text written as an escape.
+    """Rich's console with control characters in texts escaped.
 
-    Names of files, scenes and parameters, notices and warnings may hold any character; rich lets ESC and the C1 controls through. Its own
-    commands, such as those that redraw a progress bar, are apart from text and stay.
+    Names of files, scenes and parameters, notices and warnings may contain any character, and rich passes ESC and the C1 controls
+    through. Rich's own control sequences, which redraw a progress bar for example, are separate from text and not affected.
     """
 
     def render(
         self, renderable: console.RenderableType, options: console.ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """See `rich.console.Console.render`, through which all goes that is printed."""
+        """Escape control characters in the segments that rich renders."""
         for segment in super().render(renderable, options):
             if segment.control or segment.text.isprintable():
                 yield segment

@@ -1,4 +1,4 @@
-"""Files: written atomically, read with bounds."""
+"""Files: atomic writing, and reading within limits."""
 
 from typing import TYPE_CHECKING
 

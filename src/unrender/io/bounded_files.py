@@ -1,9 +1,8 @@
-"""Reading files that anybody may have made: bounded in size and nesting, or refused in one line.
+"""Reading of untrusted files within limits on size and nesting.
 
-A run folder travels: it is mailed, unpacked, served. So do problem files and arrays. What is read here is held to be hostile until it is
-shown to be plain: regular files (within their folder, where one is given), text and JSON of bounded size and depth, archives of numbers
-whose headers agree with their length. Nothing is executed, unpickled or unpacked to a file. All functions raise `InputError`, one line
-that begins with the path.
+Run folders, problem files and arrays are mailed, unpacked and served, so this module treats them as hostile. It accepts regular files
+(within a given folder), text and JSON of limited size and depth, and archives of numbers whose headers agree with their length. Nothing
+is executed, unpickled or unpacked to a file. All functions raise `InputError` with a one-line message that begins with the path.
 """
 
 from __future__ import annotations
@@ -28,24 +27,24 @@ from unrender.io import files
 from unrender.io.npy_format import MalformedHeader, Shape, read_npy
 
 LARGEST_TEXT = 1 << 28
-"""Of a text file, in bytes."""
+"""Largest text file in bytes."""
 LARGEST_JSON = 16 << 20
-"""Of a JSON file of a run folder, in bytes."""
+"""Largest JSON file of a run folder in bytes."""
 LARGEST_ARRAY = 1 << 30
-"""Of one array of a run folder as it lies in memory, in bytes."""
+"""Largest array of a run folder in bytes, unpacked."""
 LARGEST_ARCHIVE = 8 << 30
-"""Of all arrays of an archive of a run folder together, unpacked, in bytes."""
+"""Largest total of the arrays of a run folder's archive in bytes, unpacked."""
 LARGEST_GIVEN = 1 << 32
-"""Of arrays that a user gives as the input of a problem, in bytes."""
+"""Largest total of the arrays of a problem's input file in bytes."""
 DEEPEST = 32
-"""Nesting of JSON."""
+"""Largest nesting depth of JSON."""
 MOST_VALUES = 200_000
-"""Values of JSON text: reading a million names takes seconds."""
+"""Largest number of values of a JSON text: a million names take seconds to read."""
 
 _MEMBERS = 10_000
-_MOST_BESIDE = 1000  # names of a folder that a missing one is compared with
-_BYTES_PER_BYTE = 100  # unpacked for one in the file: zeros give a thousand
-_LARGEST_DIRECTORY = 1 << 20  # of an archive, in bytes: its members' names among them
+_MOST_BESIDE = 1000  # names in a folder to which a missing name is compared
+_BYTES_PER_BYTE = 100  # largest compression ratio; zeros reach a thousand
+_LARGEST_DIRECTORY = 1 << 20  # largest directory of an archive in bytes, which contains its members' names
 _UNREADABLE = (
     OSError,
     ValueError,
@@ -60,23 +59,23 @@ _UNREADABLE = (
 _COMPRESSIONS = (
     zipfile.ZIP_STORED,
     zipfile.ZIP_DEFLATED,
-)  # what NumPy writes; others may take more memory than they say
+)  # the methods that NumPy writes; others may use more memory than they declare
 
 
 def exists(path: Path) -> bool:
-    """Whether there is anything of this name, be it a link that leads nowhere."""
+    """Return whether anything has this name, including a broken link."""
     return os.path.lexists(path)
 
 
 def kind(path: Path) -> str:
-    """What is at `path`, links followed: "file", "folder", "other" (a pipe, a socket, a device), or "" for nothing.
+    """Return the kind of `path`, links followed: "file", "folder", "other" (a pipe, a socket, a device), or "" if it does not exist.
 
     Raises:
-        InputError: the name is too long, or a folder on the way cannot be entered.
+        InputError: the name is too long, or a parent folder cannot be entered.
     """
     try:
         mode = path.stat().st_mode
-    except (FileNotFoundError, NotADirectoryError, ValueError):  # the last for a name with a zero byte
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a name with a zero byte
         return ""
     except OSError as error:
         raise InputError(f"{shorten(str(path), 300)}: cannot be read: {error.strerror or error}") from error
@@ -84,14 +83,14 @@ def kind(path: Path) -> str:
 
 
 def no_file(path: Path) -> str:
-    """Why a path is no regular file, in words: what is there instead, or the nearest name beside it."""
+    """Return why a path is not a regular file, as a phrase: what it is instead, or a similar name in the folder."""
     try:
         if path.exists():
             return "not a file"
         beside = [
-            visible(found.name) for found in itertools.islice(path.parent.iterdir(), _MOST_BESIDE) if found.is_file()
+            visible(entry.name) for entry in itertools.islice(path.parent.iterdir(), _MOST_BESIDE) if entry.is_file()
         ]
-    except (OSError, ValueError):  # the latter of a zero byte in a name
+    except (OSError, ValueError):  # ValueError: a name with a zero byte
         beside = []
     return f"no such file{did_you_mean(path.name, beside)}"
 
@@ -103,19 +102,21 @@ def open_regular(path: Path, folder: Path | None = None) -> IO[bytes]:
     """Open a regular file, links followed.
 
     Args:
-        path: the file.
-        folder: where the file must lie; None for anywhere.
+        path: path of the file.
+        folder: folder that must contain it; None for any.
 
     Raises:
-        InputError: it is missing, lies outside `folder` (a link out of it), or is no regular file (a pipe would wait for ever).
+        InputError: it is missing, is outside of `folder` (by a link), or is not a regular file (reading a pipe would block).
     """
     try:
         real = path.resolve(strict=True)
         if folder is not None and not real.is_relative_to(folder.resolve(strict=True)):
             raise InputError(f"{path}: leads out of the folder, expected a file within it")
-        if not stat.S_ISREG(mode := real.stat().st_mode):  # before it is opened: a device may act on that
+        if not stat.S_ISREG(
+            mode := real.stat().st_mode
+        ):  # checked before opening, because opening may trigger a device
             raise InputError(f"{path}: {_not_regular(mode)}")
-        # Without waiting for a pipe's other end, and without following a link that took the file's place meanwhile.
+        # O_NONBLOCK avoids blocking on a pipe; O_NOFOLLOW rejects a link that has replaced the file since the check.
         descriptor = os.open(real, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0))
     except FileNotFoundError as error:
         raise InputError(f"{path}: {no_file(path)}") from error
@@ -135,7 +136,7 @@ def _not_regular(mode: int) -> str:
 
 
 def read_bytes(path: Path, largest: int, folder: Path | None = None) -> bytes:
-    """The bytes of a regular file of at most `largest` bytes; see `open_regular`."""
+    """Return the bytes of a regular file of at most `largest` bytes; see `open_regular`."""
     try:
         with open_regular(path, folder) as file:
             data = file.read(largest + 1)
@@ -154,7 +155,7 @@ def read_bytes(path: Path, largest: int, folder: Path | None = None) -> bytes:
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT, folder: Path | None = None) -> str:
-    """The text of a UTF-8 file of at most `largest` bytes, without a byte order mark; see `open_regular`."""
+    """Return the text of a UTF-8 file of at most `largest` bytes, without a byte order mark; see `open_regular`."""
     try:
         return read_bytes(path, largest, folder).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -165,9 +166,9 @@ def read_text(path: Path, largest: int = LARGEST_TEXT, folder: Path | None = Non
 
 
 def parse_json(source: str | bytes, where: str) -> Any:
-    """The value of JSON text.
+    """Parse JSON text.
 
-    Raises `InputError` for malformed text, too deep nesting, more than `MOST_VALUES` values, or a name given twice in one object.
+    Raises `InputError` for malformed text, too deep nesting, more than `MOST_VALUES` values, or a duplicate name in an object.
     """
     commas = source.count(b",") if isinstance(source, bytes) else source.count(",")
     if commas > MOST_VALUES:
@@ -184,28 +185,28 @@ def parse_json(source: str | bytes, where: str) -> Any:
 
 
 def parse_object(source: str | bytes, where: str) -> dict[str, Any]:
-    """A JSON object of valid Unicode, nested at most `DEEPEST` deep. Raises `InputError` that begins with `where`."""
-    found = parse_json(source, where)
-    if not isinstance(found, dict):
-        raise InputError(f"{where}: expected an object {{...}}, got {type(found).__name__}")
-    _check_plain(found, where)
-    return found
+    """Parse a JSON object of valid Unicode with at most `DEEPEST` levels. Raises `InputError` that begins with `where`."""
+    value = parse_json(source, where)
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: expected an object {{...}}, got {type(value).__name__}")
+    _check_plain(value, where)
+    return value
 
 
 def read_object(path: Path, folder: Path) -> dict[str, Any]:
-    """The JSON object in a file of a run folder, of at most `LARGEST_JSON` bytes."""
+    """Read the JSON object of a file in a run folder, of at most `LARGEST_JSON` bytes."""
     return parse_object(read_text(path, LARGEST_JSON, folder), str(path))
 
 
 def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    value = dict(pairs)
+    if len(value) != len(pairs):
         seen: set[str] = set()
         for name, _ in pairs:
             if name in seen:
                 raise ValueError(f"{printable(name)!r} is given twice")
             seen.add(name)
-    return found
+    return value
 
 
 def _check_plain(value: Any, where: str, depth: int = 0) -> None:
@@ -229,10 +230,10 @@ def _check_plain(value: Any, where: str, depth: int = 0) -> None:
 
 
 def read_float_arrays(path: Path, folder: Path) -> dict[str, np.ndarray]:
-    """The arrays of an .npz file of a run folder, as float32 where they are stored so or in less, else as float64."""
-    found = read_arrays(path, LARGEST_ARCHIVE, folder=folder, largest=LARGEST_ARRAY)
+    """Read the arrays of an .npz file in a run folder: float32 if stored as float32 or narrower, else float64."""
+    arrays = read_arrays(path, LARGEST_ARCHIVE, folder=folder, largest=LARGEST_ARRAY)
     with np.errstate(over="ignore"):
-        return {name: array.astype(_float_type(array.dtype)) for name, array in found.items()}
+        return {name: array.astype(_float_type(array.dtype)) for name, array in arrays.items()}
 
 
 def read_arrays(
@@ -243,21 +244,21 @@ def read_arrays(
     folder: Path | None = None,
     largest: int | None = None,
 ) -> dict[str, np.ndarray]:
-    """The arrays of an .npz archive: real numbers of any type, as stored.
+    """Read the arrays of an .npz archive: real numbers of any type, as stored.
 
-    Sizes are checked before memory is taken for them.
+    Sizes are checked before memory is allocated.
 
     Args:
-        path: the archive.
-        most_bytes: of all arrays together.
-        check: called with each array's shape before memory is taken for it; raises `InputError` for one that does not suit.
+        path: path of the archive.
+        most_bytes: largest total size of the arrays.
+        check: function of each array's shape, called before memory is allocated; raises `InputError` for an unsuitable one.
         one: whether there must be exactly one array.
-        folder: where the file must lie; None for anywhere.
-        largest: bytes of one array; None for `most_bytes`.
+        folder: folder that must contain the file; None for any.
+        largest: largest size of one array in bytes; None for `most_bytes`.
 
     Raises:
-        InputError: there is none that can be read, an array is not of real numbers or does not have the size that its header
-            declares, a name is given twice or leads out of the archive, or the arrays are too large.
+        InputError: the archive is missing or unreadable, an array is not real or its size differs from its header, a name is a duplicate
+            or points outside of the archive, or the arrays are too large.
     """
     if not exists(path):
         raise InputError(f"{path}: the file is missing")
@@ -276,14 +277,14 @@ def read_arrays(
                 what = f"its arrays have {unpacked} bytes in {packed}"
                 raise InputError(f"{path}: {what}; if that is right, save them without compression")
             _check_members(members, path)
-            found: dict[str, np.ndarray] = {}
+            arrays: dict[str, np.ndarray] = {}
             for member in members:
                 key = member.filename.removesuffix(".npy")
                 name = printable(key)
                 with archive.open(member) as packed:
                     where = f"{path}: {name}"
-                    found[key] = read_npy(packed, member.file_size, where, check, largest or most_bytes)
-            return found
+                    arrays[key] = read_npy(packed, member.file_size, where, check, largest or most_bytes)
+            return arrays
     except InputError:
         raise
     except MemoryError as error:
@@ -294,7 +295,7 @@ def read_arrays(
 
 
 def read_array(path: Path, most_bytes: int = LARGEST_GIVEN, check: Callable[[Shape], None] | None = None) -> np.ndarray:
-    """The array of real numbers in an .npy file; see `read_arrays`."""
+    """Read the array of real numbers of an .npy file; see `read_arrays`."""
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
@@ -313,9 +314,9 @@ def _reason(error: Exception) -> str:
 
 @dataclass
 class _BoundedReads:
-    """A file of which at most so many bytes are read at once; None for any number.
+    """A file that limits the size of single reads; None for no limit.
 
-    `zipfile` reads the whole directory of an archive before it tells how many members there are.
+    `zipfile` reads the entire directory of an archive before it reports the number of members.
     """
 
     file: IO[bytes]
@@ -323,7 +324,7 @@ class _BoundedReads:
     most: int | None = _LARGEST_DIRECTORY
 
     def read(self, size: int = -1) -> bytes:
-        """As a file's."""
+        """Read at most `size` bytes. Raises `InputError` if more than the limit would be read."""
         if self.most is None or 0 <= size <= self.most:
             return self.file.read(size)
         data = self.file.read(self.most + 1)
@@ -332,15 +333,15 @@ class _BoundedReads:
         return data
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """As a file's."""
+        """Set the position, as a file does."""
         return self.file.seek(offset, whence)
 
     def tell(self) -> int:
-        """As a file's."""
+        """Return the position, as a file does."""
         return self.file.tell()
 
     def seekable(self) -> bool:
-        """As a file's."""
+        """Return True."""
         return True
 
 
@@ -352,7 +353,7 @@ def _open_archive(file: IO[bytes], path: Path) -> zipfile.ZipFile:
 
 
 def _check_members(members: list[zipfile.ZipInfo], path: Path) -> None:
-    """Refuse names that lead out of the archive or are given twice, and compressions that NumPy does not write."""
+    """Reject names that point outside of the archive or are duplicates, and compression methods that NumPy does not write."""
     seen: set[str] = set()
     for member in members:
         name, key = member.filename, member.filename.removesuffix(".npy")

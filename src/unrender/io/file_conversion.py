@@ -1,4 +1,4 @@
-"""How a renderer converts what a file or an array holds to the values of one of its parameters."""
+"""Conversion from the contents of a file or an array to the values of a renderer's parameter."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 from unrender.core import periodic
 
 MESH_FILES = (".obj", ".ply", ".serialized")
-"""File name endings of meshes."""
+"""File name extensions of meshes."""
 
 
 @dataclass(frozen=True)
 class FileConversion:
-    """The conversion that the renderer applies when it loads such a parameter from a file of the scene.
+    """Conversion that the renderer applies to this parameter when it loads it from a file of the scene.
 
     Attributes:
-        raw: whether 8- and 16-bit pictures hold linear values; otherwise they are sRGB.
+        raw: whether 8- and 16-bit images are linear; otherwise they are sRGB.
         half: whether the renderer stores values in half precision.
-        repeated: number of columns at each end of the second axis that repeat columns of the opposite end, as environment maps of
-            Mitsuba have one. The parameter has the shape (H, W + 2 `repeated`, C), and its pictures (H, W).
-        vertices: returns the parameter's values from a mesh file as a flat float32 array; None where no mesh holds them.
+        repeated: number of columns at each end of the second axis that repeat those of the opposite end; Mitsuba's environment maps have
+            one. The parameter has the shape (H, W + 2 `repeated`, C), and its images have (H, W).
+        vertices: function that returns the parameter's values from a mesh file as a flat float32 array; None for other parameters.
     """
 
     raw: bool = False
@@ -32,11 +32,11 @@ class FileConversion:
     vertices: Callable[[Path], np.ndarray] | None = field(default=None, compare=False, repr=False)
 
     def picture_shape(self, shape: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the shape of a picture that fills a parameter of this shape without being scaled."""
+        """Return the size of an image that fills a parameter of this shape without scaling."""
         return periodic.interior_shape(shape, self.repeated)
 
     def stored(self, values: np.ndarray) -> np.ndarray:
-        """Return float32 values as the renderer stores them: rounded to its precision."""
+        """Return float32 values rounded to the renderer's precision."""
         if not self.half:
             return values
         with np.errstate(over="ignore"):
@@ -45,4 +45,4 @@ class FileConversion:
 
 
 PLAIN = FileConversion()
-"""Values are stored as they are."""
+"""Conversion that stores values unchanged."""

@@ -1,8 +1,8 @@
-"""Writing files and folders so that none is ever seen half-written, and none is lost once it was written.
+"""Atomic and durable writing of files and folders.
 
-After a power cut only that remains whose bytes, and whose name in its folder, were flushed to the disk (`fsync`): a file that was written
-and renamed without it may be empty. So whatever is to last goes through `write`, `make_folder` and `replace_folder`. Reading is in
-`bounded_files`.
+A power cut preserves only what was flushed to the disk (`fsync`): a file's bytes, and its name in the folder. A file that was written and
+renamed without flushing may be empty afterwards. So everything that must last is written by `write`, `make_folder` and `replace_folder`.
+Reading is in `bounded_files`.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from unrender.core.text import printable
 _T = TypeVar("_T")
 
 PARTIAL, RETIRED = "part", "old"
-"""Ends of the names of what is being written, and of what is being removed."""
+"""Suffixes of the names of files that are being written or removed."""
 _TEMPORARY = re.compile(rf"\.?(.+)\.(\d{{1,10}})\.({PARTIAL}|{RETIRED})")
 _NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EROFS)
 _AT_FDCWD, _EXCHANGE, _SWAP = -100, 2, 2
 _NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EPERM)
 
 COMPRESSED_BYTES = 1 << 26
-"""Arrays of more bytes together are stored as they are: readers refuse a small file that unpacks to a large one."""
+"""Total size from which arrays are stored without compression, because readers reject a small file that unpacks to a large one."""
 _HEADERS = 1 << 20
 
 
@@ -45,19 +45,19 @@ _HEADERS = 1 << 20
 
 
 def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) -> Path:
-    """Write `data` beside `path` and rename it into place, making the folder where it is missing. Returns `path`.
+    """Write `data` to a temporary file next to `path` and rename it. Creates the folder if necessary. Returns `path`.
 
-    What processes that died while they wrote it have left is removed where the file is `durable`.
+    If `durable`, leftovers of processes that died while writing the file are removed first.
 
     Args:
-        path: where.
-        data: what the file is to hold.
-        durable: whether its bytes are on the disk before it gets its name. False is for what nobody misses after a power cut.
-        name_too: whether its name is on the disk, too, when this returns. False is for several files of one folder, which `sync_folder`
-            then does for all; until then a power cut may leave what stood there before.
+        path: path of the file.
+        data: content of the file.
+        durable: whether the bytes are flushed to the disk before the file is renamed. False suits files that may be lost in a power cut.
+        name_too: whether the name is also flushed before this returns. False suits several files of one folder, which one call of
+            `sync_folder` flushes together; until then a power cut may restore the previous file.
 
     Raises:
-        InputError: the place cannot be written to; what stood there before is then untouched.
+        InputError: the file cannot be written; a previous file is then unchanged.
     """
     partial = temporary(path)
     try:
@@ -81,14 +81,14 @@ def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) 
 
 
 def check_member(name: str, where: str) -> None:
-    """Raise `InputError` for the name of an array that no archive can hold, or that readers refuse: one that leads out of it."""
+    """Raise `InputError` for an array name that an archive cannot contain, or that readers reject because it points outside."""
     if member_leads_out(name):
         raise InputError(f"{where} {printable(name)}: a name that leads out of an archive; rename the object")
     encode_text(name, f"{where} {printable(name)}")
 
 
 def member_leads_out(name: str) -> bool:
-    """Whether the name of an array in an archive could be that of a file elsewhere."""
+    """Return whether the name of an array in an archive could refer to a file outside of it."""
     return name.startswith(("/", "\\")) or ".." in name.replace("\\", "/").split("/") or "\0" in name
 
 
@@ -97,12 +97,12 @@ def write_arrays(
 ) -> Path:
     """Write an .npz archive of float32 arrays; see `write`.
 
-    With `compress`, archives of at most `COMPRESSED_BYTES` are compressed.
+    With `compress`, archives of less than `COMPRESSED_BYTES` are compressed.
     """
     buffer = io.BytesIO()
     values = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
     small = sum(value.nbytes for value in values.values()) < COMPRESSED_BYTES - _HEADERS
-    # Not by `numpy.savez`, which takes the name "file" for an argument of its own.
+    # `numpy.savez` cannot store an array named "file", which is one of its arguments.
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED if compress and small else zipfile.ZIP_STORED) as archive:
         for key, value in values.items():
             with archive.open(f"{key}.npy", "w", force_zip64=True) as member:
@@ -111,15 +111,15 @@ def write_arrays(
 
 
 def temporary(path: Path, end: str = PARTIAL) -> Path:
-    """The name beside `path` under which this process writes it; see `remove_leftovers`."""
+    """Return the temporary name next to `path` under which this process writes it; see `remove_leftovers`."""
     return path.with_name(f"{path.name}.{os.getpid()}.{end}")
 
 
 def flush(descriptor: int) -> None:
-    """Have a file's bytes on the disk before this returns. Raises `OSError`."""
-    full = getattr(fcntl, "F_FULLFSYNC", None)  # macOS: fsync alone leaves them in the drive's cache
+    """Flush a file's bytes to the disk. Raises `OSError`."""
+    full = getattr(fcntl, "F_FULLFSYNC", None)  # on macOS, fsync alone leaves the bytes in the drive's cache
     if full is not None:
-        with contextlib.suppress(OSError):  # a file system without it
+        with contextlib.suppress(OSError):  # the file system does not support it
             fcntl.fcntl(descriptor, full)
             return
     os.fsync(descriptor)
@@ -129,7 +129,7 @@ def flush(descriptor: int) -> None:
 
 
 def make_folder(folder: Path, durable: bool = True) -> None:
-    """Make a folder, and those above it that are missing, on the disk unless `durable` is false. Raises `OSError`."""
+    """Create a folder and its missing parents, and flush them to the disk if `durable`. Raises `OSError`."""
     missing = [] if folder.is_dir() else [folder]
     while missing and not os.path.lexists(missing[-1].parent):
         missing.append(missing[-1].parent)
@@ -140,7 +140,7 @@ def make_folder(folder: Path, durable: bool = True) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk before this returns, where the file system can. Raises `OSError`."""
+    """Flush the names in a folder to the disk, if the file system supports it. Raises `OSError`."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         flush(descriptor)
@@ -152,7 +152,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_tree(folder: Path) -> None:
-    """Have all files of a folder, and of those in it, on the disk before this returns. Raises `OSError`."""
+    """Flush all files of a folder and its subfolders to the disk. Raises `OSError`."""
     for place, _, names in os.walk(folder, topdown=False):
         for name in names:
             descriptor = os.open(Path(place, name), os.O_RDONLY | os.O_NOFOLLOW)
@@ -164,10 +164,10 @@ def sync_tree(folder: Path) -> None:
 
 
 def replace_folder(new: Path, place: Path) -> None:
-    """Put the folder `new`, which lies beside `place`, there, in place of a folder that is there now. Raises `OSError`.
+    """Move the folder `new` to `place` in the same parent, and replace an existing folder. Raises `OSError`.
 
-    At every instant one of the two is at `place`, where the system can exchange two names. Where it cannot, there is an instant
-    without; `remove_leftovers`, by the next process that writes there, then puts the old one back.
+    If the system can exchange two names, one of the two folders is at `place` at every instant. Otherwise there is an instant with
+    neither; after a crash at that point, `remove_leftovers` of the next writer restores the old folder.
     """
     sync_tree(new)
     old = place.with_name(f".{place.name}.{os.getpid()}.{RETIRED}")
@@ -184,7 +184,7 @@ def replace_folder(new: Path, place: Path) -> None:
 
 
 def _exchange(one: Path, other: Path) -> bool:
-    """Exchange the names of two folders in one instant; False where this system cannot. Raises `OSError`."""
+    """Exchange the names of two folders atomically; False if this system does not support it. Raises `OSError`."""
     names = os.fsencode(one), os.fsencode(other)
     try:
         library = ctypes.CDLL(None, use_errno=True)
@@ -206,58 +206,58 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 def check_replaceable(place: Path, own: Collection[str], record: str, overwrite: bool, label: str, what: str) -> None:
-    """Raise `InputError` where a folder to be written by `write_folder` would replace what is not its own.
+    """Raise `InputError` if `write_folder` would replace a folder that contains other files.
 
-    Leftovers of a process that died while it wrote there are removed first.
+    Leftovers of a process that died while writing it are removed first.
 
     Args:
-        place: where the folder is to stand; it need not exist.
-        own: names that such a folder may hold.
-        record: that of `own` which tells such a folder from others.
-        overwrite: whether an earlier one may be replaced.
-        label: before the colon of the message, e.g. "--out judge".
-        what: such a folder, e.g. "an earlier judgement".
+        place: path of the folder, which need not exist.
+        own: names that such a folder may contain.
+        record: the one of `own` that identifies such a folder.
+        overwrite: whether an existing one may be replaced.
+        label: beginning of the message, e.g. "--out judge".
+        what: description of such a folder, e.g. "an earlier judgement".
     """
     remove_leftovers(place.parent, (place.name,))
     try:
         if place.exists() and not place.is_dir():
             raise InputError(f"{label}: a file, expected a folder")
-        found = {path.name for path in place.iterdir()} if place.is_dir() else set()
+        present = {path.name for path in place.iterdir()} if place.is_dir() else set()
     except OSError as error:
         raise InputError(f"{label}: {error.strerror or error}") from error
-    if found and (record not in found or not found <= set(own)):
+    if present and (record not in present or not present <= set(own)):
         raise InputError(f"{label}: the folder holds other things; give a new one")
-    if found and not overwrite:
+    if present and not overwrite:
         raise InputError(f"{label}: holds {what}; give --overwrite (overwrite=True) to replace it")
 
 
 def write_folder(place: Path, fill: Callable[[Path], _T]) -> _T:
-    """Put a folder at `place`, in place of one that is there now, as `replace_folder` does; nothing is left of one that was not filled.
+    """Create or replace the folder `place` as `replace_folder` does. If filling it fails, nothing is left behind.
 
     Args:
-        place: where it comes to stand; what is above it is made.
-        fill: given an empty folder, writes what belongs there.
+        place: path of the folder; its parents are created.
+        fill: function that writes the contents into an empty folder.
 
-    Returns what `fill` does. Raises `OSError`, and what `fill` raises.
+    Returns the result of `fill`. Raises `OSError`, and whatever `fill` raises.
     """
     partial = place.with_name(f".{place.name}.{os.getpid()}.{PARTIAL}")
     try:
         make_folder(partial)
-        found = fill(partial)
+        result = fill(partial)
         replace_folder(partial, place)
-        return found
+        return result
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
 
 def remove_leftovers(folder: Path, names: Collection[str] | None = None) -> None:
-    """Remove what processes that died left half-written or half-removed in a folder; not what lies in folders within.
+    """Remove what processes that died left half-written or half-removed in a folder; subfolders are not searched.
 
-    A folder that was moved away to be replaced, and was not, is put back. What belongs to another process that lives is left alone.
+    A folder that was moved away for a replacement that did not happen is restored. Files of other live processes are not touched.
 
     Args:
-        folder: where; nothing is done where it is none, or a link.
-        names: only what was to become one of these; None for all.
+        folder: path of the folder; nothing happens if it does not exist or is a link.
+        names: final names of the files to consider; None for all.
     """
     if folder.is_symlink():
         return
@@ -278,7 +278,7 @@ def remove_leftovers(folder: Path, names: Collection[str] | None = None) -> None
 
 
 def remove(path: Path) -> None:
-    """Remove a file, a link, or a folder with all that is in it; harmless where there is nothing."""
+    """Remove a file, a link, or a folder with its contents; does nothing if there is none."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -290,7 +290,7 @@ def _is_another_that_lives(pid: int) -> bool:
     if pid in (0, os.getpid()):
         return False
     try:
-        os.kill(pid, 0)  # signal 0 asks, and does nothing
+        os.kill(pid, 0)  # signal 0 only checks for existence
     except (ProcessLookupError, OverflowError):
         return False
     except OSError:

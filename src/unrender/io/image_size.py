@@ -1,7 +1,7 @@
-"""Kind and size of a picture file, read from its header before a decoder runs.
+"""Kind and size of an image file, read from its header before a decoder runs.
 
-A file of some hundred bytes can declare a hundred thousand pixels a side. Mitsuba tells the kinds of files apart by their first bytes,
-whatever their names end in, and so does this module. Each decoder has an allow-list of kinds: a file of another kind never reaches it.
+A file of a few hundred bytes can declare a hundred thousand pixels per side. Mitsuba recognises the kind of a file by its first bytes,
+regardless of its extension, and so does this module. Each decoder has an allow-list of kinds, so it never gets a file of another kind.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from unrender.core.errors import InputError
 from unrender.io import bounded_files, tiff_header
 
 MOST_VALUES = 1 << 28
-"""Pixels times channels of the largest picture that is decoded: one gigabyte in single precision."""
+"""Largest image that is decoded, in pixels times channels: one gigabyte in single precision."""
 
 LONGEST_SIDE = 1 << 17
-"""In pixels: decoders keep tables of rows."""
+"""Largest side in pixels, because decoders allocate tables of rows."""
 
 _HEADER = 1 << 20
 _EXR_PARTS = 0x1000
 _MOST_ATTRIBUTES = 4096
 _MOST_SCANS = 100
 _MOST_SCANNED = 1 << 30
-"""Pixels times scans of a JPEG file: each scan goes over the whole picture, and may take a few bytes."""
+"""Largest product of pixels and scans of a JPEG file: each scan covers the entire image, and may have a few bytes."""
 _WEBP_ANIMATION = 0x02
 _FARTHEST = 1 << 30
 
@@ -53,21 +53,21 @@ class Header:
 
     @property
     def values(self) -> int:
-        """Pixels times channels of all parts."""
+        """Number of pixels times channels of all parts."""
         return sum(width * height * max(channels, 1) for width, height, channels in self.sizes)
 
 
 def check(path: Path) -> int:
-    """Return how many values a picture that Mitsuba decodes holds: pixels times channels of all parts.
+    """Return the number of values of an image that Mitsuba decodes: pixels times channels of all parts.
 
-    Raises `InputError`, which does not name the file. It is raised for a file of an unknown kind and for a malformed header. It is also
-    raised where the file declares more than `MOST_VALUES` values, or more than its bytes can hold.
+    Raises `InputError` without the file's name, for a file of an unknown kind, a malformed header, or a header that declares more than
+    `MOST_VALUES` values or more than the file's bytes can contain.
     """
     return _read_header(path, _MITSUBA).values
 
 
 def read_photograph_header(path: Path) -> Header:
-    """Return the header of a photograph: the kinds that Mitsuba decodes, and TIFF, WebP and PNM. Raises `InputError` as `check` does."""
+    """Return the header of a photograph: the kinds that Mitsuba decodes, TIFF, WebP and PNM. Raises `InputError` as `check` does."""
     return _read_header(path, _PHOTOGRAPHS)
 
 
@@ -78,7 +78,7 @@ def _read_header(path: Path, readers: Sequence[_Kind]) -> Header:
             size = file.seek(0, 2)
             kind, reader = _reader(data, file, path, readers)
             file.seek(0)
-            found = reader(data, file)
+            contents = reader(data, file)
     except InputError as error:
         raise InputError(str(error).removeprefix(f"{path}: ")) from error
     except Image.DecompressionBombError as error:
@@ -86,7 +86,9 @@ def _read_header(path: Path, readers: Sequence[_Kind]) -> Header:
     except (struct.error, ValueError, IndexError, OSError, UnidentifiedImageError, SyntaxError) as error:
         raise InputError(f"cannot be read as a picture: its header is malformed ({type(error).__name__})") from error
     header = (
-        Header(kind, found) if isinstance(found, list) else Header(kind, [found.size], found.bits, found.orientation)
+        Header(kind, contents)
+        if isinstance(contents, list)
+        else Header(kind, [contents.size], contents.bits, contents.orientation)
     )
     for width, height, channels in header.sizes:
         values, what = width * height * max(channels, 1), f"{width}x{height} pixels of {channels} channels"
@@ -99,10 +101,10 @@ def _read_header(path: Path, readers: Sequence[_Kind]) -> Header:
 
 
 def _plausible(size: int) -> int:
-    """The most values in a file of so many bytes.
+    """Return the largest plausible number of values of a file of `size` bytes.
 
-    What is constant compresses to a thousandth, so that a file that comes by mail can fill the memory. A photograph has some 30 values a
-    byte at most, a mask 500.
+    Constant images compress by a factor of a thousand, so a small file could fill the memory. A photograph has at most about 30 values
+    per byte, a mask 500.
     """
     return max(1 << 25, min(512 * size, 1 << 26), 32 * size)
 
@@ -113,7 +115,7 @@ _Kind = tuple[bytes, str, _Reader]
 
 
 def _reader(data: bytes, file: IO[bytes], path: Path, readers: Sequence[_Kind]) -> tuple[str, _Reader]:
-    """Return kind and reader by the first bytes (a TGA file's last ones), in Mitsuba's order."""
+    """Return the kind and reader of a file by its first bytes (the last bytes for TGA), in Mitsuba's order."""
     for magic, kind, reader in readers:
         if magic and data.startswith(magic):
             return kind, reader
@@ -134,15 +136,15 @@ def _has_tga_footer(file: IO[bytes]) -> bool:
 
 
 def _exr(data: bytes, _: IO[bytes]) -> Sizes:
-    """Of each part: the data window's width and height, and the channels."""
+    """Return width and height of the data window, and the number of channels, of each part."""
     many = struct.unpack_from("<I", data, 4)[0] & _EXR_PARTS
-    at, found = 8, []
-    while data[at] or not found:
+    at, sizes = 8, []
+    while data[at] or not sizes:
         size, at = _exr_part(data, at)
-        found.append(size)
+        sizes.append(size)
         if not many:
             break
-    return found
+    return sizes
 
 
 def _exr_part(data: bytes, at: int) -> tuple[tuple[int, int, int], int]:
@@ -154,7 +156,7 @@ def _exr_part(data: bytes, at: int) -> tuple[tuple[int, int, int], int]:
             low_x, low_y, high_x, high_y = window
             width, height = high_x - low_x + 1, high_y - low_y + 1
             if width > 0 and height > 0 and not 0 <= low_x + low_y * width < _FARTHEST:
-                # Mitsuba computes this offset in 32 bits without a sign, and then writes elsewhere.
+                # Mitsuba computes this offset in unsigned 32 bits, and then writes to a wrong address.
                 raise InputError(
                     f"its data window begins at ({low_x}, {low_y}), which Mitsuba cannot read: expected (0, 0)"
                 )
@@ -186,7 +188,7 @@ def _word(data: bytes, at: int) -> tuple[bytes, int]:
 
 
 def _hdr(data: bytes, file: IO[bytes]) -> Sizes:
-    """From the first line with a resolution, in the one form that Mitsuba reads."""
+    """Return the size from the first line with a resolution, in the only form that Mitsuba reads."""
     line = re.search(rb"^[^\n]*(?:-Y|\+X)[^\n]*$", data, re.MULTILINE)
     match = line and re.fullmatch(rb"-Y +(\d{1,9}) +\+X +(\d{1,9}) *", line[0].replace(b"\r", b""))
     if not line or not match:
@@ -199,9 +201,9 @@ def _hdr(data: bytes, file: IO[bytes]) -> Sizes:
 
 
 def _check_scanlines(data: bytes, width: int, height: int) -> None:
-    """Raise unless the encoded rows of an HDR file end where the picture does: Mitsuba would write on behind it."""
+    """Raise unless the encoded rows of an HDR file end with the image: Mitsuba would write beyond it."""
     if not (8 <= width < 1 << 15 and data[:2] == b"\2\2" and len(data) > 2 and data[2] < 0x80):
-        return  # without runs: read as it is
+        return  # not run-length encoded
     marker, at = b"\2\2" + width.to_bytes(2, "big"), 0
     for _ in range(height):
         if data[at : at + 4] != marker:
@@ -234,7 +236,7 @@ def _ppm(data: bytes, _: IO[bytes]) -> Sizes:
 
 
 def _pnm(data: bytes, _: IO[bytes]) -> Sizes:
-    """Read the header that Pillow accepts: P1 to P6, with comments between the numbers."""
+    """Return the size from a header that Pillow accepts: P1 to P6, with comments between the numbers."""
     match = re.match(rb"P([1-6])(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", data)
     if match is None:
         raise ValueError("no resolution")
@@ -242,7 +244,7 @@ def _pnm(data: bytes, _: IO[bytes]) -> Sizes:
 
 
 def _webp(data: bytes, _: IO[bytes]) -> Sizes:
-    """Read the canvas of a still image; Pillow allocates it before it tells the size."""
+    """Return the canvas of a still image, which Pillow allocates before it reports the size."""
     if data[8:12] != b"WEBP":
         raise ValueError("no WebP")
     chunk = data[12:16]
@@ -267,14 +269,14 @@ def _bmp(data: bytes, _: IO[bytes]) -> Sizes:
 
 
 def _tga(data: bytes, _: IO[bytes]) -> Sizes:
-    """Read the header that Pillow accepts."""
+    """Return the size from a header that Pillow accepts."""
     width, height, bits = struct.unpack_from("<HHB", data, 12)
     return [(width, height, max(bits // 8, 3))]
 
 
 def _mitsubas_tga(data: bytes, file: IO[bytes]) -> Sizes:
     skipped, _, kind = struct.unpack_from("<3B", data)
-    width, height, bits = struct.unpack_from("<hhB", data, 12)  # with a sign, as Mitsuba reads them
+    width, height, bits = struct.unpack_from("<hhB", data, 12)  # signed, as in Mitsuba
     depth = max(bits // 8, 1)
     if kind & 8 and min(width, height) > 0 and width * height * depth <= MOST_VALUES:
         file.seek(18 + skipped)
@@ -283,7 +285,7 @@ def _mitsubas_tga(data: bytes, file: IO[bytes]) -> Sizes:
 
 
 def _check_runs(packets: bytes, pixels: int, depth: int) -> None:
-    """Raise `ValueError` or `IndexError` unless run-length encoded pixels end where the picture does: Mitsuba would write on behind it."""
+    """Raise `ValueError` or `IndexError` unless the run-length encoded pixels end with the image: Mitsuba would write beyond it."""
     at = 0
     while pixels > 0:
         count = (packets[at] & 0x7F) + 1
@@ -294,7 +296,7 @@ def _check_runs(packets: bytes, pixels: int, depth: int) -> None:
 
 
 def _png(data: bytes, _: IO[bytes]) -> tiff_header.TiffHeader:
-    """Indexed colours count as four channels, which they become."""
+    """Return size and bits per channel; indexed colours count as four channels, to which they are converted."""
     if data[12:16] != b"IHDR":
         raise ValueError("no IHDR")
     width, height, bits, kind = struct.unpack_from(">IIBB", data, 16)
@@ -308,7 +310,7 @@ def _jpeg(data: bytes, file: IO[bytes]) -> Sizes:
         raise InputError(f"cannot be read as a picture: more than {_MOST_SCANS} scans")
     file.seek(0)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of sizes, which are judged here
+        warnings.simplefilter("ignore")  # the size is checked below
         limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
         try:
             with Image.open(file, formats=["JPEG"]) as image:
@@ -332,7 +334,7 @@ _MITSUBA: tuple[_Kind, ...] = (
     (b"\x76\x2f\x31\x01", "EXR", _exr),
     (b"", "TGA", _mitsubas_tga),
 )
-"""Kinds that Mitsuba's `Bitmap` may decode."""
+"""Kinds of files that Mitsuba's `Bitmap` may decode."""
 
 _PHOTOGRAPHS: tuple[_Kind, ...] = (
     *(each for each in _MITSUBA if each[1] not in ("PPM", "TGA")),
@@ -341,4 +343,4 @@ _PHOTOGRAPHS: tuple[_Kind, ...] = (
     *((b"P%d" % number, "PPM", _pnm) for number in range(1, 7)),
     (b"", "TGA", _tga),
 )
-"""Kinds that photographs and masks may have."""
+"""Kinds of files of photographs and masks."""

@@ -1,4 +1,4 @@
-"""Reading pictures: files and arrays become linear float32 arrays, or one clear line says why not."""
+"""Reading of images: files and arrays become linear float32 arrays, or a one-line error."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from unrender.core.text import reason_of
 from unrender.io import bounded_files, image_size
 
 READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
-"""File name endings that `read` knows."""
+"""File name extensions that `read` supports."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in linear values.
+    """An image in linear values.
 
     Attributes:
         values: (H, W, C) float32, C in {1, 3}.
-        notice: one line on what was done to the values, "" if they were taken as they are.
-        alpha: (H, W) float32 in [0, 1], of integer values that are not opaque everywhere, where it was asked for; else None.
+        notice: one line about the conversion of the values, "" for none.
+        alpha: (H, W) float32 in [0, 1], if it was requested and integer values are not opaque everywhere; else None.
     """
 
     values: np.ndarray
@@ -33,17 +33,17 @@ class Picture:
 
 
 def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tuple[int, ...] = (1, 3, 4)) -> Picture:
-    """The picture in a file or an array.
+    """Read an image from a file or an array.
 
     Args:
-        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). The alpha of floating-point values is dropped.
-            Floating-point values are linear; 8- and 16-bit integers are taken as sRGB in [0, 1].
-        linearise: whether to undo the sRGB curve of 8- and 16-bit values; masks want them as they are.
-        alpha: whether to keep the alpha of 8- and 16-bit values.
-        channels: numbers of channels that arrays may have; of 2 the second is alpha.
+        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). The alpha of floating-point values is ignored.
+            Floating-point values are linear. 8- and 16-bit integers are sRGB in [0, 1].
+        linearise: whether to convert 8- and 16-bit values from sRGB; False for masks.
+        alpha: whether to return the alpha of 8- and 16-bit values.
+        channels: numbers of channels that arrays may have; the second of 2 channels is alpha.
 
     Raises:
-        InputError: no such file, unreadable, of another shape, or not finite.
+        InputError: the file is missing or unreadable, or the values have an unsupported shape or are not finite.
     """
     if isinstance(source, (str, Path)):
         path = Path(source)
@@ -71,13 +71,13 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
 
 
 def resize(values: np.ndarray, height: int, width: int, around: bool = False) -> np.ndarray:
-    """Return a picture (H, W, C) as (height, width, C): smoothed before it shrinks, linear between pixels where it grows.
+    """Resize an image (H, W, C) to (height, width, C), with smoothing before reduction and linear interpolation for enlargement.
 
     Args:
-        values: the picture.
-        height: of the result.
-        width: of the result.
-        around: whether its left and right borders are neighbours, as in an environment map.
+        values: the image.
+        height: height of the result.
+        width: width of the result.
+        around: whether the left and right borders are neighbours, as in an environment map.
     """
     if values.shape[:2] == (height, width):
         return values
@@ -90,17 +90,17 @@ def resize(values: np.ndarray, height: int, width: int, around: bool = False) ->
 
 
 def srgb_to_linear(values: np.ndarray) -> np.ndarray:
-    """The inverse of the sRGB transfer curve (IEC 61966-2-1), values in [0, 1]."""
+    """Apply the inverse sRGB transfer function (IEC 61966-2-1) to values in [0, 1]."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
 
 
 def luminance(values: np.ndarray) -> np.ndarray:
-    """(..., 3) linear sRGB to (..., 1), by the weights of ITU-R BT.709."""
+    """Convert linear sRGB (..., 3) to luminance (..., 1), by the weights of ITU-R BT.709."""
     return (values @ np.array([0.212671, 0.715160, 0.072169], np.float32))[..., None]
 
 
 def xyz_to_rgb(values: np.ndarray) -> np.ndarray:
-    """(..., 3) CIE XYZ to linear sRGB, by the matrix that Mitsuba has."""
+    """Convert CIE XYZ (..., 3) to linear sRGB, by Mitsuba's matrix."""
     matrix = [[3.240479, -1.537150, -0.498535], [-0.969256, 1.875991, 0.041556], [0.055648, -0.204043, 1.057311]]
     return values @ np.array(matrix, np.float32).T
 
@@ -118,8 +118,8 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
         encoded = bool(bitmap.srgb_gamma())
         stored = np.array(bitmap)
         bits = 8 * stored.itemsize
-        told = encoded and linearise
-        transparent = told and bitmap.has_alpha() and (stored[..., -1] < np.iinfo(stored.dtype).max).any()
+        linearised = encoded and linearise
+        transparent = linearised and bitmap.has_alpha() and (stored[..., -1] < np.iinfo(stored.dtype).max).any()
         single = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.Y, mi.Bitmap.PixelFormat.YA)
         kind = mi.Bitmap.PixelFormat.Y if single else mi.Bitmap.PixelFormat.RGB
         if encoded and not linearise:
@@ -127,23 +127,23 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
         values = np.array(bitmap.convert(kind, mi.Struct.Type.Float32, False))
     except InputError:
         raise
-    except Exception as error:  # Mitsuba throws what its image libraries throw
+    except Exception as error:  # Mitsuba's image libraries may raise anything
         raise InputError(f"cannot be read as a picture: {reason_of(error, 300)}") from error
     values = values.reshape(*values.shape[:2], -1)
-    if not told:
+    if not linearised:
         return Picture(values)
     coverage = _coverage(stored[..., -1]) if transparent and alpha else None
-    told = f", its alpha {'left out' if coverage is None else 'taken as mask'}" if transparent else ""
-    return Picture(values, f"{bits}-bit sRGB, linearised{told}", coverage)
+    note = f", its alpha {'left out' if coverage is None else 'taken as mask'}" if transparent else ""
+    return Picture(values, f"{bits}-bit sRGB, linearised{note}", coverage)
 
 
 def _coverage(stored: np.ndarray) -> np.ndarray:
-    """Of integer alpha, in [0, 1]."""
+    """Return integer alpha as a fraction in [0, 1]."""
     return (stored / np.float32(np.iinfo(stored.dtype).max)).astype(np.float32)
 
 
 def _colour_channels(bitmap: Any) -> np.ndarray:
-    """R, G and B of an EXR file of many channels, such as Mitsuba's own `aov` integrator writes: (H, W, 3)."""
+    """Return R, G and B, (H, W, 3), of an EXR file of many channels, such as those of Mitsuba's `aov` integrator."""
     names = [field.name for field in bitmap.struct_()]
     if not {"R", "G", "B"} <= set(names):
         raise InputError(f"has the channels {', '.join(names)[:200]}, but not R, G and B")
@@ -168,8 +168,8 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
             return Picture(values.astype(np.float32))
         transparent = array.shape[2] in (2, 4) and bool((array[..., -1] < 2**bits - 1).any())
         coverage = _coverage(array[..., -1]) if alpha and transparent else None
-        told = ", its alpha taken as mask" if coverage is not None else ""
-        return Picture(srgb_to_linear(values).astype(np.float32), f"{bits}-bit sRGB, linearised{told}", coverage)
+        note = ", its alpha taken as mask" if coverage is not None else ""
+        return Picture(srgb_to_linear(values).astype(np.float32), f"{bits}-bit sRGB, linearised{note}", coverage)
     with np.errstate(over="ignore"):
         return Picture(np.ascontiguousarray(values, dtype=np.float32))
 

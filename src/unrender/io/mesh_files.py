@@ -1,7 +1,7 @@
-"""Meshes that a scene names, checked before Mitsuba reads them.
+"""Checks of the mesh files of a scene before Mitsuba reads them.
 
-Mitsuba takes the numbers of vertices and faces as they are declared, and faces without a look at their vertices: a PLY or serialized file
-whose index is out of range, or whose counts are not those of its data, is a segmentation fault or worse. OBJ files it checks itself.
+Mitsuba trusts the declared numbers of vertices and faces, and the vertex indices of faces. A PLY or serialized file with an index out of
+range, or with counts that differ from its data, causes a segmentation fault or worse. Mitsuba checks OBJ files itself.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from unrender.core.text import visible
 from unrender.io import bounded_files
 
 LARGEST = 1 << 32
-"""Of a file, in bytes."""
+"""Largest file in bytes."""
 _LARGEST_HEADER = 1 << 16
 _MOST_ELEMENTS = 1 << 30
 _BLOCK = 1 << 20
@@ -50,7 +50,7 @@ _SPLATS = ("x", "y", "z", "nx", "ny", "nz"), ("scale_0", "scale_1", "scale_2", "
 
 @dataclass
 class _Element:
-    """Of a PLY file: rows of the same properties; a list is its count, with ".count" in its name, and three numbers."""
+    """Element of a PLY file: rows with the same properties. A list consists of its count, named with ".count", and three numbers."""
 
     name: str
     count: int
@@ -63,7 +63,7 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Header:
-    """Of a PLY file; `order` is "<" or ">", or "" where the numbers are text."""
+    """Header of a PLY file; `order` is "<" or ">", or "" for a text file."""
 
     order: str
     elements: list[_Element]
@@ -71,11 +71,11 @@ class _Header:
 
 
 def check_ply(path: Path, splats: bool = False) -> None:
-    """Raise `InputError` unless a PLY file has the rows that it declares, and triangles of vertices that exist.
+    """Raise `InputError` unless a PLY file has the rows that it declares, and triangles of existing vertices.
 
     Args:
-        path: the file.
-        splats: whether it is a set of ellipsoids, whose properties must be float32 and in Mitsuba's order.
+        path: path of the file.
+        splats: whether it contains ellipsoids, whose properties must be float32 and in Mitsuba's order.
     """
     with bounded_files.open_regular(path) as file:
         header = _header(file, path)
@@ -121,7 +121,7 @@ def _header(file: IO[bytes], path: Path) -> _Header:
 
 
 def _check_element(element: _Element, path: Path) -> None:
-    """Names end up in messages of Mitsuba's, and give the places of numbers in memory."""
+    """Check an element's names, which appear in Mitsuba's messages, and its properties, which determine the memory layout."""
     if not all(re.fullmatch(r"[\w.:-]{1,100}", name) for name in (element.name, *element.names)):
         raise InputError(f"{path}: element {visible(element.name[:60])}: expected names of letters, digits and '_'")
     twice = [name for name, count in Counter(element.names).items() if count > 1]
@@ -178,11 +178,11 @@ def _check_text(file: IO[bytes], header: _Header, vertices: int, path: Path) -> 
             if len(block) > left:
                 words = _before(block[left:], words)
             left -= min(left, len(block))
-            whole = len(pending) // width * width
+            complete = len(pending) // width * width
             if element.name == "face":
-                _check_words(pending[:whole], element, vertices, row, path)
-            row += whole // width
-            pending = pending[whole:]
+                _check_words(pending[:complete], element, vertices, row, path)
+            row += complete // width
+            pending = pending[complete:]
 
 
 def _before(block: list[bytes], words: Iterator[list[bytes]]) -> Iterator[list[bytes]]:
@@ -198,10 +198,10 @@ def _words(file: IO[bytes]) -> Iterator[list[bytes]]:
         rest = data[end:]
         if len(rest) > _LARGEST_HEADER:
             return
-        if found := data[:end].split():
-            yield found
-    if found := rest.split():
-        yield found
+        if words := data[:end].split():
+            yield words
+    if words := rest.split():
+        yield words
 
 
 def _check_words(words: list[bytes], element: _Element, vertices: int, start: int, path: Path) -> None:
@@ -217,15 +217,15 @@ def _check_words(words: list[bytes], element: _Element, vertices: int, start: in
 
 
 def _check_faces(counts: np.ndarray, corners: np.ndarray, vertices: int, start: int, path: Path) -> None:
-    """Raise `InputError` unless all faces have three corners among the vertices. `start`: the first one's number."""
+    """Raise `InputError` unless all faces have three corners among the vertices. `start` is the index of the first face."""
     if (counts != 3).any():
         face = int(np.argmax(counts != 3))
         raise InputError(f"{path}: face {start + face} has {int(counts[face])} corners, expected triangles")
     wrong = ((corners < 0) | (corners >= vertices)).any(axis=-1)
     if wrong.any():
         face = int(np.argmax(wrong))
-        found = ", ".join(str(int(corner)) for corner in corners[face])
-        raise InputError(f"{path}: face {start + face} has the vertices {found}, expected less than {vertices}")
+        indices = ", ".join(str(int(corner)) for corner in corners[face])
+        raise InputError(f"{path}: face {start + face} has the vertices {indices}, expected less than {vertices}")
 
 
 # ---------------------------------------------------------------------- OBJ
@@ -235,9 +235,9 @@ _MOST_VARIANTS = 1 << 12
 
 
 def check_obj(path: Path) -> None:
-    """Raise `InputError` where a vertex has so many combinations of normal and texture coordinates that Mitsuba would take hours.
+    """Raise `InputError` if a vertex has so many combinations of normals and texture coordinates that Mitsuba would take hours.
 
-    It keeps them in a list that it walks through for each corner.
+    Mitsuba stores them in a list that it searches linearly for each corner.
     """
     with bounded_files.open_regular(path) as file:
         if os.fstat(file.fileno()).st_size <= _FREE_BYTES:
@@ -263,7 +263,7 @@ _LONGEST_NAME = 1 << 12
 
 
 def check_serialized(path: Path, index: int = 0) -> None:
-    """Raise `InputError` unless the mesh of that index in a serialized file is whole, finite, and of vertices that exist."""
+    """Raise `InputError` unless the mesh with this index in a serialized file is complete, finite, and has existing vertices only."""
     if index < 0:
         raise InputError(f"{path}: expected a shape_index of at least 0, got {index}")
     try:
@@ -277,7 +277,7 @@ def check_serialized(path: Path, index: int = 0) -> None:
 
 
 def _seek_mesh(file: IO[bytes], index: int) -> int:
-    """Go to where the compressed data of a mesh begin. Returns the version of the format."""
+    """Seek the compressed data of a mesh. Returns the version of the format."""
     magic, version = struct.unpack("<HH", file.read(4))
     if magic != _MAGIC or version not in (3, 4):
         raise ValueError("no serialized mesh")
@@ -295,13 +295,13 @@ def _seek_mesh(file: IO[bytes], index: int) -> int:
 
 @dataclass
 class _Unpacked:
-    """Reads a stream of zlib, no more than is asked for."""
+    """Reader of a zlib stream that unpacks no more than requested."""
 
     file: IO[bytes]
     _unpacker: zlib._Decompress = field(default_factory=zlib.decompressobj)
 
     def read(self, size: int) -> bytes:
-        """Exactly so many bytes. Raises `ValueError` where there are fewer."""
+        """Return exactly `size` bytes. Raises `ValueError` if there are fewer."""
         parts, left = [], size
         while left > 0:
             data = self._unpacker.unconsumed_tail or self.file.read(_LARGEST_HEADER)
@@ -313,7 +313,7 @@ class _Unpacked:
         return b"".join(parts)
 
     def floats(self, count: int, kind: str) -> bool:
-        """Take in so many numbers. Returns whether all are finite."""
+        """Read `count` numbers. Returns whether all are finite."""
         finite = True
         for start in range(0, count, _BLOCK):
             size = min(_BLOCK, count - start)
@@ -328,7 +328,7 @@ def _check_mesh(data: _Unpacked, version: int, path: Path) -> None:
         if sum(1 for _, _ in zip(name, range(_LONGEST_NAME + 1), strict=False)) > _LONGEST_NAME:
             raise ValueError("a name without end")
     vertices, faces = struct.unpack("<QQ", data.read(16))
-    most = 1200 * os.fstat(data.file.fileno()).st_size  # what zlib makes of so many bytes at best
+    most = 1200 * os.fstat(data.file.fileno()).st_size  # upper bound of zlib's compression ratio
     if max(vertices, faces) > _MOST_ELEMENTS or 12 * (vertices + faces) > most:
         raise InputError(f"{path}: declares {vertices} vertices and {faces} faces, more than it has bytes for")
     kind = "<f8" if flags & _DOUBLE else "<f4"
@@ -346,13 +346,13 @@ def _check_mesh(data: _Unpacked, version: int, path: Path) -> None:
 def ply(
     vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None = None, uv: np.ndarray | None = None
 ) -> bytes:
-    """Binary, little-endian: float32 coordinates, with normals and s, t where they are given.
+    """Encode a mesh as binary little-endian PLY: float32 coordinates, with optional normals and s, t.
 
     Args:
         vertices: (V, 3).
-        faces: (F, 3), numbers of vertices.
-        normals: (V, 3), unit.
-        uv: (V, 2).
+        faces: vertex indices, (F, 3).
+        normals: unit normals, (V, 3).
+        uv: texture coordinates, (V, 2).
     """
     columns = [("xyz", vertices)]
     columns += [] if normals is None else [(("nx", "ny", "nz"), normals)]
@@ -368,7 +368,10 @@ def ply(
 
 
 def obj(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None) -> bytes:
-    """Vertices, texture coordinates where they are given, and faces, as text with every bit of float32. Arguments as of `ply`."""
+    """Encode a mesh as OBJ text that preserves every bit of float32: vertices, optional texture coordinates, faces.
+
+    Arguments as in `ply`.
+    """
     lines = ["# written by unrender", *rows("v", vertices)]
     lines += [] if uv is None else rows("vt", upwards(uv))
     corners = faces.astype(np.int64) + 1
@@ -379,10 +382,10 @@ def obj(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None) -
 
 
 def rows(kind: str, values: np.ndarray) -> list[str]:
-    """Lines of an OBJ file."""
+    """Return the rows of an array as lines of an OBJ file."""
     return [f"{kind} " + " ".join(f"{x:.9g}" for x in row) for row in values.tolist()]
 
 
 def upwards(uv: np.ndarray) -> np.ndarray:
-    """Texture coordinates whose v grows the other way."""
+    """Flip the direction of v in texture coordinates (V, 2)."""
     return np.stack([uv[:, 0], 1 - uv[:, 1]], 1)

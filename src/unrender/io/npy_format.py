@@ -1,4 +1,4 @@
-"""One array in NumPy's format, read with its header taken for text and its sizes checked before memory is taken."""
+"""Reader of arrays in NumPy's format, which parses the header as text and checks sizes before it allocates memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Shape = tuple[int, ...]
 _AXES = 32
 _BLOCK = 1 << 20
 _MAGIC = b"\x93NUMPY"
-_LONGEST_HEADER = 1 << 12  # far more than the name of a type and a shape take
+_LONGEST_HEADER = 1 << 12  # more than any type name and shape need
 _INTEGER = rb"-?\d{1,40}L?"
 _HEADER = re.compile(
     rb"\s*\{\s*'descr':\s*(?:'([^'\[\]]{1,16})'|\[[^\[\]]{0,1000}\]),\s*'fortran_order':\s*(True|False),"
@@ -26,11 +26,11 @@ _HEADER = re.compile(
 
 
 class MalformedHeader(ValueError):
-    """An array whose header does not describe plain numbers."""
+    """Header of an array that does not describe plain numbers."""
 
 
 def read_npy(file: IO[bytes], size: int, where: str, check: Callable[[Shape], None] | None, largest: int) -> np.ndarray:
-    """One array in NumPy's format, of `size` bytes with its header. Raises `InputError` or `MalformedHeader`."""
+    """Read an array in NumPy's format, of `size` bytes including its header. Raises `InputError` or `MalformedHeader`."""
     kind, columns_first, shape = _read_header(file, where)
     if any(side < 0 for side in shape) or len(shape) > _AXES:
         raise InputError(f"{where}: an array cannot have the shape {printable(str(shape))}")
@@ -40,7 +40,7 @@ def read_npy(file: IO[bytes], size: int, where: str, check: Callable[[Shape], No
     if check is not None:
         check(shape)
     data = bytearray(declared)
-    for start in range(0, declared, _BLOCK):  # an archive's member would be held twice
+    for start in range(0, declared, _BLOCK):  # one read of an archive's member would need twice the memory
         block = file.read(min(_BLOCK, declared - start))
         data[start : start + len(block)] = block
         if len(block) < min(_BLOCK, declared - start):
@@ -51,9 +51,9 @@ def read_npy(file: IO[bytes], size: int, where: str, check: Callable[[Shape], No
 
 
 def _read_header(file: IO[bytes], where: str) -> tuple[np.dtype, bool, Shape]:
-    """Type, whether columns come first, and shape; the type is one of real numbers.
+    """Return the type, which is real, whether the order is column-major, and the shape.
 
-    By a pattern, not by NumPy's own reader: that takes a header for Python, and a hostile one for long.
+    NumPy's own reader evaluates the header as a Python literal, which can take long for a hostile one.
     """
     start = file.read(8)
     if start[:6] != _MAGIC or len(start) < 8:

@@ -1,4 +1,4 @@
-"""Initial and true values of parameters: a number, a colour, an image, a grid or an array becomes an array of the parameter's shape."""
+"""Conversion of an initial or true value to an array of the parameter's shape: a number, a colour, an image, a grid or an array."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from unrender.io.file_conversion import MESH_FILES, PLAIN, FileConversion
 
 
 def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> tuple[np.ndarray, str]:
-    """Return `initial` as float32 of `shape`, and a notice on what was done to it ("" if nothing).
+    """Return `initial` as float32 of `shape`, and a notice about its conversion, "" for none.
 
-    A number fills any shape; a colour fills the last axis. A picture file fills (H, W, C) and a .vol file (Z, Y, X, C); files of other
-    resolutions are resized. A mesh file fills values at vertices. An array, also of a .npy file or the only one of an .npz archive, must
-    have the shape; the last axis may be missing where its length is 1. Where the shape has one axis, as of a mesh's vertices (n V,), it may
-    be (V, n), too. Where outer columns repeat others, pictures and arrays may leave them out.
+    A number fills any shape, a colour the last axis. An image file fills (H, W, C), and a .vol file (Z, Y, X, C); other resolutions are
+    resized. A mesh file fills values at vertices. An array, a .npy file, or an .npz archive of one array must have the shape; a last axis
+    of length 1 may be missing. A shape of one axis, such as that of vertices (n V,), also accepts (V, n). Images and arrays may omit
+    repeated border columns.
 
     Args:
-        initial: the value as given.
-        shape: of the parameter.
-        conversion: what the renderer does to such a file when it loads a scene.
+        initial: the value as passed.
+        shape: shape of the parameter.
+        conversion: the renderer's conversion of such a file in a scene.
 
     Raises:
-        InputError: it does not fit, cannot be read, or is not finite.
+        InputError: the value does not fit, cannot be read, or is not finite.
     """
     if isinstance(initial, (str, Path)):
-        found, notice = _from_file(Path(initial), shape, conversion)
-        return periodic.repeat(conversion.stored(found), conversion.repeated), notice
+        values, notice = _from_file(Path(initial), shape, conversion)
+        return periodic.repeat(conversion.stored(values), conversion.repeated), notice
     try:
         array = np.asarray(initial)
         if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
@@ -112,7 +112,7 @@ def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
 
 
 def _check_shape(found: tuple[int, ...], shape: tuple[int, ...], conversion: FileConversion) -> None:
-    """Raise `InputError` where no array of this shape fills the parameter's, before it is read."""
+    """Raise `InputError` if an array of this shape cannot fill the parameter; called before the array is read."""
     number, colour = found in ((), (1,)), len(found) == 1 and len(shape) > 1 and found[0] == shape[-1]
     bare = len(shape) > 1 and shape[-1] == 1 and found == shape[:-1]
     if not (number or colour or bare or found in (shape, conversion.picture_shape(shape))):

@@ -1,4 +1,4 @@
-"""Textures and grids at other resolutions, by Mitsuba's convention: values sit at the middles of texels, and vary linearly between."""
+"""Resampling of textures and grids by Mitsuba's convention: values are at texel centres, and vary linearly between them."""
 
 from __future__ import annotations
 
@@ -8,33 +8,34 @@ import numpy as np
 
 
 def upsample(values: np.ndarray, size: Sequence[int], wrap: Sequence[bool] = ()) -> np.ndarray:
-    """The linear interpolant of `values` at the middles of finer texels.
+    """Interpolate `values` linearly at the centres of finer texels.
 
-    A linear map: exact for linear functions farther than half a coarse texel from the borders, where values are constant outwards
-    (Mitsuba's `clamp`), or go on at the other end along axes that wrap (`repeat`). Never beyond the least and greatest value.
+    The map is linear in the values, and exact for linear functions at least half a coarse texel away from the borders. Beyond the borders
+    values are constant (Mitsuba's `clamp`), or continue at the opposite end along axes that wrap (`repeat`). Results stay within the
+    range of the values.
 
     Args:
         values: (*coarse, C).
-        size: texels along each axis but the last, not fewer than there are.
-        wrap: per axis, whether its two ends are neighbours; none for no axis.
+        size: new number of texels along each axis but the last, not less than before.
+        wrap: per axis, whether its two ends are neighbours; empty for no axis.
     """
     from scipy.ndimage import zoom
 
-    found = values
+    result = values
     for axis, (old, new) in enumerate(zip(values.shape[:-1], size, strict=True)):
         if new != old:
             factors = [new / old if a == axis else 1.0 for a in range(values.ndim)]
             mode = "grid-wrap" if axis < len(wrap) and wrap[axis] else "nearest"
-            found = zoom(found, factors, order=1, mode=mode, grid_mode=True)
-    return np.asarray(found)
+            result = zoom(result, factors, order=1, mode=mode, grid_mode=True)
+    return np.asarray(result)
 
 
 def downsample(values: np.ndarray, size: Sequence[int]) -> np.ndarray:
-    """Means over the coarser texels, weighted by the share of each finer one that lies in them.
+    """Average over coarser texels, weighted by the overlap of each finer texel.
 
     Args:
         values: (*fine, C).
-        size: texels along each axis but the last, not more than there are.
+        size: new number of texels along each axis but the last, not more than before.
     """
     if values.shape[:-1] == tuple(size):
         return values
@@ -45,6 +46,6 @@ def downsample(values: np.ndarray, size: Sequence[int]) -> np.ndarray:
 
 
 def resize(values: np.ndarray, size: Sequence[int]) -> np.ndarray:
-    """(*old, C) to (*size, C): `downsample` along axes that shrink, then `upsample` along those that grow."""
+    """Resize (*old, C) to (*size, C): `downsample` along axes that shrink, then `upsample` along axes that grow."""
     least = [min(old, new) for old, new in zip(values.shape[:-1], size, strict=True)]
     return np.ascontiguousarray(upsample(downsample(values, least), size), np.float32)

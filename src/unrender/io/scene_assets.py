@@ -1,4 +1,4 @@
-"""The files that objects of a scene name, checked before Mitsuba reads them: of the right kind, bounded, and as large as they declare."""
+"""Checks of the files that objects of a scene refer to, before Mitsuba reads them: kind, size, and agreement with their header."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from unrender.core.text import shorten
 from unrender.io import bounded_files, image_size, mesh_files, spectrum_files, volumes
 
 MOST_VALUES = 1 << 30
-"""Of all pictures and grids of a scene together."""
+"""Largest number of values of all images and grids of a scene."""
 _LARGEST = 1 << 32
 
 
 @dataclass
 class AssetChecks:
-    """Checks the files of one scene.
+    """Checks of the files of one scene.
 
     Attributes:
-        values: of the pictures and grids so far.
+        values: number of values of the images and grids so far.
     """
 
     values: int = 0
 
     def check(self, plugin: str, path: Path, index: int = 0) -> None:
-        """Check a file that an object names.
+        """Check a file that an object refers to.
 
         Args:
-            plugin: the object's type.
-            path: the file.
-            index: the object's `shape_index`.
+            plugin: type of the object.
+            path: path of the file.
+            index: `shape_index` of the object.
 
         Raises:
             InputError: one line that names the file.
         """
-        if (found := bounded_files.kind(path)) != "file":
-            raise InputError(f"{shorten(str(path), 200)}: {_KINDS[found]}")
+        if (kind := bounded_files.kind(path)) != "file":
+            raise InputError(f"{shorten(str(path), 200)}: {_KINDS[kind]}")
         if plugin == "serialized":
             mesh_files.check_serialized(path, index)
         else:
@@ -84,11 +84,11 @@ _CHECKS: dict[str, Callable[[Path], int | None]] = {
 _MAGIC = b"tensor_file"
 _MOST_FIELDS, _MOST_AXES = 1000, 16
 _BYTES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 8, 8: 8, 9: 2, 10: 4, 11: 8}
-"""Of each type of number: whole ones of 8 to 64 bits, with and without sign; float16, float32, float64."""
+"""Bytes per number of each type: integers of 8 to 64 bits, signed and unsigned; float16, float32, float64."""
 
 
 def check_tensors(path: Path) -> None:
-    """Raise `InputError` unless all tensors of a file lie within it."""
+    """Raise `InputError` unless all tensors of a file are inside of it."""
     try:
         with bounded_files.open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size

@@ -1,8 +1,8 @@
-"""Which files a Mitsuba scene is made of, and whether its XML keeps to its own folder.
+"""List of the files of a Mitsuba scene, and confinement of its XML to the scene's folder.
 
-Mitsuba reads what an XML file includes, from anywhere. A scene that came from elsewhere should not be able to have other files of this
-machine parsed, so includes are followed here first, as Mitsuba will follow them, and must stay inside the scene's folder. Textures and
-meshes may lie anywhere: what is read as a picture or a mesh shows in no message.
+Mitsuba reads whatever an XML file includes. An untrusted scene must not be able to have other files of this machine parsed. So this
+module follows includes first, as Mitsuba will, and requires that they stay in the scene's folder. Textures and meshes may be anywhere,
+because no message shows the contents of an image or a mesh.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MOST_INCLUDES = 1000
 _MOST_ELEMENTS = 1 << 20
 _LARGEST = 1 << 26
 _LONGEST_VALUE = 1 << 12
-"""Characters of an attribute in which parameters are substituted."""
+"""Largest number of characters of an attribute in which parameters are substituted."""
 _MOST_PARAMETERS = 1000
 
 
@@ -33,8 +33,8 @@ class SceneFiles:
     """The files of a scene.
 
     Attributes:
-        xml: the scene itself and what it includes, in the order in which they are begun; a file that is included twice is there twice.
-        named: textures, meshes and other files that they name and that exist.
+        xml: the scene and its includes, in the order in which they are opened; a file that is included twice is listed twice.
+        named: existing textures, meshes and other files that they refer to.
     """
 
     xml: list[Path]
@@ -42,21 +42,21 @@ class SceneFiles:
 
 
 def of(scene: Path) -> list[Path]:
-    """The XML file itself, those that it includes, and the textures, meshes and other files that they name and that exist; each once.
+    """Return the XML file, its includes, and existing textures, meshes and other files that they refer to; each once.
 
     Raises:
         InputError: see `read`.
     """
-    found = read(scene)
-    return list(dict.fromkeys([*found.xml, *found.named]))
+    files = read(scene)
+    return list(dict.fromkeys([*files.xml, *files.named]))
 
 
 def read(scene: Path) -> SceneFiles:
-    """Follow a scene's XML.
+    """Follow a scene's XML and collect its files.
 
     Raises:
-        InputError: the XML cannot be read, declares entities, is nested too deeply, has too many elements, includes a file outside the
-            scene's folder, names a parameter that it does not define, or a spectrum's file is malformed.
+        InputError: the XML cannot be read, declares entities, is nested too deeply, has too many elements, includes a file outside of the
+            scene's folder, uses an undefined parameter, or refers to a malformed spectrum file.
     """
     path = scene.absolute()
     reader = _Reader(path.parent.resolve())
@@ -65,7 +65,8 @@ def read(scene: Path) -> SceneFiles:
 
 
 def resolve(name: str, search: Sequence[Path]) -> Path | None:
-    """The first file of that name in the folders of `search`, as Mitsuba looks for it; None for none. An absolute name is itself."""
+    """Return the first file of this name in the folders `search`, as Mitsuba does; None if there is none. Absolute names are
+    unchanged."""
     path = Path(name)
     places = [path] if path.is_absolute() else [place / path for place in search]
     return next((place for place in places if os.path.exists(place)), None)
@@ -81,13 +82,13 @@ class _Reader:
     _bytes: int = 0
 
     def read(self, path: Path, shown: str, search: list[Path], depth: int) -> None:
-        """Take in one XML file and what it includes.
+        """Read an XML file and its includes.
 
         Args:
-            path: the file.
-            shown: what messages call it.
-            search: where Mitsuba will look for what it names; its `path` elements are added.
-            depth: of the include.
+            path: path of the file.
+            shown: name in messages.
+            search: folders that Mitsuba will search for its files; its `path` elements are added.
+            depth: nesting depth of the include.
         """
         if len(self.xml) >= _MOST_INCLUDES:
             raise InputError(f"scene {shown}: more than {_MOST_INCLUDES} includes")
@@ -108,13 +109,13 @@ class _Reader:
             raise InputError(f"scene {shown}:{error.lineno}: not XML: {expat.ErrorString(error.code)}") from error
 
     def count(self, shown: str) -> None:
-        """Count one element."""
+        """Count an element. Raises `InputError` above the limit."""
         self._elements += 1
         if self._elements > _MOST_ELEMENTS:
             raise InputError(f"scene {shown}: more than {_MOST_ELEMENTS} elements")
 
     def define(self, name: str, value: str, shown: str) -> None:
-        """Give a parameter its value, unless it has one. Names are tried from the longest to the shortest, as Mitsuba does."""
+        """Define a parameter unless it is defined. Names are sorted from the longest to the shortest, as Mitsuba tries them."""
         key = f"${name}"
         if any(key == known for known, _ in self.parameters):
             return
@@ -124,9 +125,9 @@ class _Reader:
         self.parameters.insert(place, (key, value))
 
     def substituted(self, text: str, shown: str) -> str:
-        """The text with the values of parameters in place of `$name`; `\\$` is a dollar sign.
+        """Replace `$name` by the values of parameters; `\\$` is a literal dollar sign.
 
-        A name is found wherever the text begins with it: `$ab` is the value of `a` followed by "b" where there is no parameter `ab`.
+        A name matches as a prefix: `$ab` is the value of `a` followed by "b" if there is no parameter `ab`.
         """
         if "$" not in text:
             return text
@@ -150,7 +151,7 @@ class _Reader:
 
 @dataclass
 class _File:
-    """One XML file while it is read: the handlers of its elements."""
+    """Handlers of the elements of one XML file while it is read."""
 
     reader: _Reader
     folder: Path
@@ -160,25 +161,25 @@ class _File:
     _nested: int = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """Take in the start of an element."""
+        """Handle the start of an element."""
         self._nested += 1
         if self._nested > _DEEPEST:
             raise InputError(f"scene {self.shown}: nested more than {_DEEPEST} deep")
         self.reader.count(self.shown)
-        given = {name: self.reader.substituted(value, self.shown) for name, value in attributes.items()}
-        if tag == "default" and {"name", "value"} <= set(given):
-            self.reader.define(given["name"], given["value"], self.shown)
+        values = {name: self.reader.substituted(value, self.shown) for name, value in attributes.items()}
+        if tag == "default" and {"name", "value"} <= set(values):
+            self.reader.define(values["name"], values["value"], self.shown)
         elif tag == "include":
-            self._include(given.get("filename", ""))
+            self._include(values.get("filename", ""))
         elif tag == "path":
-            self._search(given.get("value", ""))
-        elif tag == "string" and given.get("name") == "filename":
-            self._name(given.get("value", ""))
-        elif tag == "spectrum" and "filename" in given:
-            self._spectrum(given["filename"])
+            self._search(values.get("value", ""))
+        elif tag == "string" and values.get("name") == "filename":
+            self._name(values.get("value", ""))
+        elif tag == "spectrum" and "filename" in values:
+            self._spectrum(values["filename"])
 
     def end(self, _: str) -> None:
-        """Take in the end of an element."""
+        """Handle the end of an element."""
         self._nested -= 1
 
     def declared(self, *_: Any) -> None:
@@ -204,14 +205,14 @@ class _File:
         self.search.insert(0, place)
 
     def _name(self, name: str) -> None:
-        found = resolve(name, self.search)
-        if found is not None and found.is_file():
-            self.reader.named.append(found)
+        path = resolve(name, self.search)
+        if path is not None and path.is_file():
+            self.reader.named.append(path)
 
     def _spectrum(self, name: str) -> None:
-        """Unlike other files, Mitsuba reads these as it parses."""
-        found = resolve(name, [*self.search, Path()])
-        if found is None:
+        """Check a spectrum file at once, because Mitsuba reads it while it parses the XML."""
+        path = resolve(name, [*self.search, Path()])
+        if path is None:
             raise InputError(f"scene {self.shown}: spectrum {shorten(name, 200)}: no such file")
-        spectrum_files.check(found)
-        self.reader.named.append(found)
+        spectrum_files.check(path)
+        self.reader.named.append(path)

@@ -1,4 +1,4 @@
-"""Files of spectra that a scene names, checked before Mitsuba reads them: `.spd`, lines of a wavelength and a value."""
+"""Checks of a scene's spectrum files (`.spd`, lines of a wavelength and a value) before Mitsuba reads them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _LARGEST = 1 << 20
 
 
 def check(path: Path) -> None:
-    """Raise `InputError` for what is no such file."""
+    """Raise `InputError` unless the file is such a spectrum."""
     text = bounded_files.read_text(path, _LARGEST)
     for number, line in enumerate(text.split("\n"), 1):
         words = line.partition("#")[0].split()

@@ -1,4 +1,4 @@
-"""Pictures that wait in a file without a name, so that memory does not grow with their number."""
+"""Images stored in an unnamed temporary file, so that memory does not grow with their number."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _LEVELS = 255
 
 
 class PictureStore:
-    """One file in the system's folder for temporary files (TMPDIR), which is gone when its pictures are, or the process."""
+    """A file in the folder for temporary files (TMPDIR), which is deleted with its images or with the process."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(prefix="unrender-")  # noqa: SIM115 (it lives as long as this does)
@@ -25,83 +25,84 @@ class PictureStore:
         self._end = 0
 
     def add(self, values: np.ndarray) -> StoredPicture:
-        """A picture (H, W, ...) of float32, kept exactly: in half as many bytes where 16-bit floats hold it, in a quarter where it has
-        256 levels from 0 to 1, as masks have.
+        """Store an image (H, W, ...) of float32 without loss.
+
+        It takes half the bytes if 16-bit floats represent it, and a quarter if it has at most 256 levels from 0 to 1, as masks have.
 
         Raises:
-            InputError: the file cannot be written, as on a full disk.
+            InputError: the file cannot be written, for example because the disk is full.
         """
-        kept, levels = _compact(np.ascontiguousarray(values, np.float32))
+        stored, levels = _compact(np.ascontiguousarray(values, np.float32))
         start = -(-self._end // _PAGE) * _PAGE
         try:
             self._file.seek(start)
-            self._file.write(kept.data)
+            self._file.write(stored.data)
             self._file.flush()
         except OSError as error:
             raise InputError(
-                f"pictures that wait in {tempfile.gettempdir()}: {error.strerror or error}; TMPDIR names another folder"
+                f"temporary file for pictures in {tempfile.gettempdir()}: {error.strerror or error}; set TMPDIR to another folder"
             ) from error
-        self._end = start + kept.nbytes
-        return StoredPicture(self, start, values.shape, kept.dtype, levels)
+        self._end = start + stored.nbytes
+        return StoredPicture(self, start, values.shape, stored.dtype, levels)
 
     def read(self, start: int, size: int) -> bytearray:
-        """Some bytes of the file."""
-        found, done = bytearray(size), 0
+        """Return `size` bytes of the file from `start`."""
+        buffer, done = bytearray(size), 0
         while done < size:
-            read = os.preadv(self._file.fileno(), [memoryview(found)[done:]], start + done)
+            read = os.preadv(self._file.fileno(), [memoryview(buffer)[done:]], start + done)
             if not read:
-                raise InputError("pictures that wait in a temporary file: it has been cut short")
+                raise InputError("temporary file for pictures: it has been truncated")
             done += read
-        return found
+        return buffer
 
     def mapped(self, start: int, size: int) -> mmap.mmap:
-        """A part of the file; `start` is that of a picture."""
+        """Map a part of the file into memory; `start` is the start of an image."""
         return mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ, offset=start)
 
 
 class StoredPicture:
-    """A picture (H, W, ...) of float32, read when it is asked for: `np.asarray` reads all of it, `rows` some pixels.
+    """An image (H, W, ...) of float32 that is read on request: `np.asarray` reads all of it, `rows` reads some pixels.
 
     Attributes:
-        shape, dtype, ndim, size, nbytes: of the array.
+        shape, dtype, ndim, size, nbytes: those of the array.
     """
 
     dtype = np.dtype(np.float32)
 
     def __init__(
-        self, store: PictureStore, start: int, shape: tuple[int, ...], kept: np.dtype, levels: np.ndarray | None
+        self, store: PictureStore, start: int, shape: tuple[int, ...], stored_type: np.dtype, levels: np.ndarray | None
     ):
         self.shape, self.ndim = shape, len(shape)
         self.size = int(np.prod(shape))
         self.nbytes = 4 * self.size
-        self._store, self._start, self._kept, self._levels = store, start, kept, levels
+        self._store, self._start, self._stored_type, self._levels = store, start, stored_type, levels
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         if copy is False:
             raise ValueError("a stored picture is read into new memory")
-        found = np.frombuffer(self._store.read(self._start, self.size * self._kept.itemsize), self._kept)
-        found = self._values(found).reshape(self.shape)
-        return found if dtype is None else found.astype(dtype, copy=False)
+        values = np.frombuffer(self._store.read(self._start, self.size * self._stored_type.itemsize), self._stored_type)
+        values = self._values(values).reshape(self.shape)
+        return values if dtype is None else values.astype(dtype, copy=False)
 
     def __len__(self) -> int:
         return self.shape[0]
 
     def rows(self, pixels: np.ndarray) -> np.ndarray:
-        """The values of these pixels, (N, C), by row-major indices (N,); C is 1 where the picture has two axes."""
+        """Return the values of these pixels, (N, C), by row-major indices (N,); C is 1 for an image with two axes."""
         channels = self.size // (self.shape[0] * self.shape[1])
-        with self._store.mapped(self._start, self.size * self._kept.itemsize) as mapped:
+        with self._store.mapped(self._start, self.size * self._stored_type.itemsize) as mapped:
             mapped.madvise(mmap.MADV_RANDOM)
-            everything = np.frombuffer(mapped, self._kept).reshape(-1, channels)
-            found = everything[pixels]
-            del everything  # else the file cannot be unmapped
-        return self._values(found)
+            everything = np.frombuffer(mapped, self._stored_type).reshape(-1, channels)
+            values = everything[pixels]
+            del everything  # a remaining reference would prevent unmapping
+        return self._values(values)
 
-    def _values(self, kept: np.ndarray) -> np.ndarray:
-        return kept.astype(np.float32) if self._levels is None else self._levels[kept]
+    def _values(self, stored: np.ndarray) -> np.ndarray:
+        return stored.astype(np.float32) if self._levels is None else self._levels[stored]
 
 
 def _compact(values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """What is written, and what its levels stand for."""
+    """Return the stored array, and the values of its levels if it is quantised."""
     if values.ndim == 2 and values.size and values.min() >= 0 and values.max() <= 1:
         index = np.rint(values * _LEVELS).astype(np.uint8)
         levels = np.zeros(_LEVELS + 1, np.float32)

@@ -64,26 +64,26 @@ def read(data: bytes, file: IO[bytes]) -> TiffHeader:
 
 
 def without_orientation(data: bytes) -> bytearray:
-    """Return a file's bytes with the orientation 1. OpenCV turns pixels by that tag even where it is told to ignore it."""
-    found = bytearray(data)
+    """Return a file's bytes with orientation 1. OpenCV applies the tag even if it is set to ignore it."""
+    patched = bytearray(data)
     _, places = _first_tags(data, io.BytesIO(data))
     if place := places.get(_ORIENTATION):
         order = "<" if data[:2] == b"II" else ">"
         value = struct.pack(order + "H", 1).ljust(place.stop - place.start - (12 if _is_big(data) else 8), b"\0")
         count = struct.pack(order + ("Q" if _is_big(data) else "I"), 1)
-        found[place] = struct.pack(order + "HH", _ORIENTATION, 3) + count + value
-    return found
+        patched[place] = struct.pack(order + "HH", _ORIENTATION, 3) + count + value
+    return patched
 
 
 def _is_big(data: bytes) -> bool:
-    """Whether a file is a BigTIFF, with offsets of 64 bits."""
+    """Return whether a file is a BigTIFF, with offsets of 64 bits."""
     return 43 in (data[2], data[3])
 
 
 def _first_tags(data: bytes, file: IO[bytes]) -> tuple[dict[int, int], dict[int, slice]]:
-    """Return the first value of each tag whose type is a whole number, and where its entry lies.
+    """Return the first value of each tag of an integer type, and the position of its entry.
 
-    Raises `ValueError` where width or height are missing.
+    Raises `ValueError` if width or height are missing.
     """
     order = "<" if data[:2] == b"II" else ">"
     big = _is_big(data)
@@ -96,17 +96,17 @@ def _first_tags(data: bytes, file: IO[bytes]) -> tuple[dict[int, int], dict[int,
     length = struct.calcsize(order + entry)
     table = file.read(count * length)
     begin = start + (8 if big else 2)
-    found: dict[int, int] = {}
+    values: dict[int, int] = {}
     places: dict[int, slice] = {}
     for index, (number, kind, many, value) in enumerate(struct.iter_unpack(order + entry, table)):
         if kind not in _TYPES or not many:
             continue
         size = struct.calcsize(order + _TYPES[kind])
-        if many * size > len(value):  # the values lie elsewhere
+        if many * size > len(value):  # the values are stored elsewhere
             file.seek(min(struct.unpack(order + ("Q" if big else "I"), value)[0], 1 << 62))
             value = file.read(size)
-        found.setdefault(number, struct.unpack_from(order + _TYPES[kind], value)[0])
+        values.setdefault(number, struct.unpack_from(order + _TYPES[kind], value)[0])
         places.setdefault(number, slice(begin + index * length, begin + (index + 1) * length))
-    if not {_WIDTH, _HEIGHT} <= set(found):
+    if not {_WIDTH, _HEIGHT} <= set(values):
         raise ValueError("no width or height")
-    return found, places
+    return values, places

@@ -1,4 +1,4 @@
-"""Reading TOML, and in which line of it a field stands. (`tomllib` does not tell.)"""
+"""TOML parsing, and the line of each field, which `tomllib` does not report."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ else:  # pragma: no cover
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
 Place = tuple[str | int, ...]
-"""A field's keys and indices from the top of the file."""
+"""Path of a field: keys and indices from the top of the file."""
 
 LARGEST = 3 << 17
-"""Of a TOML file, in bytes: `tomllib` takes half a second for so many."""
+"""Largest TOML file in bytes: `tomllib` takes half a second for this size."""
 _MOST_DOTS = 200, 1 << 15
-"""In a line and in all: `tomllib` takes quadratic time for a key of many parts."""
+"""Largest number of dots in a line and in the file: `tomllib` takes quadratic time for a key of many parts."""
 
 
 _SYNTAX = re.compile(r"""["'#\[\]{}]""")
@@ -41,7 +41,7 @@ def check(text: str, where: str) -> None:
 
 
 def parse(text: str, where: str) -> dict[str, Any]:
-    """What TOML text says. Raises `InputError`."""
+    """Parse TOML text. Raises `InputError`."""
     check(text, where)
     try:
         return tomllib.loads(text)
@@ -54,19 +54,19 @@ def parse(text: str, where: str) -> dict[str, Any]:
         raise InputError(f"{where}:{line}: not valid TOML: {head} ({column})") from error
     except RecursionError as error:
         raise InputError(f"{where}: not valid TOML: nested too deeply") from error
-    except ValueError as error:  # of numbers without end
+    except ValueError as error:  # excessively long numbers
         raise InputError(f"{where}: not valid TOML: {str(error)[:200]}") from error
 
 
 def encode(text: str, where: str) -> bytes:
-    """Return the bytes of a TOML file that `parse` takes. Raises `InputError` for text that it would refuse or that is no Unicode."""
+    """Return the bytes of a TOML file. Raises `InputError` for text that `parse` rejects or that is not valid Unicode."""
     data = encode_text(text, where)
     parse(text, where)
     return data
 
 
 def array_table(heading: str, fields: Mapping[str, Any]) -> str:
-    """One [[heading]] as people write it: tables among its fields stand in one line each."""
+    """Return one [[heading]] table with each nested table on one line."""
     import tomli_w
 
     def inline(table: Mapping[str, Any]) -> str:
@@ -79,7 +79,7 @@ def array_table(heading: str, fields: Mapping[str, Any]) -> str:
 
 
 def dotted(place: Place) -> str:
-    """("parameters", 0, "bounds") as parameters[0].bounds."""
+    """Format a path: ("parameters", 0, "bounds") as parameters[0].bounds."""
     text = ""
     for part in place:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
@@ -87,10 +87,10 @@ def dotted(place: Place) -> str:
 
 
 def find(text: str, place: Place) -> int:
-    """The line, from 1, where the field at `place` or else the nearest thing around it is given, in valid TOML.
+    """Return the line, from 1, of the field at `place`, or of the nearest enclosing item, in valid TOML.
 
-    A field inside an inline table or array is found by the statement that holds it. A place that is not in the file at
-    all (something is missing) is found by the table it should be in, and by line 1 at the top level.
+    A field inside an inline table or array has the line of its statement. A missing field has the line of its table, or line 1 at the top
+    level.
     """
     known = _lines(text)
     for length in range(len(place), 0, -1):
@@ -100,10 +100,10 @@ def find(text: str, place: Place) -> int:
 
 
 def _lines(text: str) -> dict[Place, int]:
-    """{place: line} of every table header and every assignment."""
-    # Split as TOML does: by line feeds alone (str.splitlines would also split at form feeds and the like).
+    """Return {place: line} of every table header and every assignment."""
+    # TOML separates lines by line feeds only; str.splitlines would also split at form feeds and other characters.
     rows = text.split("\n")
-    found: dict[Place, int] = {}
+    line_of: dict[Place, int] = {}
     counts: dict[Place, int] = {}
     table: Place = ()
     at = 0
@@ -114,25 +114,25 @@ def _lines(text: str) -> dict[Place, int]:
             continue
         statement, end = _statement(rows, at)
         if statement is None:
-            return found
+            return line_of
         path = _path(statement)
         if row.startswith("["):
             table = _through_arrays(path, counts)
             if row.startswith("[["):
                 counts[table] = counts.get(table, -1) + 1
                 table = (*table, counts[table])
-            found.setdefault(table, at + 1)
+            line_of.setdefault(table, at + 1)
         else:
             for length in range(1, len(path) + 1):
-                found.setdefault((*table, *path[:length]), at + 1)
+                line_of.setdefault((*table, *path[:length]), at + 1)
         at = end
-    return found
+    return line_of
 
 
 def _statement(rows: list[str], start: int) -> tuple[dict[str, Any] | None, int]:
-    """The header or key of the statement that begins at row `start`, parsed by itself, and the row after the statement.
+    """Return the parsed header or key of the statement at row `start`, and the row after the statement.
 
-    A statement ends where its brackets and strings do.
+    A statement ends where its brackets and strings are closed.
     """
     depth, quote, end = 0, "", start
     while end < len(rows):
@@ -149,7 +149,7 @@ def _statement(rows: list[str], start: int) -> tuple[dict[str, Any] | None, int]
 
 
 def _open_after(row: str, depth: int, quote: str) -> tuple[int, str]:
-    """How many brackets are open after a row, and by what the string ends that is, "" for none."""
+    """Return the number of open brackets after a row, and the delimiter of an open multi-line string, "" for none."""
     at = 0 if quote or _SYNTAX.search(row) else len(row)
     while at < len(row):
         letter = row[at]
@@ -157,7 +157,7 @@ def _open_after(row: str, depth: int, quote: str) -> tuple[int, str]:
             at += 2
         elif quote and row.startswith(quote, at):
             at += len(quote)
-            if len(quote) == 3:  # before its end a string may have two more of them
+            if len(quote) == 3:  # up to two more quotes may precede the end of the string
                 at += len(row[at : at + 2]) - len(row[at : at + 2].lstrip(letter))
             quote = ""
         elif quote:
@@ -174,7 +174,7 @@ def _open_after(row: str, depth: int, quote: str) -> tuple[int, str]:
 
 
 def _path(statement: dict[str, Any]) -> Place:
-    """The key of a statement whose value is a number."""
+    """Return the key of a statement whose value is a number."""
     path: list[str | int] = []
     value: Any = statement
     while True:
@@ -187,7 +187,7 @@ def _path(statement: dict[str, Any]) -> Place:
 
 
 def _through_arrays(path: Place, counts: dict[Place, int]) -> Place:
-    """A header's path with the index of the latest element after each array of tables on the way."""
+    """Return a header's path with the index of the latest element after each array of tables."""
     through: Place = ()
     for number, part in enumerate(path):
         through = (*through, part)

@@ -1,4 +1,4 @@
-"""TOML files as pydantic models. An error is one line: the file, the line in it, the field, what was expected."""
+"""TOML files as pydantic models, with one-line errors: the file, its line, the field, the expected value."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from unrender.io.toml_lines import Place, dotted
 
 
 class Table(BaseModel):
-    """The fields of one table. Each has a description: what is expected there."""
+    """Fields of one table. Each field's description states the expected value."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -25,33 +25,33 @@ _M = TypeVar("_M", bound=Table)
 
 
 def read(file: Path, model: type[_M], tables: Mapping[str, type[Table]]) -> tuple[_M, str]:
-    """A file's content, and its text with Unix line ends, for `error_at`.
+    """Return a file's content, and its text with Unix line ends for `error_at`.
 
     Args:
-        file: of at most `toml_lines.LARGEST` bytes.
-        model: of the top level.
-        tables: those of the fields that are a table, or a list of tables.
+        file: file of at most `toml_lines.LARGEST` bytes.
+        model: model of the top level.
+        tables: models of the fields that are a table or a list of tables.
 
     Raises:
         InputError: "problem.toml:12: parameters[0].bounds: expected ..., got ...".
-        OSError: where there is no such file.
+        OSError: the file does not exist.
     """
     text = bounded_files.read_text(file, toml_lines.LARGEST).replace("\r\n", "\n")
     try:
         return model.model_validate(toml_lines.parse(text, str(file))), text
     except pydantic.ValidationError as error:
-        # An unknown field first: where its name is misspelt, the right one is missing too.
+        # Report an unknown field first: if a name is misspelt, the correct one is missing too.
         details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
         raise error_at(file, text, *_explain(details[0], model, tables)) from error
 
 
 def error_at(file: Path, text: str, place: Place, what: str) -> InputError:
-    """What is wrong with one field of a file."""
+    """Return the error for one field of a file."""
     return InputError(f"{file}:{toml_lines.find(text, place)}: {dotted(place)}: {what}")
 
 
 def _explain(detail: Any, model: type[Table], tables: Mapping[str, type[Table]]) -> tuple[Place, str]:
-    """The place and the message of one of pydantic's errors, without its own additions about unions and tuples."""
+    """Return the place and message of one of pydantic's errors, without pydantic's additions for unions and tuples."""
     location = detail["loc"]
     place: Place = location[:1]
     if len(location) >= 2 and location[0] in tables:

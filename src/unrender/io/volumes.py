@@ -1,7 +1,7 @@
-"""Grids of voxels in files: Mitsuba's `.vol`, NumPy's `.npy`, and `.npz` with one array.
+"""Voxel grids in files: Mitsuba's `.vol`, NumPy's `.npy`, and `.npz` with one array.
 
-A `.vol` file (little endian): "VOL", the version 3, the type of its numbers (1: float32, the only one that Mitsuba 3 reads), sizes
-along x, y and z, channels, a box (least x, y, z, greatest x, y, z), then the numbers: channels run fastest, then x, y, z.
+A `.vol` file (little endian) contains "VOL", the version 3, the number type (1: float32, the only one that Mitsuba 3 reads), the sizes
+along x, y and z, the number of channels, a box (minimum x, y, z, maximum x, y, z), and the numbers. Channels vary fastest, then x, y, z.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from unrender.core.errors import InputError
 from unrender.io import bounded_files, files
 
 READABLE = (".vol", ".npy", ".npz")
-"""File name endings that `read_grid` knows."""
+"""File name extensions that `read_grid` supports."""
 
 MOST_VALUES = 1 << 28
-"""Numbers of the largest grid that is read: one gigabyte in single precision."""
+"""Largest number of values of a grid: one gigabyte in single precision."""
 
 UNIT_BOX = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
 
@@ -37,12 +37,12 @@ _OTHERS = {2: "float16", 3: "uint8", 4: "quantised directions"}
 
 @dataclass(frozen=True)
 class Grid:
-    """Voxels and the place that a file gives them.
+    """Voxels and their bounding box.
 
     Attributes:
         values: (Z, Y, X, C) float32, finite.
-        box: least x, y, z, greatest x, y, z: what `.vol` files tell, and Mitsuba goes by only where `use_grid_bbox` is set; the unit
-            cube for NumPy's.
+        box: minimum x, y, z, maximum x, y, z from a `.vol` file, which Mitsuba uses only if `use_grid_bbox` is set; the unit cube for
+            NumPy files.
     """
 
     values: np.ndarray
@@ -50,17 +50,17 @@ class Grid:
 
 
 def read_grid(path: str | Path, check: Callable[[Shape], None] | None = None) -> Grid:
-    """The grid in a file.
+    """Read the grid of a file.
 
-    Arrays (Z, Y, X) count as grids of one channel; whole numbers are taken as they are.
+    Arrays (Z, Y, X) are grids of one channel. Integers are converted without scaling.
 
     Args:
-        path: one of `READABLE`.
-        check: shown the shape (Z, Y, X, C) that the header declares, before memory is taken; raises `InputError` for one that does
-            not suit.
+        path: file of a kind in `READABLE`.
+        check: function of the declared shape (Z, Y, X, C), called before memory is allocated; raises `InputError` for an unsuitable one.
 
     Raises:
-        InputError: no such file, malformed, of another shape, too large, or not finite. One line, the file first.
+        InputError: one line that begins with the file: it is missing or malformed, or the grid has an unsupported shape, is too large, or
+            is not finite.
     """
     file = _existing(Path(path))
 
@@ -78,17 +78,17 @@ def read_grid(path: str | Path, check: Callable[[Shape], None] | None = None) ->
 
 
 def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -> Path:
-    """Write a grid, beside its place first. Returns `path`.
+    """Write a grid atomically. Returns `path`.
 
-    A `.vol` file that was read is written back bit for bit. Numbers of `.vol` files are float32.
+    A `.vol` file that was read is written back bit for bit. `.vol` files contain float32.
 
     Args:
-        path: one of `READABLE`, which says the format.
+        path: file of a kind in `READABLE`, which determines the format.
         values: (Z, Y, X, C) or (Z, Y, X), or a `mitsuba.VolumeGrid`, which keeps its own box (`.vol` only).
-        box: see `Grid`; NumPy's files do not hold it.
+        box: see `Grid`; NumPy files do not store it.
 
     Raises:
-        InputError: values or box are no such thing, or the file cannot be written.
+        InputError: the values or the box are invalid, or the file cannot be written.
     """
     file = Path(path)
     ending = file.suffix.lower()
@@ -118,7 +118,7 @@ def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -
 
 
 def read_numpy(path: Path, check: Callable[[Shape], None] | None = None) -> np.ndarray:
-    """The array of a `.npy` file, or the only one of an `.npz` archive, as float32 of any shape. Raises `InputError`."""
+    """Read the array of a `.npy` file, or the only one of an `.npz` archive, as float32 of any shape. Raises `InputError`."""
     file = _existing(path)
 
     def named(shape: Shape) -> None:
@@ -139,7 +139,7 @@ def read_numpy(path: Path, check: Callable[[Shape], None] | None = None) -> np.n
 
 
 def check_vol(path: Path) -> int:
-    """How many numbers a `.vol` file holds. Raises `InputError` where it is none, or does not hold what its header declares."""
+    """Return the number of values of a `.vol` file. Raises `InputError` if it is malformed or its size differs from its header."""
     with bounded_files.open_regular(path) as file:
         shape, _ = _vol_header(file, path, _check_size)
     return math.prod(shape)
@@ -173,7 +173,7 @@ def _read_vol(path: Path, check: Callable[[Shape], None]) -> Grid:
 
 
 def _vol_header(file: IO[bytes], path: Path, check: Callable[[Shape], None]) -> tuple[Shape, tuple[float, ...]]:
-    """Shape (Z, Y, X, C) and box; the numbers follow. Raises `InputError`."""
+    """Return the shape (Z, Y, X, C) and the box; the file is then at its numbers. Raises `InputError`."""
     try:
         head = file.read(_HEADER.size)
         if head[:3] != _MAGIC[:3]:
