@@ -36,7 +36,7 @@ def test_pictures_come_back_exactly_whole_and_by_pixels() -> None:
             values.nbytes,
             values.dtype,
         )
-        assert found._kept.itemsize == size, name
+        assert found._stored_type.itemsize == size, name
         pixels = np.array([3, 0, 3, values.shape[0] * values.shape[1] - 1])
         np.testing.assert_array_equal(found.rows(pixels), values.reshape(values.shape[0] * values.shape[1], -1)[pixels])
 
