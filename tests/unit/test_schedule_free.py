@@ -273,7 +273,7 @@ def test_it_is_stored_and_made_again():
     ("options", "message"),
     [
         ({"learning_rate": 0.0}, "learning_rate"),
-        ({"learning_rate": {"a": 0.1}}, "needs the rate of the others"),
+        ({"learning_rate": {"a": 0.1}}, "needs a rate for the other parameters"),
         ({"learning_rate": {"*": -1.0}}, "learning_rate"),
         ({"beta": 1.0}, "beta"),
         ({"beta_2": -0.1}, "beta_2"),

@@ -167,7 +167,7 @@ def test_a_clipped_mean_is_clipped_after_debiasing() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Chain((AgreementRate(),)), "AgreementRate: no transform before it remembers .* FittedSobolev"),
+        (lambda: Chain((AgreementRate(),)), "AgreementRate: no transform before it stores .* FittedSobolev"),
         (lambda: Chain((FittedSobolev(), WienerShrinkage(("map",)))), "FittedSobolev must precondition map"),
         (lambda: Chain((WienerShrinkage(("mop",)),)), 'unknown parameter "mop"'),
         (lambda: Chain((PerParameter(("mop",)),)), 'unknown parameter "mop"'),

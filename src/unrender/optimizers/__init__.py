@@ -1,4 +1,4 @@
-"""Optimizers: steps from estimates."""
+"""Optimizers, which compute steps from gradient estimates."""
 
 from unrender import schedules
 from unrender.optimizers.adam import Adam

@@ -19,20 +19,19 @@ from unrender.schedules.functions import Schedule
 @register
 @dataclass(frozen=True)
 class Adam(Recipe):
-    """Steps −η m̂ / (√v̂ + ε): the debiased mean of the gradient over the root of its debiased mean square, per
-    element.
+    """Steps −η m̂ / (√v̂ + ε), with the debiased mean m̂ and the debiased mean square v̂ of the gradient, per element.
 
-    At a first gradient g the step is −η sign(g), whatever the loss's scale. Elements whose gradient is 0 keep moving
-    by their momentum for some steps. The chain is `GradientMean`, `ScaleByRms`.
+    The first step for a gradient g is −η sign(g), whatever the scale of the loss. Elements whose gradient becomes 0 continue by momentum
+    for some steps. The chain is `GradientMean`, `ScaleByRms`.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
+        learning_rate: η, in units of the parameter, > 0, for the parameters without their own; or {key: rate, "*": rate of the others}.
         beta_1: decay of the mean, in [0, 1).
         beta_2: decay of the mean square, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
         schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
-        uniform: whether all elements of a parameter share one rate: √v̂ is that of the element with the largest v̂ (Nicolet et al. 2021).
-            For vertices of a mesh with `preconditioners.LargeSteps`, whose steps stay as smooth as their gradients.
+        uniform: whether all elements of a parameter share the largest v̂ (Nicolet et al. 2021). It suits mesh vertices with
+            `preconditioners.LargeSteps`, because steps stay as smooth as the gradients.
     """
 
     learning_rate: float | Mapping[str, float] = 0.01

@@ -1,4 +1,4 @@
-"""Newton's method on the mean of all quadratic models so far: recursive least squares."""
+"""Newton's method on the weighted mean of all quadratic models, i.e. recursive least squares."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from unrender.optimizers.directions import coordinate_scales
 from unrender.optimizers.newton import trust_region_step
 
 _FEWEST_MODELS = 8.0
-"""Models in the mean from which on their scatter tells a standard error."""
+"""Number of models from which their scatter gives a standard error."""
 _WEAK_SHARE = 0.01
-"""Share of an element in directions that are held back, as a square, from which on it has no standard error."""
+"""Squared share of an element in damped directions above which it has no standard error."""
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,15 @@ class AveragedNewtonState:
     """State between steps.
 
     Attributes:
-        learning_rates: of each parameter: its scale.
+        learning_rates: learning rate of each parameter, its scale.
         matrix: A, the mean of the Hessians, (n, n), double precision on the host.
-        target: b, the mean of H x - g, (n,): the mean model is least where A x = b.
-        noise: the mean of what noise adds to squares of derivatives, (n, n), see `HessianNoise`.
-        shares: of that, what is left in the mean, (n,): the sum of the squared weights of its models.
-        counts: how many models each element's mean is of, (n,); fewer where steps have been long.
-        lengths: of the last step, in units of the trust region, of the elements that moved together, (n,).
-        scatter: covariance of `target` by noise, (n, n): the sum over models of their squared weights times the squared difference of
-            each model's gradient from that of the mean before it.
+        target: b, the mean of H x − g, (n,). The mean model has its minimum where A x = b.
+        noise: mean contribution of noise to squared derivatives, (n, n), see `HessianNoise`.
+        shares: fraction of that contribution in the mean, (n,): the sum of the squared weights of the models.
+        counts: effective number of models in each element's mean, (n,); long steps reduce it.
+        lengths: length of the last step of the elements that moved together, in units of the trust region, (n,).
+        scatter: covariance of `target` from noise, (n, n): the sum over models of the squared weight times the squared difference between
+            the model's gradient and that of the previous mean.
     """
 
     learning_rates: dict[str, float]
@@ -51,30 +51,30 @@ class AveragedNewtonState:
 @register
 @dataclass(frozen=True)
 class AveragedNewton:
-    """The minimum of the weighted mean of the quadratic models g_tᵀ (x − x_t) + (x − x_t)ᵀ H_t (x − x_t) / 2 of all steps t.
+    """Minimum of the weighted mean of the quadratic models g_tᵀ (x − x_t) + (x − x_t)ᵀ H_t (x − x_t) / 2 of all steps t.
 
-    With A and b the means of H_t and H_t x_t − g_t, it is where A x = b. In the mean, the new model has the weight (1 + r) / (k + 1 + r)
-    after k others, so that models count by about k^r, and near the solution the noise of n steps falls as 1 / √n, with no learning rate
-    and no length of the run to be known. After a step of length m it has the weight m² / (1 + m²) at least, and k falls to what that
-    stands for: models are of where they were made. With exact models of a quadratic loss, the first step is Newton's.
+    With the means A of H_t and b of H_t x_t − g_t, the minimum solves A x = b. After k models, the next one has the weight (1 + r) / (k +
+    1 + r), so that weights grow as k^r. Near the solution the noise of n steps then decreases as 1 / √n, without a learning rate or a
+    known length of the run. After a step of length m the weight is at least m² / (1 + m²), and k is reduced to match, because models are
+    valid where they were made. With exact models of a quadratic loss, the first step is Newton's.
 
-    Where derivatives are noisy (`HessianNoise`, N), the step is (A + σ N)⁻¹ (b − A x), with the mean of N and the sum σ of the squared
-    weights of the models: what noise would add to A if it were made of the mean derivatives. So directions that are noise alone hardly
-    move, until enough steps tell more. A + σ N is taken in coordinates in which its diagonal is 1, with the magnitudes of its
-    eigenvalues, none below `damping` times the largest. A damped direction takes more steps, and ends at the same place.
+    With noisy derivatives (`HessianNoise`, N), the step is (A + σ N)⁻¹ (b − A x), with the mean of N and the sum σ of the models' squared
+    weights. σ N is what noise would add to A if A were built from the mean derivatives. Directions that consist of noise hardly move
+    until there are enough steps. A + σ N is scaled to a unit diagonal, and the magnitudes of its eigenvalues are at least `damping` times
+    the largest. A damped direction takes more steps to the same solution.
 
-    Parameters that A does not connect take steps of their own, each within its own trust region: the minimum of the model for
-    ‖s‖ <= Δ. Lengths are in the coordinates x / η with each parameter's learning rate η, times the σ of smoothed derivatives or the
-    widths of differences (`Estimate.sigma`).
+    Parameters that A does not connect take separate steps, each in its own trust region: the minimum of the model for ‖s‖ <= Δ. Lengths
+    are in coordinates x / η with each parameter's learning rate η, times the σ of smoothed derivatives or the widths of differences
+    (`Estimate.sigma`).
 
-    An estimate that is not finite counts for nothing. Costs O(n³) time and O(n²) memory for n parameters in all.
+    An estimate that is not finite is ignored. Takes O(n³) time and O(n²) memory for n parameters in total.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
+        learning_rate: η, in units of the parameter, > 0, for the parameters without their own.
         averaging: r, >= 0.
-        trust_radius: Δ, > 0; None for no limit. Where noise alone moves the minimum by more than 1, nothing is averaged: a Δ below 1,
-            such as 0.3, averages there, too.
-        damping: in (0, 1).
+        trust_radius: Δ, > 0; None for no limit. If noise moves the minimum by more than 1, nothing is averaged; a Δ below 1, such as 0.3,
+            averages even then.
+        damping: smallest eigenvalue relative to the largest, in (0, 1).
     """
 
     learning_rate: float = 1.0
@@ -103,14 +103,16 @@ class AveragedNewton:
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
     ) -> tuple[Tree, AveragedNewtonState]:
-        """See `Optimizer.update`. On the host."""
+        """Return the steps and the next state. Computed on the host."""
         hessian = arrays.numpy(estimate.require("AveragedNewton", Hessian).matrix).astype(np.float64)
         gradient, x = vectors.ravel(estimate.gradient), vectors.ravel(parameters)
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
             return vectors.unravel(np.zeros_like(x), parameters), state
         hessian = 0.5 * (hessian + hessian.T)
-        found = estimate.get(HessianNoise)
-        added = np.zeros_like(hessian) if found is None else arrays.numpy(found.matrix).astype(np.float64)
+        noise_estimate = estimate.get(HessianNoise)
+        added = (
+            np.zeros_like(hessian) if noise_estimate is None else arrays.numpy(noise_estimate.matrix).astype(np.float64)
+        )
         if not np.isfinite(added).all():
             added = np.zeros_like(hessian)
         scale = coordinate_scales(estimate, state, parameters)
@@ -140,10 +142,10 @@ class AveragedNewton:
         )
 
     def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:
-        """See `Measuring`: of A⁻¹ b, from the scatter of the models' gradients about those of the mean.
+        """Return the standard errors of A⁻¹ b, from the scatter of the models' gradients about those of the mean.
 
-        It is of the run's own noise, not of the references', nor of what differences of a width leave out. It needs some ten models.
-        Parameters with a share in a direction that `damping` holds back have none: the step there is not the whole one to A⁻¹ b.
+        They cover the run's own noise, not that of the references, nor the bias of finite differences. They need about ten models.
+        Parameters with a share in a damped direction have none, because their step to A⁻¹ b is incomplete.
         """
         errors = np.full(len(state.matrix), np.nan)
         for block in _blocks(state.matrix != 0.0):
@@ -154,8 +156,8 @@ class AveragedNewton:
             eigenvalues, directions = np.linalg.eigh(state.matrix[both] / np.outer(units, units))
             weak = eigenvalues <= self.damping * eigenvalues.max()
             inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / np.outer(units, units)
-            found = np.sqrt(np.abs(np.diag(inverse @ state.scatter[both] @ inverse)))
-            errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.nan, found)
+            error = np.sqrt(np.abs(np.diag(inverse @ state.scatter[both] @ inverse)))
+            errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.nan, error)
         split = vectors.parts(errors[None], parameters)
         counts = vectors.parts(state.counts[None], parameters)
         return {
@@ -165,27 +167,27 @@ class AveragedNewton:
         }
 
     def _weight(self, count: float, length: float) -> float:
-        """Of a model in the mean, after so many others and a step of this length."""
+        """Return the weight of a model after `count` others and a step of this length."""
         usual = (1.0 + self.averaging) / (count + 1.0 + self.averaging)
         return max(usual, length * length / (1.0 + length * length))
 
     def _solve(self, matrix: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """The step of one block, in coordinates in units of the trust region."""
+        """Return the step of one block, in units of the trust region."""
         units = np.sqrt(np.abs(np.diag(matrix)))
         if not units.all():
             return np.zeros_like(gradient)
         eigenvalues, eigenvectors = np.linalg.eigh(matrix / np.outer(units, units))
         curvatures = np.abs(eigenvalues)
         curvatures = np.maximum(curvatures, self.damping * curvatures.max())
-        whole = units[:, None] * (eigenvectors * curvatures) @ eigenvectors.T * units
-        curvatures, eigenvectors = np.linalg.eigh(0.5 * (whole + whole.T))
+        hessian = units[:, None] * (eigenvectors * curvatures) @ eigenvectors.T * units
+        curvatures, eigenvectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
         return eigenvectors @ trust_region_step(
             np.maximum(curvatures, 0.0), eigenvectors.T @ gradient, self.trust_radius
         )
 
 
 def _blocks(connected: np.ndarray) -> list[np.ndarray]:
-    """The elements that are connected, directly or by others, from a symmetric matrix of pairs (n, n); those without any are left out."""
+    """Return the connected components of a symmetric adjacency matrix (n, n), as lists of elements; isolated ones are omitted."""
     from scipy.sparse.csgraph import connected_components
 
     number, labels = connected_components(connected, directed=False)

@@ -1,4 +1,4 @@
-"""The protocol of optimizers."""
+"""Protocols of optimizers."""
 
 from __future__ import annotations
 
@@ -12,57 +12,58 @@ from unrender.preconditioners.mesh import MeshTopology
 
 
 class Optimizer(Protocol):
-    """Computes steps from estimates. Immutable; all that changes is in the state."""
+    """Immutable optimizer, which computes steps from estimates. Everything that changes is in the state."""
 
     @property
     def requires(self) -> AbstractSet[str]:
-        """What the estimator must provide: `Capabilities` of types, e.g. `Capabilities(Gradient, Variance)`; reads as a set of names."""
+        """Capabilities that the estimator must provide, e.g. `Capabilities(Gradient, Variance)`; also a set of names."""
         ...
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> Any:
-        """The state before the first step: a dataclass of arrays.
+        """Return the state before the first step, a dataclass of arrays.
 
-        `learning_rates` holds the parameters that have their own; the others take the optimizer's.
+        `learning_rates` contains the parameters with their own rates; the others use the optimizer's.
         """
         ...
 
     def update(self, estimate: Estimate, state: Any, parameters: Tree) -> tuple[Tree, Any]:
-        """The steps to add to the parameters, and the next state."""
+        """Return the steps to add to the parameters, and the next state."""
         ...
 
 
 @runtime_checkable
 class OnMeshes(Protocol):
-    """An optimizer that has preconditioners which need to know the neighbours of a parameter's elements."""
+    """An optimizer with preconditioners that depend on the neighbours of a parameter's elements."""
 
     def on_meshes(
         self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
     ) -> Optimizer:
-        """Return the same for a problem's parameters.
+        """Return the optimizer for a problem's parameters.
 
         Args:
-            topology: returns the mesh of a parameter; None for what has none.
-            repeated: returns the number of outer columns that repeat those of the opposite end; None where no parameter has any.
+            topology: function from a key to the parameter's mesh; None if it has none.
+            repeated: function from a key to the number of repeated border columns; None if no parameter has any.
         """
         ...
 
 
 @runtime_checkable
 class Measuring(Protocol):
-    """An optimizer that measures how far noise moves its result."""
+    """An optimizer that estimates the standard errors of its result from noise."""
 
     def standard_errors(self, state: Any, parameters: Tree) -> Tree:
-        """Return the standard error of each element, {key: array} of the shapes of `parameters`, by the coordinates of the descent.
+        """Return the standard error of each element, {key: array} with the shapes of `parameters`, in the coordinates of the
+        optimisation.
 
-        Parameters without one are left out.
+        Parameters without an estimate are omitted.
         """
         ...
 
 
 @runtime_checkable
 class Choosing(Protocol):
-    """An optimizer that finds settings of its own as it goes."""
+    """An optimizer that adapts some of its settings."""
 
     def choices(self, state: Any) -> tuple[str, ...]:
-        """What it has chosen so far, a line each, for people."""
+        """Return the settings chosen so far for display, one line each."""
         ...

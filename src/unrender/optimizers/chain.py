@@ -28,10 +28,10 @@ class ChainState:
     """State of a chain between steps.
 
     Attributes:
-        step: Number of steps made so far.
-        learning_rates: {key: η} before schedule and factors.
-        states: States of the transforms, in their order.
-        begun: Step at which these states began.
+        step: Number of steps so far.
+        learning_rates: {key: η}, without schedule and factors.
+        states: States of the transforms, in order.
+        begun: Step at which these states started.
     """
 
     step: int
@@ -40,18 +40,18 @@ class ChainState:
     begun: int = 0
 
     def of(self, kind: type[S]) -> S:
-        """Return the first state of this type. Raise `KeyError` where there is none."""
+        """Return the first state of this type. Raise `KeyError` if there is none."""
         for state in self.states:
             if isinstance(state, kind):
                 return state
         raise KeyError(kind.__name__)
 
     def upsampled(self, upsampler: Upsampler) -> ChainState:
-        """See `Upsamplable`: as each of the states."""
+        """Interpolate each of the states."""
         return replace(self, states=tuple(upsampled(state, upsampler) for state in self.states))
 
     def restarted(self, fresh: ChainState) -> ChainState:
-        """See `Restartable`: the schedule goes on; the transforms begin at this step."""
+        """Continue the schedule, and restart the transforms at this step."""
         pairs = zip(self.states, fresh.states, strict=True)
         states = tuple(restarted(state, begun) for state, begun in pairs)
         return replace(fresh, step=self.step, begun=self.step, states=states)
@@ -73,7 +73,7 @@ class Recipe(ABC):
 
     @property
     def requires(self) -> Capabilities:
-        """A gradient, and what the transforms require."""
+        """A gradient, and the capabilities that the transforms require."""
         return Capabilities(Gradient, *(kind for part in self._composed for kind in part.requires))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
@@ -81,7 +81,7 @@ class Recipe(ABC):
         return ChainState(0, own, tuple(part.init(parameters, own) for part in self._composed))
 
     def update(self, estimate: Estimate, state: ChainState, parameters: Tree) -> tuple[Tree, ChainState]:
-        """See `Optimizer.update`. Lazy on Dr.Jit unless a transform waits: evaluate steps and state together."""
+        """Return the steps and the next state. Lazy on Dr.Jit unless a transform waits: evaluate both together."""
         factor = rates.factor(type(self).__name__, self.schedule, state.step)
         made, gradient = state.step - state.begun, estimate.gradient
         update = StepUpdate(estimate, parameters, made, state.learning_rates, gradient, gradient, factor)
@@ -96,7 +96,7 @@ class Recipe(ABC):
         return steps, replace(state, step=state.step + 1, states=tuple(states))
 
     def choices(self, state: ChainState) -> tuple[str, ...]:
-        """See `Choosing`."""
+        """Return the choices of the transforms, one line each."""
         made, pairs = state.step - state.begun, zip(self._composed, state.states, strict=True)
         return tuple(line for part, own in pairs for line in part.choices(own, made))
 
@@ -104,15 +104,15 @@ class Recipe(ABC):
 @register
 @dataclass(frozen=True)
 class Chain(Recipe):
-    """Transforms one after the other, and last a step against the direction: −η × direction.
+    """Sequence of transforms, followed by a step against the direction: −η × direction.
 
         Chain((GradientMean(0.9), ScaleByRms(0.999)), learning_rate=0.01)
 
-    This example is Adam. A transform receives the gradient as its predecessor has left it, so the order matters.
+    This example is Adam. A transform gets the direction from the previous one, so the order matters.
 
     Args:
-        transforms: First to last; see `unrender.optimizers.transforms`.
-        learning_rate: η, in units of the parameter for a direction of size 1, > 0. Or {key: rate, "*": of the others}.
+        transforms: Transforms in order; see `unrender.optimizers.transforms`.
+        learning_rate: η, in units of the parameter for a direction of size 1, > 0; or {key: rate, "*": rate of the others}.
         schedule: Factor of every learning rate by step; see `unrender.schedules.functions`.
     """
 

@@ -1,4 +1,4 @@
-"""CMA-ES (Hansen and Ostermeier 1996), a search by losses alone: the baseline of methods without derivatives, on the `cma` package."""
+"""CMA-ES (Hansen and Ostermeier 1996), a derivative-free search on the `cma` package: the baseline of methods without derivatives."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.optimizers import rates
 
 _TOLERANCE = 0.01
-"""Distance of the parameters from the mean, in standard deviations, up to which they count as equal."""
+"""Distance between parameters and mean, in standard deviations, below which they count as equal."""
 
 
 @dataclass(frozen=True)
 class CMAESState:
     """State between steps: the ranks of all generations, from which the search is reproduced with its seed.
 
-    The first step after a checkpoint is read repeats the arithmetic of all generations, without evaluating losses; the search then
-    continues as if uninterrupted.
+    The first step after a checkpoint repeats the arithmetic of all generations without evaluating losses, and then continues as if
+    uninterrupted.
 
     Attributes:
-        learning_rates: of each parameter: its scale.
-        start: (n,), the first mean, in the scaled coordinates u.
-        ranks: (generations, population) integers: each point's rank in its generation, from 0, the least loss; equal losses have equal
-            ranks.
-        held: (k,), the generations before which bounds kept the parameters from the mean.
-        held_at: (k, n), the parameters there, in u.
+        learning_rates: learning rate of each parameter, its scale.
+        start: first mean in the scaled coordinates u, (n,).
+        ranks: (generations, population) integers: rank of each point in its generation, from 0 for the smallest loss; equal losses have
+            equal ranks.
+        held: generations before which bounds moved the parameters away from the mean, (k,).
+        held_at: the parameters at those generations, in u, (k, n).
     """
 
     learning_rates: dict[str, float]
@@ -45,37 +45,37 @@ class CMAESState:
     held: np.ndarray
     held_at: np.ndarray
 
-    # A cache of the search at this state, not a field: it moves on to the next state, and is rebuilt from the ranks where it is missing.
+    # Cache of the search at this state, not a field: it moves to the next state, and is rebuilt from the ranks if it is missing.
     _search: ClassVar[_Search | None] = None
 
 
 @register
 @dataclass(frozen=True)
 class CMAES:
-    """One generation of CMA-ES a step: points are drawn from a Gaussian around a mean, their losses ranked, and mean and covariance moved
-    towards the better ones. The step ends at the new mean.
+    """One generation of CMA-ES per step.
 
-    Invariant to any monotonic function of the loss. Every point of a generation is evaluated with the same random numbers, other ones in
-    the next generation. Losses that are not finite rank last. A generation whose losses are all equal, on a plateau or where none is
-    finite, makes no step and no update; the next one draws other points.
+    Points are sampled from a Gaussian around the mean, and mean and covariance move towards the points with lower losses. The step ends
+    at the new mean. The search is invariant to monotonic functions of the loss. All points of a generation share random numbers, which
+    change with each generation. Losses that are not finite rank last. If all losses of a generation are equal, as on a plateau, there is
+    no step and no update; the next generation samples other points.
 
-    Scales: the search is for u = x / η with each parameter's learning rate η; its first standard deviation is `sigma0` η, the same in all
+    Scales: the search uses u = x / η with each parameter's learning rate η. Its first standard deviation is `sigma0` η, the same in all
     directions of u.
 
-    Bounds are the caller's, who projects the parameters onto them. Where the parameters differ from the mean, the search takes them as its
-    mean, and from then on clips the points that it draws to that bound. (Beyond it the loss is that of the bound, and unclipped points
-    would make the mean drift, or the deviations explode, in directions that no loss depends on. `cma`'s own handling of bounds did much
-    worse on a quadratic with a few of them.) So nothing but steps and bounds may move the parameters during a search.
+    Bounds: the caller projects the parameters onto them. If the parameters differ from the mean, the search adopts them as its mean, and
+    clips later points to that bound. (Beyond a bound the loss is that of the bound. Unclipped points would let the mean drift, or the
+    deviations explode, in directions without influence on the loss. `cma`'s own bound handling performed much worse on a quadratic with a
+    few bounds.) So only steps and bounds may change the parameters during a search.
 
-    Costs O(n²) time a point and O(n²) memory, and O(n³) every few generations; O(n) with `diagonal`. The state grows by `population`
-    numbers a generation, and by n each time a bound is found.
+    Takes O(n²) time per point and O(n²) memory, plus O(n³) every few generations; O(n) with `diagonal`. The state grows by `population`
+    numbers per generation, and by n per bound.
 
     Args:
-        sigma0: the first standard deviation, in units of η, > 0: about a third of the distance to where the optimum may be.
-        population: λ, points a generation, >= 4; None for 4 + ⌊3 log n⌋. More suits noise.
-        seed: of the points drawn, >= 0.
-        diagonal: adapt the variances of the parameters only, not their covariances: for more than some hundred.
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own.
+        sigma0: first standard deviation, in units of η, > 0: about a third of the expected distance to the optimum.
+        population: λ, points per generation, >= 4; None for 4 + ⌊3 log n⌋. Noise needs more.
+        seed: seed of the sampled points, >= 0.
+        diagonal: whether only variances are adapted, not covariances; for more than a few hundred parameters.
+        learning_rate: η, in units of the parameter, > 0, for the parameters without their own.
     """
 
     sigma0: float = 0.3
@@ -95,7 +95,7 @@ class CMAES:
 
     @property
     def requires(self) -> Capabilities:
-        """The loss at points of its own."""
+        """The loss at points chosen by the optimizer."""
         return Capabilities(LossFunction)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> CMAESState:
@@ -106,10 +106,10 @@ class CMAES:
         return CMAESState(own, start, ranks, held, np.zeros((0, start.size)))
 
     def update(self, estimate: Estimate, state: CMAESState, parameters: Tree) -> tuple[Tree, CMAESState]:
-        """See `Optimizer.update`. On the host. Raises `InputError` for losses of another shape than one per point."""
+        """Return the step of one generation and the next state. On the host. Raises `InputError` unless there is one loss per point."""
         evaluate = estimate.require("CMAES", LossFunction).evaluate
         search = state._search or self._replay(state)
-        object.__setattr__(state, "_search", None)  # it is about to change
+        object.__setattr__(state, "_search", None)  # the search advances to the next state
         scale = vectors.repeat_per_element(state.learning_rates, parameters)
         here, generation = vectors.ravel(parameters) / scale, len(state.ranks)
         if search.differs(here):
@@ -128,7 +128,7 @@ class CMAES:
         return vectors.unravel(step, parameters), state
 
     def _replay(self, state: CMAESState) -> _Search:
-        """The search at a state, from its ranks."""
+        """Rebuild the search at a state from its ranks."""
         search = _Search(state.start, self.sigma0, state.ranks.shape[1], self.diagonal)
         held = dict(zip(state.held.tolist(), state.held_at, strict=True))
         for generation, ranks in enumerate(state.ranks):
@@ -143,20 +143,20 @@ class CMAES:
 
 
 def _ranks(losses: np.ndarray) -> np.ndarray:
-    """Ranks from 0, the least; equal losses have equal ranks, and those that are not finite the last."""
+    """Return ranks from 0 for the smallest loss; equal losses have equal ranks, and those that are not finite the last."""
     known = np.where(np.isfinite(losses), losses, np.inf)
     return np.unique(known, return_inverse=True)[1].astype(np.int32)
 
 
 class _Search:
-    """`cma.CMAEvolutionStrategy` that prints nothing, writes no file and draws from the generator it is given."""
+    """`cma.CMAEvolutionStrategy` without output, with an explicit random generator."""
 
     def __init__(self, start: np.ndarray, sigma0: float, population: int, diagonal: bool):
         self._least, self._most = np.full(start.size, -math.inf), np.full(start.size, math.inf)
         self._random = np.random.default_rng(0)
         self._points = np.zeros((0, start.size))
         with _quiet():
-            import cma  # here, since it takes a second and few need it
+            import cma  # imported here because it takes a second
 
             options = {
                 "popsize": population,
@@ -164,7 +164,7 @@ class _Search:
                 # Badly conditioned covariances are rescaled per coordinate, but never by a change of coordinates.
                 "conditioncov_alleviate": [1e8, math.inf],
                 "randn": lambda *shape: self._random.standard_normal(shape),
-                "seed": math.nan,  # not to seed NumPy's global generator
+                "seed": math.nan,  # does not seed NumPy's global generator
                 "verbose": -10,
                 "verb_disp": 0,
                 "verb_log": 0,
@@ -173,34 +173,36 @@ class _Search:
 
     @property
     def mean(self) -> np.ndarray:
-        """(n,)."""
+        """Mean of the distribution, (n,)."""
         return np.array(self._strategy.mean)
 
     def differs(self, here: np.ndarray) -> bool:
-        """Whether `here` (n,) differs from the mean."""
+        """Return whether `here` (n,) differs from the mean."""
         return bool(np.any(np.abs(here - self._strategy.mean) > self._tolerance()))
 
     def bound_at(self, here: np.ndarray) -> None:
-        """Make `here` (n,) the mean, and a bound in each dimension where it differs from the earlier mean."""
+        """Make `here` (n,) the mean, and a bound in each dimension where it differs from the previous mean."""
         mean, near = self._strategy.mean, self._tolerance()
         self._least = np.where(here > mean + near, here, self._least)
         self._most = np.where(here < mean - near, here, self._most)
         self._strategy.mean = here.copy()
 
     def draw(self, random: np.random.Generator) -> np.ndarray:
-        """(population, n): the next generation, or other points of this one if all of its ranks were equal."""
+        """Return the next generation, (population, n), or other points of this one if all of its ranks were equal."""
         self._random, strategy = random, self._strategy
         with _quiet():
-            if len(self._points):  # its first two may be a mirrored pair along the last step, drawn only once
-                drawn = [*self._points[:2], *(strategy.ask(1)[0] for _ in self._points[2:])]
+            if len(
+                self._points
+            ):  # the first two may be a mirrored pair along the last step, which is sampled only once
+                points = [*self._points[:2], *(strategy.ask(1)[0] for _ in self._points[2:])]
             else:
-                drawn = strategy.ask()
-        strategy.sent_solutions.clear()  # an archive of what it drew, for when that is told in other coordinates
-        self._points = np.clip(drawn, self._least, self._most)
+                points = strategy.ask()
+        strategy.sent_solutions.clear()  # an archive of the points, needed only if they are passed back in other coordinates
+        self._points = np.clip(points, self._least, self._most)
         return self._points
 
     def update(self, ranks: np.ndarray) -> None:
-        """Update by the ranks (population,) of the points drawn last; no update where all are equal."""
+        """Update by the ranks (population,) of the last points; no update if all are equal."""
         if ranks.any():
             with _quiet():
                 self._strategy.tell(list(self._points), ranks.astype(np.float64).tolist(), check_points=False)
@@ -212,7 +214,7 @@ class _Search:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without warnings of the `cma` package, and without those it adds to the filters."""
+    """Suppress the warnings of the `cma` package, and its changes to the warning filters."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

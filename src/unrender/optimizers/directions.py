@@ -1,7 +1,6 @@
-"""How a search direction becomes a step: what `Newton`, `NewtonCG` and `LBFGS` share.
+"""Conversion of a search direction to a step, shared by `Newton`, `NewtonCG` and `LBFGS`.
 
-They choose a direction on the host, in the coordinates u = x / scale; the step then is a multiple of the direction, or what an inner
-Adam makes of it.
+They compute a direction on the host, in coordinates u = x / scale. The step is a multiple of the direction, or the step of an inner Adam.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ class NewtonState:
     """State between steps.
 
     Attributes:
-        step: steps made so far.
-        learning_rates: of each parameter: its scale.
-        adam: of the inner Adam, in double precision on the host; None without one.
+        step: number of steps so far.
+        learning_rates: learning rate of each parameter, its scale.
+        adam: state of the inner Adam, in double precision on the host; None without one.
     """
 
     step: int
@@ -39,27 +38,27 @@ class NewtonState:
     adam: ChainState | None = None
 
     def upsampled(self, upsampler: Upsampler) -> NewtonState:
-        """See `Upsamplable`. Raises `NotCarried` with an inner Adam, whose moments are on the host."""
+        """Return this state. Raises `NotCarried` with an inner Adam, whose moments are on the host."""
         del upsampler
         if self.adam is not None:
             raise NotCarried("Newton's Adam")
         return self
 
     def restarted(self, fresh: NewtonState) -> NewtonState:
-        """See `Restartable`: the schedule goes on."""
+        """Continue the schedule in a new state."""
         adam = None if self.adam is None or fresh.adam is None else self.adam.restarted(fresh.adam)
         return replace(fresh, step=self.step, adam=adam)
 
 
 class Scaled(Protocol):
-    """The state of an optimizer with a scale for each parameter."""
+    """State of an optimizer with a scale per parameter."""
 
     @property
     def learning_rates(self) -> Mapping[str, float]: ...
 
 
 class DirectionOptions(Protocol):
-    """The options that the methods share; `Newton` documents them."""
+    """Options that these methods share; `Newton` documents them."""
 
     @property
     def learning_rate(self) -> float: ...
@@ -86,7 +85,7 @@ def check_options(owner: str, options: DirectionOptions) -> None:
 def init_state(
     owner: str, options: DirectionOptions, parameters: Tree, learning_rates: Mapping[str, float] | None
 ) -> NewtonState:
-    """The state before the first step. Raises `InputError` for a learning rate that is not positive, or of an unknown parameter."""
+    """Return the state before the first step. Raises `InputError` for an invalid learning rate or an unknown parameter."""
     own = rates.per_parameter(owner, parameters, options.learning_rate, learning_rates)
     adam = None
     if options.inner_optimizer is not None:
@@ -95,7 +94,7 @@ def init_state(
 
 
 def coordinate_scales(estimate: Estimate, state: Scaled, parameters: Tree) -> np.ndarray:
-    """The unit of each element's coordinate u, (n,): its learning rate, times the σ of smoothed derivatives."""
+    """Return the unit of each element's coordinate u, (n,): its learning rate times the σ of smoothed derivatives."""
     smoothing = estimate.get(Smoothing)
     scales = {key: η * (smoothing.sigma[key] if smoothing else 1.0) for key, η in state.learning_rates.items()}
     return vectors.repeat_per_element(scales, parameters)
@@ -104,7 +103,7 @@ def coordinate_scales(estimate: Estimate, state: Scaled, parameters: Tree) -> np
 def apply_direction(
     owner: str, options: DirectionOptions, direction: np.ndarray, state: NewtonState, parameters: Tree
 ) -> tuple[Tree, NewtonState]:
-    """The step along a direction (n,), in units of the parameters, and the next state.
+    """Return the step along a direction (n,), in units of the parameters, and the next state.
 
     A direction that is not finite counts as zero.
     """

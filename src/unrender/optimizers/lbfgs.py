@@ -1,4 +1,4 @@
-"""Limited-memory BFGS: curvature from the gradients of past steps (Liu and Nocedal 1989)."""
+"""Limited-memory BFGS, which estimates curvature from the gradients of past steps (Liu and Nocedal 1989)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from unrender.optimizers.directions import (
 from unrender.schedules.functions import Schedule
 
 _FIRST_STEP = 0.1
-"""Length of a step before any curvature is known, as a fraction of the trust radius."""
+"""Length of a step without curvature information, as a fraction of the trust radius."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +32,10 @@ class LBFGSState:
     """State between steps.
 
     Attributes:
-        newton: the step count, scales and inner Adam, as of `Newton`.
-        parameters, gradient: (n,) each, of the last step.
-        moves, changes: (history, n) each: s = Δx and y = Δg of past steps, the most recent in the last row.
-        count: how many rows of them are in use, the last ones.
+        newton: step count, scales and inner Adam, as in `Newton`.
+        parameters, gradient: those of the last step, (n,) each.
+        moves, changes: s = Δx and y = Δg of past steps, (history, n) each, with the most recent in the last row.
+        count: number of rows in use, which are the last ones.
     """
 
     newton: NewtonState
@@ -49,29 +49,29 @@ class LBFGSState:
 @register
 @dataclass(frozen=True)
 class LBFGS:
-    """Steps −γ B g, no longer than a trust radius: B is BFGS's estimate of H⁻¹ from the last steps s and the changes y of the gradient
-    over them, starting from the identity times sᵀy / yᵀy of the last one. There is no line search: a step costs one gradient.
+    """Steps −γ B g within a trust radius, where B is BFGS's estimate of H⁻¹.
 
-    Until there is a pair (s, y) the step is −g, a tenth of the trust radius long. Needs 2 `history` n numbers of memory.
+    B comes from the last steps s and the changes y of the gradient, starting from the identity times sᵀy / yᵀy of the last pair. There is
+    no line search: a step costs one gradient. Without any pair (s, y) the step is −g with a tenth of the trust radius. Memory is 2
+    `history` n numbers.
 
-    Scales: as in `Newton`, all this is of u = x / η with each parameter's learning rate η, times its σ, and so is Δ.
+    Scales: as in `Newton`, everything, including Δ, is in coordinates u = x / η with each parameter's learning rate η, times its σ.
 
-    Noise: y is the difference of two gradients that each have noise of their own, which does not shrink with s. A pair with sᵀy below
-    `curvature` ‖s‖ ‖y‖, as where the curvature is negative or y is mostly noise, is left out; the noise of the others stays for
-    `history` steps. So noise in proportion to the gradient, up to a third of it, does little harm; noise of a constant size soon ends
-    the descent (the paper found that it "almost never converges" there), which a `schedule` delays. B is biased even where the
-    gradients are not.
+    Noise: y is the difference of two gradients with independent noise, which does not shrink with s. A pair with sᵀy below `curvature`
+    ‖s‖ ‖y‖, such as one with negative curvature or mostly noise, is skipped. The noise of the others stays for `history` steps. Noise in
+    proportion to the gradient, up to a third of it, does little harm. Noise of constant size soon ends the optimisation (the paper found
+    that it "almost never converges" there), which a `schedule` delays. B is biased even if the gradients are not.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
-            σ, or of the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
-        trust_radius: Δ, the longest step, Euclidean over all elements of u, > 0.
-        history: pairs that are kept, >= 1.
-        curvature: the least cosine between s and y of a pair that is kept, in (0, 1).
-        step_scale: γ, factor of the step, in (0, 1]; without effect with `inner_optimizer`.
-        inner_optimizer: an Adam whose gradient is the negated step; the length of its step follows from its own learning rate or the
-            parameter's. None to take the step itself.
-        schedule: factor of the step, the last thing to act, by step; see `unrender.schedules.functions`.
+        learning_rate: η, in units of the parameter, > 0, for the parameters without their own. With 1 the trust region is in units of σ,
+            or of the parameters; with learning rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, largest Euclidean length of a step over all elements of u, > 0.
+        history: number of pairs, >= 1.
+        curvature: smallest cosine between s and y of a pair, in (0, 1).
+        step_scale: γ, factor of the step, in (0, 1]; no effect with `inner_optimizer`.
+        inner_optimizer: an Adam whose gradient is the negated step; its own learning rate, or the parameter's, determines the length.
+            None takes the step itself.
+        schedule: final factor of the step, by step; see `unrender.schedules.functions`.
     """
 
     learning_rate: float = 1.0
@@ -99,7 +99,7 @@ class LBFGS:
         return LBFGSState(init_state("LBFGS", self, parameters, learning_rates), none, none, rows, rows)
 
     def update(self, estimate: Estimate, state: LBFGSState, parameters: Tree) -> tuple[Tree, LBFGSState]:
-        """See `Optimizer.update`. On the host."""
+        """Return the steps and the next state. Computed on the host."""
         scale = coordinate_scales(estimate, state.newton, parameters)
         here, gradient = vectors.ravel(parameters), vectors.ravel(estimate.gradient)
         if state.newton.step:
@@ -109,7 +109,7 @@ class LBFGS:
         return steps, replace(state, newton=newton, parameters=here, gradient=gradient)
 
     def _remember(self, state: LBFGSState, move: np.ndarray, change: np.ndarray, scale: np.ndarray) -> LBFGSState:
-        """With this pair as the most recent one, where its curvature is positive and large enough."""
+        """Return the state with this pair as the most recent one, if its curvature is positive and large enough."""
         least = self.curvature * float(np.linalg.norm(move / scale) * np.linalg.norm(change * scale))
         if not 0.0 < least <= float(move @ change):
             return state
@@ -121,7 +121,7 @@ class LBFGS:
         )
 
     def _direction(self, state: LBFGSState, gradient: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        from scipy.optimize import LbfgsInvHessProduct  # takes long to import
+        from scipy.optimize import LbfgsInvHessProduct  # a slow import
 
         length = float(np.linalg.norm(gradient))
         if not 0.0 < length < math.inf:
@@ -129,7 +129,7 @@ class LBFGS:
         if state.count == 0:
             return gradient * (-_FIRST_STEP * self.trust_radius / length)
         moves, changes = state.moves[-state.count :] / scale, state.changes[-state.count :] * scale
-        # SciPy's B starts from the identity: in coordinates u / √β that is β in those of u.
+        # SciPy's B starts from the identity. In coordinates u / √β this is β in those of u.
         beta = float(moves[-1] @ changes[-1]) / float(changes[-1] @ changes[-1])
         inverse = LbfgsInvHessProduct(moves / math.sqrt(beta), changes * math.sqrt(beta))
         return vectors.clip_norm(-beta * inverse.matvec(gradient), self.trust_radius)

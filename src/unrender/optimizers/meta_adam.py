@@ -1,4 +1,4 @@
-"""The step rule for a gradient with an estimated variance (Balint et al. 2023, section 5)."""
+"""Step rule for a gradient with an estimated variance (Balint et al. 2023, section 5)."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from unrender.schedules.functions import Schedule
 @register
 @dataclass(frozen=True)
 class MetaAdam(Recipe):
-    """Steps −η g / √(Var g + ε), per element (Eq. 21), with the variance that the estimator provides.
+    """Steps −η g / √(Var g + ε), per element (Eq. 21), with the variance from the estimator.
 
-    Adam divides by the root mean square of many gradients, which it assumes independent; a meta-estimate is an average already and
-    correlated with earlier ones. Here the divisor is the standard deviation of the present gradient: where noise dominates, the step is
-    about η at most; where many samples agree it grows with their number, up to η √n after n steps of a constant gradient (Var g is
-    the mean square of a sample), and falls as soon as the gradient or the weight of the past becomes small. So learning rates are
-    lower than Adam's, and the same rate serves the start and the end of a descent.
+    Adam divides by the root mean square of many gradients, which it assumes to be independent. A meta-estimate is already an average, and
+    correlated with earlier ones. Here the divisor is the standard deviation of the current gradient. Where noise dominates, the step is
+    about η at most. Where many samples agree, it grows with their number, up to η √n after n steps of a constant gradient (Var g is the
+    mean square of a sample), and decreases as soon as the gradient or the weight of the past becomes small. So learning rates are lower
+    than Adam's, and one learning rate serves the start and the end of a run.
 
-    The noise of successive meta-estimates has one sign for as long as their memory lasts, so that the steps of an element in noise do not
-    average out: after n steps of a memory that does not forget it has moved by about 0.8 η n, where Adam's, of independent gradients, move
-    it by η √n: 14 times as far after 300 steps. `rule="walk"` multiplies each step by √((1 − α) / (1 + α)), the inverse root of that
-    correlation's time, so that noise moves the element by η √n, whatever the weight of the past α: learning rates are Adam's, and the
-    steps of a long memory fall as 1 / √n by themselves. What a gradient moves an element by, relative to what noise does, is about the
-    same by both rules, and Adam's: no factor of the step changes that.
+    The noise of successive meta-estimates is correlated, so the steps of a noisy element do not average out. After n steps with full
+    weight of the past it has moved by about 0.8 η n, whereas Adam with independent gradients moves it by η √n: a factor of 14 after 300
+    steps. `rule="walk"` multiplies each step by √((1 − α) / (1 + α)), the inverse root of the correlation time for the weight α of the
+    past. Noise then moves the element by η √n. Learning rates are those of Adam, and the steps of a long average decrease as 1 / √n. The
+    ratio between the movement by the gradient and by noise is about the same for both rules and for Adam, because a factor of the step
+    does not change it.
 
-    At the first step a meta-estimate's variance is its square, and the step is −η sign(g), as Adam's. The chain is `ScaleByDeviation`, and
-    `ClipDirection` with `longest`.
+    At the first step a meta-estimate's variance is its square, and the step is −η sign(g), as in Adam. The chain is `ScaleByDeviation`,
+    and `ClipDirection` with `longest`.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
-        epsilon: ε, in squared units of the gradient, > 0: elements whose gradient and variance are both 0 do not move.
-            It is far below Adam's (whose ε is outside the root): a texel's gradient of a mean over pixels is small.
+        learning_rate: η, in units of the parameter, > 0, for the parameters without their own; or {key: rate, "*": rate of the others}.
+        epsilon: ε, in squared units of the gradient, > 0. Elements whose gradient and variance are both 0 do not move. It is far below
+            Adam's ε, which is outside the root: a texel's gradient of a mean over pixels is small.
         schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
-        longest: the longest step of an element in units of η, > 0; None for no limit.
-        rule: "deviation", the paper's, or "walk", which requires the weight of the past.
+        longest: largest step of an element in units of η, > 0; None for no limit.
+        rule: "deviation" is the paper's; "walk" requires the weight of the past.
     """
 
     learning_rate: float | Mapping[str, float] = 0.002

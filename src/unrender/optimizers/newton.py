@@ -1,4 +1,4 @@
-"""Newton's method with a modified Hessian, for estimators that give one (Wang et al., section 2)."""
+"""Newton's method with a modified Hessian, for estimators that provide one (Wang et al., section 2)."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _SECULAR_ITERATIONS = 60
 
 
 def trust_region_step(curvatures: np.ndarray, gradient: np.ndarray, radius: float | None) -> np.ndarray:
-    """The s with ‖s‖ <= radius that minimises Σ gradient s + curvatures s² / 2, all along the eigenvectors, (n,).
+    """Return the s with ‖s‖ <= radius that minimises Σ gradient s + curvatures s² / 2, in the eigenbasis, (n,).
 
     Args:
         curvatures: (n,), >= 0.
         gradient: (n,), not all zero.
         radius: > 0; None for no limit.
 
-    It is −gradient / (curvatures + λ) with the least λ >= 0 that makes it short enough (Nocedal and Wright, section 4.3). Newton's
-    iteration for 1 / ‖s‖ = 1 / radius approaches λ from below.
+    The solution is −gradient / (curvatures + λ) with the smallest λ >= 0 that satisfies the limit (Nocedal and Wright, section 4.3).
+    Newton's iteration for 1 / ‖s‖ = 1 / radius approaches λ from below.
     """
     if radius is None:
         return -gradient / curvatures
@@ -55,33 +55,31 @@ def trust_region_step(curvatures: np.ndarray, gradient: np.ndarray, radius: floa
 @register
 @dataclass(frozen=True)
 class Newton:
-    """Steps −γ H̃⁻¹ g (Eq. 3) with a positive definite H̃, within a trust region.
+    """Steps −γ H̃⁻¹ g (Eq. 3) with a positive definite H̃, in a trust region.
 
-    H̃ has the eigenvectors of H and the magnitudes of its eigenvalues, none below `damping` times the largest: along directions of
-    negative curvature plain Newton steps climb to a saddle or a maximum. A step that would leave the trust region is replaced by the
-    minimum of gᵀs + sᵀ H̃ s / 2 for ‖s‖ <= Δ, which turns towards −g as Δ shrinks. (The paper shortens the step and keeps its direction,
-    which is dominated by the eigenvectors of least curvature, whose estimates are the noisiest.) Where H is zero the step is −g, Δ long;
-    where H is not finite there is none.
+    H̃ has the eigenvectors of H and the magnitudes of its eigenvalues, at least `damping` times the largest. Along directions of negative
+    curvature, plain Newton steps would climb to a saddle point or a maximum. A step beyond the trust region is replaced by the minimum of
+    gᵀs + sᵀ H̃ s / 2 for ‖s‖ <= Δ, which turns towards −g as Δ shrinks. (The paper shortens the step and keeps its direction. That
+    direction is dominated by the eigenvectors of least curvature, whose estimates are the noisiest.) If H is zero, the step is −g with
+    length Δ. If H is not finite, there is no step.
 
-    Scales: the step is computed in the coordinates u = x / η, where η is each parameter's learning rate, times the σ of smoothed
-    derivatives (`Estimate.sigma`), which hold no information beyond it. Δ and `damping` are in units of u: a position in metres and an
-    angle in radians with η of 0.05 and 0.5 may move by 0.05 Δ and 0.5 Δ. Inside the trust region and without damping the step does not
-    depend on η.
+    Scales: coordinates are u = x / η, where η is each parameter's learning rate times the σ of smoothed derivatives (`Estimate.sigma`),
+    which contain no information beyond it. Δ and `damping` are in units of u: a position in metres and an angle in radians with η of 0.05
+    and 0.5 may move by 0.05 Δ and 0.5 Δ. Inside the trust region and without damping, the step does not depend on η.
 
-    Noise: the step is a product of two estimates, so it is biased even where they are not (an inverse is convex); a small eigenvalue
-    that noise makes smaller gives a long step along its eigenvector. Noise of a tenth of H asks for `damping` around 0.03, as much noise
-    as H for 0.3; `step_scale` averages over steps, and so does `inner_optimizer`. Costs O(n³) time and O(n²) memory for n parameters in
-    all.
+    Noise: the step is a product of two estimates, so it is biased even if they are not (an inverse is convex). Noise that reduces a small
+    eigenvalue causes a long step along its eigenvector. Noise of a tenth of H needs `damping` of about 0.03, noise as large as H needs
+    0.3. `step_scale` and `inner_optimizer` average over steps. Takes O(n³) time and O(n²) memory for n parameters in total.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
-            σ, or of the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
-        trust_radius: Δ, the longest step, Euclidean over all elements of u, > 0; None for no limit.
-        damping: the least eigenvalue of H̃ as a fraction of the largest, in (0, 1).
-        step_scale: γ, factor of the step, in (0, 1]; without effect with `inner_optimizer`.
-        inner_optimizer: an Adam whose gradient is the negated step, as in the paper ("All methods use the Adam optimizer"); the length
-            of its step follows from its own learning rate or the parameter's. None to take the step itself.
-        schedule: factor of the step, the last thing to act, by step; see `unrender.schedules.functions`.
+        learning_rate: η, in units of the parameter, > 0, for the parameters without their own. With 1 the trust region is in units of σ,
+            or of the parameters; with learning rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, largest Euclidean length of a step over all elements of u, > 0; None for no limit.
+        damping: smallest eigenvalue of H̃ relative to the largest, in (0, 1).
+        step_scale: γ, factor of the step, in (0, 1]; no effect with `inner_optimizer`.
+        inner_optimizer: an Adam whose gradient is the negated step, as in the paper ("All methods use the Adam optimizer"); its own
+            learning rate, or the parameter's, determines the length. None takes the step itself.
+        schedule: final factor of the step, by step; see `unrender.schedules.functions`.
     """
 
     learning_rate: float = 1.0
@@ -106,7 +104,7 @@ class Newton:
         return init_state("Newton", self, parameters, learning_rates)
 
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
-        """See `Optimizer.update`. On the host."""
+        """Return the steps and the next state. Computed on the host."""
         matrix = estimate.require("Newton", Hessian).matrix
         scale = coordinate_scales(estimate, state, parameters)
         hessian = scale[:, None] * arrays.numpy(matrix).astype(np.float64) * scale

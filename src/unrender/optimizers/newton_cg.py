@@ -1,4 +1,4 @@
-"""Newton's method by conjugate gradients: the Newton step from Hessian-vector products alone (Wang et al., Eqs 4 to 7)."""
+"""Newton's method by conjugate gradients, from Hessian-vector products only (Wang et al., Eqs 4 to 7)."""
 
 from __future__ import annotations
 
@@ -26,38 +26,39 @@ from unrender.schedules.functions import Schedule
 @register
 @dataclass(frozen=True)
 class NewtonCG:
-    """A step that solves H s = −g by conjugate gradients (Fletcher and Reeves), truncated at a trust radius.
+    """Approximate solution of H s = −g by conjugate gradients (Fletcher and Reeves), truncated at a trust radius.
 
-    From s = 0 and v = r = −g (Eq. 6): α = rᵀr / vᵀHv, which is Eq. 5 for v conjugate to those before, s += α v (Eq. 7), r −= α H v,
-    and the next v is r + (r'ᵀr' / rᵀr) v. It ends after `iterations`, when ‖r‖ falls below `tolerance` ‖g‖, or when s reaches the
-    trust radius Δ. Where the curvature along −g is negative, the step follows −g to the radius (Steihaug 1983). Memory is a few
-    vectors; no n × n matrix is built. As many iterations as dimensions solve a well-conditioned positive definite H exactly, without
-    tolerance and damping.
+    Starts from s = 0 and v = r = −g (Eq. 6). Each iteration computes α = rᵀr / vᵀHv, which equals Eq. 5 for v conjugate to earlier ones,
+    s += α v (Eq. 7), r' = r − α H v, and v = r' + (r'ᵀr' / rᵀr) v. It stops after `iterations`, when ‖r‖ is below `tolerance` ‖g‖, or
+    when s reaches the trust radius Δ. If the curvature along −g is negative, the step follows −g to the radius (Steihaug 1983). Memory is
+    a few vectors; no n × n matrix is built. As many iterations as dimensions solve a well-conditioned positive definite system exactly,
+    without tolerance and damping.
 
-    Scales: as in `Newton`, all this is in the coordinates u = x / η with each parameter's learning rate η, times its σ, and so is Δ;
-    products are asked for with η v.
+    Scales: as in `Newton`, everything, including Δ, is in coordinates u = x / η with each parameter's learning rate η, times its σ.
+    Products are requested for η v.
 
-    Noise: the estimated product H v need not be that of a symmetric matrix, nor of the same one each time. So the iterations end before
-    they follow noise: at a v whose curvature vᵀHv / vᵀv is below `damping` times the greatest one met, or negative (the step along it then
-    uses the magnitude of the curvature, and no less than that bound); when ‖r‖ exceeds ‖g‖; when v is no descent direction (vᵀg >= 0); at
-    a product that is not finite. Thus s always descends by the given gradient, and few iterations are as good as many. The step is
-    biased even where gradient and products are not: it is not linear in them.
+    Noise: the estimated products need not belong to one symmetric matrix. So the iteration stops before it follows noise: at a v whose
+    curvature vᵀHv / vᵀv is negative or below `damping` times the largest so far (the step along it then uses the magnitude of the
+    curvature, but at least that bound); when ‖r‖ exceeds ‖g‖; when v is not a descent direction (vᵀg >= 0); and at a product that is not
+    finite. Thus s is always a descent direction of the given gradient, and few iterations are as good as many. The step is biased even if
+    gradient and products are not, because it is nonlinear in them.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0; for the parameters without their own. With 1 the trust region is in units of
-            σ, or of the parameters; with rates that suit Adam, radii of 10 to 100 are usual.
-        trust_radius: Δ, the longest step, Euclidean over all elements of u, > 0.
-        iterations: Hessian-vector products a step at most, >= 1.
-        tolerance: the ratio ‖r‖ / ‖g‖ at which it ends, in [0, 1).
-        damping: the least curvature that is trusted, as a fraction of the greatest, in [0, 1).
-        step_scale: γ, factor of the step, in (0, 1]; without effect with `inner_optimizer`.
-        inner_optimizer: an Adam whose gradient is the negated step, as in the paper ("All methods use the Adam optimizer"); the length
-            of its step follows from its own learning rate or the parameter's. None to take the step itself.
-        schedule: factor of the step, the last thing to act, by step; see `unrender.schedules.functions`. Near the optimum the step
-            is as noisy as the gradient: shrinking steps average the noise, which Adam's mean does for its own.
-        line: keep the step's direction alone, and take its length from a parabola through three losses, at the parameters and one step to
-            either side: two evaluations (and the estimator must provide losses). For many parameters, where the gradient is mostly
-            noise and the curvature along it, from the same draws, is not that of the loss. Those losses are not smoothed.
+        learning_rate: η, in units of the parameter, > 0, for the parameters without their own. With 1 the trust region is in units of σ,
+            or of the parameters; with learning rates that suit Adam, radii of 10 to 100 are usual.
+        trust_radius: Δ, largest Euclidean length of a step over all elements of u, > 0.
+        iterations: maximum number of Hessian-vector products per step, >= 1.
+        tolerance: ratio ‖r‖ / ‖g‖ at which the iteration stops, in [0, 1).
+        damping: smallest accepted curvature relative to the largest, in [0, 1).
+        step_scale: γ, factor of the step, in (0, 1]; no effect with `inner_optimizer`.
+        inner_optimizer: an Adam whose gradient is the negated step, as in the paper ("All methods use the Adam optimizer"); its own
+            learning rate, or the parameter's, determines the length. None takes the step itself.
+        schedule: final factor of the step, by step; see `unrender.schedules.functions`. Near the optimum the step is as noisy as the
+            gradient. Decreasing steps average this noise, as Adam's mean does.
+        line: whether to use only the step's direction, and to determine its length from a parabola through three losses, at the
+            parameters and one step to either side. This takes two evaluations, and the estimator must provide losses. It suits many
+            parameters, where the gradient is mostly noise and its curvature, from the same samples, is not that of the loss. These losses
+            are not smoothed.
     """
 
     learning_rate: float = 1.0
@@ -79,14 +80,14 @@ class NewtonCG:
 
     @property
     def requires(self) -> Capabilities:
-        """A gradient and Hessian-vector products; with `line`, the loss at points of its own."""
+        """A gradient and Hessian-vector products; with `line`, also the loss at points chosen by the optimizer."""
         return Capabilities(Gradient, HessianProduct, *([LossFunction] if self.line else []))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> NewtonState:
         return init_state("NewtonCG", self, parameters, learning_rates)
 
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
-        """See `Optimizer.update`. On the host, between products."""
+        """Return the steps and the next state. On the host, between products."""
         hvp = estimate.require("NewtonCG", HessianProduct).apply
         scale = coordinate_scales(estimate, state, parameters)
 
@@ -103,12 +104,12 @@ class NewtonCG:
 
     @staticmethod
     def _losses(estimate: Estimate, step: np.ndarray, parameters: Tree) -> np.ndarray:
-        """The losses one step behind the parameters, at the parameters, and one step ahead, (3,)."""
+        """Return the losses one step behind the parameters, at the parameters, and one step ahead, (3,)."""
         theta = vectors.ravel(parameters)
         return estimate.require("NewtonCG", LossFunction).evaluate(np.stack([theta - step, theta, theta + step]))
 
     def _line_search(self, step: np.ndarray, losses: np.ndarray) -> np.ndarray:
-        """The multiple >= 0 of `step` within the trust radius that minimises the parabola through the three losses."""
+        """Return the multiple >= 0 of `step` in the trust radius that minimises the parabola through the three losses."""
         behind, center, ahead = losses
         slope, curvature = 0.5 * (ahead - behind), ahead + behind - 2 * center
         longest = self.trust_radius / float(np.linalg.norm(step))

@@ -1,4 +1,4 @@
-"""Two optimizers side by side, each for some of the parameters."""
+"""Two optimizers for disjoint sets of parameters."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ class PartitionedState:
     others: Any
 
     def upsampled(self, upsampler: Upsampler) -> PartitionedState:
-        """See `Upsamplable`: as the two are."""
+        """Interpolate both states."""
         return PartitionedState(upsampled(self.own, upsampler), upsampled(self.others, upsampler))
 
     def restarted(self, fresh: PartitionedState) -> PartitionedState:
-        """See `Restartable`: as the two are."""
+        """Restart both states."""
         return PartitionedState(restarted(self.own, fresh.own), restarted(self.others, fresh.others))
 
 
 @register
 @dataclass(frozen=True)
 class Partitioned:
-    """One optimizer for the parameters in `keys`, another for the rest: vertices of a mesh beside its texture.
+    """One optimizer for the parameters in `keys` and another for the rest, such as vertices of a mesh and its texture.
 
         Partitioned(("vase.vertex_positions",), Adam(0.01, uniform=True), ScheduleFree(0.1))
 
-    Or a few numbers by `AveragedNewton` beside textures, from an estimator that gives the numbers a block of their own
-    (`HybridGradient` with `GaussNewton`); in steps without a block they stay where they are.
+    Or a few scalars by `AveragedNewton` together with textures, from an estimator that provides a separate block for the scalars
+    (`HybridGradient` with `GaussNewton`). In steps without a block the scalars do not change.
 
     Args:
-        keys: of parameters.
-        optimizer: for those. One that requires more than the gradient takes it from the block of these keys (`BlockEstimate`).
-        others: for all others; it requires the gradient alone.
+        keys: keys of parameters.
+        optimizer: optimizer of `keys`. One that requires more than the gradient uses the block of these keys (`BlockEstimate`).
+        others: optimizer of all other parameters; it may require the gradient only.
     """
 
     keys: tuple[str, ...] = ()
@@ -67,7 +67,7 @@ class Partitioned:
 
     @property
     def requires(self) -> Capabilities:
-        """A gradient, and a block for an optimizer that requires more."""
+        """A gradient, and a block if the optimizer requires more."""
         return Capabilities(Gradient, BlockEstimate) if self._solves_block else Capabilities(Gradient)
 
     @property
@@ -84,7 +84,7 @@ class Partitioned:
         return replace(self, optimizer=own, others=others)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> PartitionedState:
-        """See `Optimizer.init`. Raises `InputError` for a key that is no parameter."""
+        """Return the state before the first step. Raises `InputError` for an unknown key."""
         for key in self.keys:
             if key not in parameters:
                 raise InputError(f'Partitioned: keys: unknown parameter "{key}"')
@@ -95,10 +95,10 @@ class Partitioned:
     def update(self, estimate: Estimate, state: PartitionedState, parameters: Tree) -> tuple[Tree, PartitionedState]:
         points, gradients = self._parts(parameters), self._parts(estimate.gradient)
         fresh = estimate.get(FreshGradient)
-        told = ({}, {}) if fresh is None else self._parts(fresh.values)
+        fresh_parts = ({}, {}) if fresh is None else self._parts(fresh.values)
         steps, states = {}, []
         for part, before, point, gradient, values in zip(
-            (self.optimizer, self.others), (state.own, state.others), points, gradients, told, strict=True
+            (self.optimizer, self.others), (state.own, state.others), points, gradients, fresh_parts, strict=True
         ):
             capabilities = () if fresh is None else (FreshGradient(values),)
             own = replace(estimate, gradient=gradient, capabilities=capabilities)
@@ -109,13 +109,13 @@ class Partitioned:
                         f"Partitioned: the estimate's block is of {listed(block.keys)}, not of {listed(self.keys)}"
                     )
                 own = block.estimate
-            found, after = (trees.zeros_like(point), before) if own is None else part.update(own, before, point)
-            steps |= found
+            part_steps, after = (trees.zeros_like(point), before) if own is None else part.update(own, before, point)
+            steps |= part_steps
             states.append(after)
         return {key: steps[key] for key in parameters}, PartitionedState(*states)
 
     def standard_errors(self, state: PartitionedState, parameters: Tree) -> Tree:
-        """See `Measuring`: of the optimizers that measure them."""
+        """Return the standard errors from the optimizers that estimate them."""
         parts = zip((self.optimizer, self.others), (state.own, state.others), self._parts(parameters), strict=True)
         return {
             key: error
@@ -125,11 +125,11 @@ class Partitioned:
         }
 
     def choices(self, state: PartitionedState) -> tuple[str, ...]:
-        """See `Choosing`."""
+        """Return the choices of both optimizers, one line each."""
         both = ((self.optimizer, state.own), (self.others, state.others))
         return tuple(line for part, of in both if isinstance(part, Choosing) for line in part.choices(of))
 
     def _parts(self, tree: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """What belongs to `keys`, and the rest."""
+        """Split a tree into the part of `keys` and the rest."""
         own = {key: value for key, value in tree.items() if key in self.keys}
         return own, {key: value for key, value in tree.items() if key not in self.keys}

@@ -13,11 +13,13 @@ from unrender.schedules.functions import Schedule
 
 
 def check(owner: str, learning_rate: Any, schedule: Any) -> None:
-    """Raise `InputError` unless `learning_rate` is a positive number, or {key: one, "*": of the others}, and `schedule` a schedule or
-    None."""
+    """Raise `InputError` for an invalid learning rate or schedule.
+
+    `learning_rate` must be a positive number or {key: rate, "*": rate of the others}, and `schedule` a schedule or None.
+    """
     if isinstance(learning_rate, Mapping):
         if "*" not in learning_rate:
-            raise InputError(f'{owner}: learning_rate needs the rate of the others, {{"*": rate}}')
+            raise InputError(f'{owner}: learning_rate needs a rate for the other parameters, {{"*": rate}}')
         for key, rate in learning_rate.items():
             checks.number(owner, "learning_rate" if key == "*" else f"learning_rate of {key}", rate, above=0.0)
     else:
@@ -29,7 +31,7 @@ def check(owner: str, learning_rate: Any, schedule: Any) -> None:
 def per_parameter(
     owner: str, keys: Iterable[str], common: float | Mapping[str, float], own: Mapping[str, float] | None
 ) -> dict[str, float]:
-    """{key: learning rate}: the parameter's own where it has one, else `common`, which may be {key: rate, "*": of the others}.
+    """Return {key: learning rate}: the parameter's own, else `common`, which may be {key: rate, "*": rate of the others}.
 
     Raises `InputError` for a rate of an unknown parameter, or one that is not positive.
     """
@@ -45,7 +47,7 @@ def per_parameter(
 
 
 def factor(owner: str, schedule: Schedule | None, step: int) -> float:
-    """The schedule's factor at `step`. Raises `InputError` where it is negative or not finite."""
+    """Return the schedule's factor at `step`. Raises `InputError` if it is negative or not finite."""
     value = 1.0 if schedule is None else float(schedule(step))
     if not (math.isfinite(value) and value >= 0.0):
         raise InputError(f"{owner}: schedule must return a finite factor >= 0, got {value!r} at step {step}")

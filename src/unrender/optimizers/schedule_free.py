@@ -25,45 +25,46 @@ from unrender.schedules.functions import Schedule
 @register
 @dataclass(frozen=True)
 class ScheduleFree(Recipe):
-    """Adam's steps without momentum on z, the weighted mean x of z, and gradients at a point between the two.
+    """Adam steps without momentum on z, with gradients at a point between z and its weighted mean x.
 
     At step t, counted from 0, with the gradient g at the parameters y:
 
         z ← z − η_t w g / (√v̂ + ε),   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
 
-    The parameters of a run are its y, near x. An average has less noise than an iterate, and parameters that move slowly suit estimators
-    that reuse earlier samples. The chain has six transforms, each with its formula in its own docstring:
+    The result of a run is y, which is near x. An average has less noise than an iterate, and slowly moving parameters suit estimators
+    that reuse earlier samples. The chain has six transforms, whose docstrings contain their formulas:
 
     - `FittedSobolev` smooths the gradients of `preconditioned` by S, whose strength it fits to them.
     - `AgreementRate` sets η_t. The rate needs no horizon; it decays with the gradient's noise.
     - `ScaleByRms` divides by √v̂ + ε. All gradients have equal weight in v̂ from step 1 / (1 − β₂) on.
     - `ApplyPreconditioner` applies S again, to the direction.
-    - `WienerShrinkage` multiplies by w: elements of little signal take short steps.
-    - `ScheduleFreeAverage` moves z, x and y.
+    - `WienerShrinkage` multiplies by w, which shortens the steps of elements with little signal.
+    - `ScheduleFreeAverage` updates z, x and y.
 
-    Adam normalises every element's step, so weakly observed elements follow a random walk: w stops that. Parameters outside
-    `preconditioned` have no neighbours to estimate w from, and unscaled steps. Pass `wiener=False` for pixel mini-batches. Two successive
-    gradients then hardly share a pixel, so their product shows little signal everywhere. The decaying rate averages the noise instead.
+    Adam normalises every element's step, so weakly observed elements follow a random walk, which w prevents. Parameters outside of
+    `preconditioned` have no neighbours from which w can be estimated, and take unscaled steps. Use `wiener=False` with pixel
+    mini-batches: two successive gradients then hardly share a pixel, so their product shows little signal anywhere, and the decaying
+    learning rate averages the noise instead.
 
-    Where the smoothing becomes weaker, the rate starts at 0.3 η_0 or less: neighbours no longer average the noise. Where it becomes
-    stronger again, z starts again at x.
+    Where the smoothing becomes weaker, the learning rate restarts at 0.3 η_0 or less, because neighbours no longer average the noise.
+    Where it becomes stronger again, z restarts at x.
 
     Args:
-        learning_rate: η_0, in units of the parameter, > 0; for the parameters without their own. Or {key: rate, "*": of the others}.
+        learning_rate: η_0, in units of the parameter, > 0, for the parameters without their own; or {key: rate, "*": rate of the others}.
         beta: β, in [0, 1).
-        beta_2: β₂, decay of the mean square at first, in [0, 1).
+        beta_2: β₂, initial decay of the mean square, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
         averaging: r, >= 0.
-        growth: q, >= 0; 0 for a rate that never grows.
-        decay: p, >= 0; 0 for a rate that never falls.
-        schedule: a further factor of every learning rate by step; see `unrender.schedules.functions`.
-        preconditioner: S, applied to the gradients and to the steps of z of the parameters in `preconditioned`. In place of the
-            preconditioner of a `Parameter`: with that of the parameter, bounds are met by u = S^-1 x, which knows nothing of them.
-            The strength of `Sobolev` is the greatest that is of use: it is fitted to the gradients, see `StrengthFit`.
+        growth: q of `AgreementRate`, >= 0; 0 for a rate that never grows.
+        decay: p of `AgreementRate`, >= 0; 0 for a rate that never decays.
+        schedule: additional factor of every learning rate by step; see `unrender.schedules.functions`.
+        preconditioner: S, applied to the gradients and to the steps of z for the parameters in `preconditioned`. It replaces the
+            preconditioner of a `Parameter`, which would optimise u = S⁻¹ x without knowledge of the bounds. The strength of `Sobolev` is
+            an upper limit; it is fitted to the gradients, see `StrengthFit`.
         preconditioned: keys of parameters.
-        wiener: whether the steps of these parameters are shortened by the share of signal.
-        reparameterised: Keys of parameters that move by another variable (`unrender.parameterisations`), whose size does not tell how far
-            they have come.
+        wiener: whether the steps of these parameters are multiplied by w.
+        reparameterised: Keys of parameters with another variable (`unrender.parameterisations`), whose size does not measure their
+            progress.
     """
 
     learning_rate: float | Mapping[str, float] = 0.1
@@ -102,7 +103,7 @@ class ScheduleFree(Recipe):
         return optimizer
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
-        """See `Optimizer.init`. Raises `InputError` for a parameter that the preconditioner does not suit, or an unknown one."""
+        """Return the state before the first step. Raises `InputError` for an unknown parameter, or one that S does not support."""
         for name in ("preconditioned", "reparameterised"):
             if unknown := next((key for key in getattr(self, name) if key not in parameters), None):
                 raise InputError(f'ScheduleFree: {name}: unknown parameter "{unknown}"')

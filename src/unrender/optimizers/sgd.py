@@ -19,11 +19,11 @@ from unrender.schedules.functions import Schedule
 class SGD(Recipe):
     """Steps −η u with the velocity u ← μ u + g (Polyak's heavy ball).
 
-    A constant gradient g ends in steps of −η g / (1 − μ). The chain is `DecayingSum`.
+    For a constant gradient g the steps converge to −η g / (1 − μ). The chain is `DecayingSum`.
 
     Args:
-        learning_rate: η, in units of the parameter squared per unit of loss, > 0; for the parameters without their own.
-            Or {key: rate, "*": of the others}.
+        learning_rate: η, in units of the parameter squared per unit of loss, > 0, for the parameters without their own; or {key: rate,
+            "*": rate of the others}.
         momentum: μ, in [0, 1).
         schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
     """

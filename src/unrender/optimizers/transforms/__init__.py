@@ -1,4 +1,4 @@
-"""The parts that steps are made of: each has `init` and `update`, and `unrender.optimizers.Chain` composes them."""
+"""Step transforms: parts of a step with `init` and `update`, which `unrender.optimizers.Chain` composes."""
 
 from unrender.optimizers.transforms.agreement_rate import AgreementRate
 from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, FittedSobolev

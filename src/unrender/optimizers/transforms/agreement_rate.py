@@ -23,15 +23,15 @@ from unrender.optimizers.transforms.base import (
 _DELAY = 10.0
 """τ of the docstring, in steps."""
 _STEEPEST = 0.6
-"""The greatest power of 1/t that the rate falls by: between 1/2 and 1, with averages, as in Polyak and Juditsky 1992."""
+"""Largest power of 1/t in the decay: between 1/2 and 1 for averaged iterates, as in Polyak and Juditsky 1992."""
 _MEMORY = 0.8
 """Decay of the mean correlation of successive gradients."""
 _PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
-"""Independent pairs of gradients of which a plain mean would tell as much."""
+"""Number of independent pairs of gradients with the same variance in a plain mean."""
 _MOST_GROWTH = 3.0
-"""Times the first rate, and times what the parameters themselves have grown by."""
+"""Largest rate relative to the first one, and relative to the growth of the parameters."""
 _REFINED = 0.3
-"""The greatest rate, over the first one, at a step that reduces smoothing."""
+"""Largest rate, relative to the first one, at a step that reduces smoothing."""
 
 
 @dataclass(frozen=True)
@@ -52,19 +52,19 @@ class Agreement(TransformState):
 @register
 @dataclass(frozen=True)
 class AgreementRate(StepTransform):
-    """Change each parameter's learning rate by the mean correlation ρ of its successive gradients.
+    """Adapt each parameter's learning rate to the mean correlation ρ of its successive gradients.
 
         log η_{t+1} = log η_t + q max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − max(0, ρ)), 0.6) / (t + τ)
 
-    with τ = 10. The rate grows while gradients agree. It shrinks where they contradict one another, as after steps too long. It falls as
-    t^-0.6 once they are noise. Gradients of n elements agree by chance within s = 1/(3 √n), the standard error of ρ. The rate grows up to 3
-    times the first, and times what the parameter itself has grown by. A step that reduces smoothing has at most 0.3 of the first rate.
-    A `FittedSobolev` before it remembers the last gradient.
+    with τ = 10. The rate grows while gradients agree, shrinks where they oppose each other, as after too long steps, and decays as t^-0.6
+    once they are noise. s = 1/(3 √n) is the standard error of ρ for random gradients of n elements. The rate is at most 3 times the
+    first, times the growth of the parameter. At a step that reduces smoothing it is at most 0.3 times the first. Needs a `FittedSobolev`
+    before it, which stores the last gradient.
 
     Args:
         growth: q, >= 0; 0 for a rate that never grows.
-        decay: p, >= 0; 0 for a rate that never falls.
-        unsized: Keys of parameters whose size does not raise the limit of the rate, such as those that move as logarithms.
+        decay: p, >= 0; 0 for a rate that never decays.
+        unsized: Keys of parameters whose growth does not raise the limit, such as those optimised as logarithms.
     """
 
     growth: float = 0.1
@@ -84,7 +84,7 @@ class AgreementRate(StepTransform):
         return Agreement(dict.fromkeys(parameters, 1.0), dict.fromkeys(parameters, 0.0), sizes)
 
     def update(self, update: StepUpdate, state: Agreement) -> tuple[StepUpdate, Agreement]:
-        """See `StepTransform.update`. Waits for the device: correlations and the parameters' size are read."""
+        """Adapt the learning rates. Waits for the device, because correlations and sizes of the parameters are read."""
         previous = update.require_previous("AgreementRate")
         if update.made > 0:
             correlation, log_rate = {}, {}
@@ -100,7 +100,7 @@ class AgreementRate(StepTransform):
         return replace(update, factors=factors), state
 
     def choices(self, state: Agreement, made: int) -> tuple[str, ...]:
-        """See `StepTransform.choices`: how far the rates have come."""
+        """Return the current rates relative to the first."""
         changed = [f"{key} {math.exp(log):.2g}" for key, log in state.log_rate.items()] if made > 0 else []
         return (f"learning rate, over the first: {listed(changed)}",) if changed else ()
 
@@ -113,20 +113,20 @@ class AgreementRate(StepTransform):
 
 
 def _root_mean_square(x: Array, square: float) -> float:
-    """Return the root mean square of an array whose squares sum up to `square`; 0 of no elements."""
+    """Return the root mean square of an array from the sum of its squares; 0 for an empty array."""
     return math.sqrt(square / max(1, math.prod(arrays.shape(x))))
 
 
 def _measured(gradient: Tree, previous: Tree, parameters: Tree) -> dict[str, tuple[float, float]]:
-    """Return {key: (cosine of the angle between two gradients, 0 where one of them is 0; root mean square of the parameter)}."""
+    """Return {key: (cosine of the angle between two gradients, 0 if one of them is 0; root mean square of the parameter)}."""
     sums = {
         key: inner_products([(g, previous[key]), (g, g), (previous[key],) * 2, (parameters[key],) * 2])
         for key, g in gradient.items()
     }
     arrays.evaluate(sums)
-    found = {}
+    measured = {}
     for key, parts in sums.items():
         product, one, other, square = (arrays.number(part) for part in parts)
         lengths = math.sqrt(one) * math.sqrt(other)
-        found[key] = (product / lengths if lengths > 0 else 0.0, _root_mean_square(parameters[key], square))
-    return found
+        measured[key] = (product / lengths if lengths > 0 else 0.0, _root_mean_square(parameters[key], square))
+    return measured

@@ -1,4 +1,4 @@
-"""What a transform is: one part of a step, with a state of its own."""
+"""Base class of step transforms: parts of a step with their own state."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from unrender.scene.upsampling import SQUARES, Upsampler
 
 @dataclass(frozen=True)
 class SmoothingChange:
-    """How the gradient of one parameter is preconditioned at this step.
+    """Preconditioning of one parameter's gradient at this step.
 
     Attributes:
         preconditioner: S; None for the identity.
-        gain: |S g|² over that with the smoothing of the last step; 1 where the smoothing has not changed.
-        level: |S g|² where the smoothing has changed; 0 elsewhere.
-        confirmed: Share of the agreement of successive gradients that fresh samples confirm, in (0, 1].
-        vertices: Vertices of the mesh whose values these are; 0 for textures, grids and single numbers.
+        gain: |S g|² relative to the smoothing of the last step; 1 if it is unchanged.
+        level: |S g|² if the smoothing has changed; 0 otherwise.
+        confirmed: Fraction of the agreement of successive gradients that independent samples confirm, in (0, 1].
+        vertices: Number of mesh vertices that carry the parameter; 0 for textures, grids and numbers.
     """
 
     preconditioner: Preconditioner | None = None
@@ -39,24 +39,24 @@ SMOOTHING_UNCHANGED = SmoothingChange()
 
 @dataclass(frozen=True)
 class StepUpdate:
-    """What flows through a chain: at first the gradient, at last the steps.
+    """Data that passes through a chain: the gradient at first, the steps at last.
 
-    The step of a parameter is −η f q direction / divisor with its learning rate η, `factor` f and its own q of `factors`. A transform may
-    set `steps` instead.
+    The step of a parameter is −η f q direction / divisor, with its learning rate η, the common factor f, and its own factor q. A
+    transform may set `steps` instead.
 
     Attributes:
         estimate: Estimate of this step.
         parameters: Current values, {key: array}.
-        made: Steps that the chain has made before this one.
+        made: Number of previous steps of the chain.
         learning_rates: {key: η}, in units of the parameter.
-        gradient: Gradient as preconditioned so far.
-        direction: Ascent direction as transformed so far; the gradient at first.
-        factor: Factor of every learning rate.
-        factors: {key: factor of this learning rate}; 1 for keys that are missing.
-        divisor: Sum of weights of a mean that `direction` is, which starts at zero.
-        previous: Preconditioned gradient of the last step; zeros at the first step, None where no transform remembers it.
-        smoothing: {key: how its gradient is preconditioned}.
-        steps: {key: step}, set by a transform that has iterates of its own.
+        gradient: Gradient with the preconditioning so far.
+        direction: Ascent direction with the transforms so far; initially the gradient.
+        factor: f, factor of every learning rate.
+        factors: {key: q}; 1 for missing keys.
+        divisor: Sum of weights, if `direction` is a mean that starts at zero.
+        previous: Preconditioned gradient of the last step; zeros at the first step, None if no transform stores it.
+        smoothing: {key: preconditioning of its gradient}.
+        steps: {key: step}, set by a transform with its own iterates.
     """
 
     estimate: Estimate
@@ -77,21 +77,21 @@ class StepUpdate:
         return self.learning_rates[key] * (self.factor / self.divisor) * self.factors.get(key, 1.0)
 
     def require_previous(self, owner: str) -> Tree:
-        """Return `previous`. Raise `InputError` where no earlier transform remembers it."""
+        """Return `previous`. Raise `InputError` if no earlier transform stores it."""
         if self.previous is None:
-            raise InputError(f"{owner}: no transform before it remembers the last gradient; put FittedSobolev first")
+            raise InputError(f"{owner}: no transform before it stores the last gradient; put FittedSobolev first")
         return self.previous
 
 
 class StepTransform(ABC):
-    """One part of a step. Immutable; everything that changes is in its state.
+    """Part of a step. Immutable; everything that changes is in its state.
 
-    A class inherits from this one and is registered. `unrender.optimizers.Chain` applies transforms one after the other.
+    Subclasses are registered. `unrender.optimizers.Chain` applies transforms in sequence.
     """
 
     @property
     def requires(self) -> tuple[type[Capability], ...]:
-        """Capabilities that the estimate must have, besides the gradient."""
+        """Capabilities that the estimate must have in addition to the gradient."""
         return ()
 
     @abstractmethod
@@ -110,25 +110,25 @@ class StepTransform(ABC):
         ...
 
     def choices(self, state: Any, made: int) -> tuple[str, ...]:
-        """Return what the transform has chosen in `made` steps, a line each, for people."""
+        """Return the choices of the transform after `made` steps for display, one line each."""
         del state, made
         return ()
 
 
 VALUES: Mapping[str, float] = {"power": 0.0}
-"""Metadata of a state's field {key: array} that holds values of parameters."""
+"""Metadata of a state's field {key: array} that contains values of parameters."""
 GRADIENTS: Mapping[str, float] = {"power": 1.0}
-"""Metadata of a field that holds gradients."""
+"""Metadata of a field that contains gradients."""
 MEAN_SQUARES: Mapping[str, float] = {"power": SQUARES}
-"""Metadata of a field that holds mean squares of gradients."""
+"""Metadata of a field that contains mean squares of gradients."""
 
 
 @dataclass(frozen=True)
 class TransformState:
-    """A state whose fields declare by metadata what a finer resolution makes of them: `VALUES`, `GRADIENTS` or `MEAN_SQUARES`."""
+    """State whose fields declare in metadata how a finer resolution scales them: `VALUES`, `GRADIENTS` or `MEAN_SQUARES`."""
 
     def upsampled(self, upsampler: Upsampler) -> Any:
-        """See `Upsamplable`."""
+        """Interpolate the fields, and scale them by their metadata."""
         powers = {each.name: each.metadata["power"] for each in fields(self) if "power" in each.metadata}
         return replace(self, **{name: upsampler.tree(getattr(self, name), power) for name, power in powers.items()})
 

@@ -30,64 +30,63 @@ from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler
 
 STEPS = 10
-"""The pairs of gradients that the strength is fitted to at first: later ones tell more of noise than of what is still to do."""
+"""Number of pairs of gradients in the first fit. Later pairs contain more noise than signal."""
 _FACTOR, _WEAKEST = 4.0, 1 / 16
 """Candidates are λ, λ/4, λ/16, ... down to the first that hardly smooths."""
 _LEAST_DESCENT = 0.4
-"""Of the best candidate's."""
+"""Smallest accepted descent relative to the best candidate's."""
 _ROWS = 8
-"""Fresh gradients from one judgement to the next; it is by those of the last two."""
+"""Number of independent gradients between two tests; a test uses those of the last two intervals."""
 _LEAST_FRESH_DESCENT, _ERRORS = 0.7, 2.8
-"""Of the best candidate's with fresh samples; and by how many standard errors it has to be more than the present strength's."""
+"""Smallest accepted descent relative to the best candidate's, and the smallest improvement in standard errors."""
 _CONFIRMED, _KEPT = 0.45, 0.6
-"""Shares of what successive gradients agree on that fresh samples have to show for less smoothing, and must not be below by a standard
-error once it is less."""
+"""Confirmed fraction of the agreement of successive gradients that is needed to reduce smoothing, and the fraction below which the
+reduction is reverted."""
 _CLEAR = 0.15
-"""Share of |S g|² that fresh samples have to show for less smoothing."""
+"""Fraction of |S g|² that independent samples must confirm to reduce smoothing."""
 _SLOWEST = 0.75
-"""The power of 1 / step that detail's gradient falls by at most where it waits for less smoothing."""
+"""Largest power of 1/step at which the gradient of detail may decay if smoothing is to be reduced."""
 _LEAST_LEFT = 0.05
-"""Share of its first gradients that detail's gradient must still have for less smoothing."""
+"""Smallest fraction of its first gradients that the gradient of detail must retain if smoothing is to be reduced."""
 _LEAST_CONFIRMED = 0.02
-"""The share by which such an agreement counts at least."""
+"""Smallest value of `confirmed`."""
 
 
 @dataclass(frozen=True)
 class StrengthFit:
-    """The strength of one parameter's preconditioner.
+    """Fitted strength of one parameter's Sobolev preconditioner.
 
-    The stronger the smoothing, the quicker whole regions move, and the less noise moves them; but what differs from texel to texel hardly
-    moves. With g and g' the gradients of successive steps and S = (I + λ L)^(-1/2), steps that are as long as Adam's descend by about
-    S g · S g' / |S g|. The strength is at first the greatest, up to that given, by which they descend at least 0.4 times as much as by
-    the best.
+    Strong smoothing moves large regions quickly and averages noise, but hardly moves detail of single texels. Consider gradients g and g'
+    of successive steps, and S = (I + λ L)^(-1/2). Steps of Adam's length descend by about S g · S g' / |S g|. The first fit selects the
+    strongest smoothing, up to the given λ, whose descent is at least 0.4 times the best.
 
-    Later, gradients of an estimator that remembers samples agree on the noise remembered, too. Where an estimate has the gradient f of
-    fresh samples (`FreshGradient`), S g · S f is what is no noise. Smoothing is reduced, to the strongest that descends at least 0.7 times
-    as much as the best, if by that the descent grows by more than 2.8 standard errors, and S g · S f is at least 0.45 of S g · S g', and
-    0.15 of |S g|²: the rest is noise, which nothing would average any more.
+    Gradients of an estimator that reuses samples also agree on the reused noise. If an estimate has the gradient f from new samples
+    (`FreshGradient`), S g · S f excludes that noise. Smoothing is reduced to the strongest candidate with at least 0.7 times the best
+    descent, if all of the following hold:
 
-    Steps by smoothed gradients recover detail, too, only later: reducing their smoothing pays where the detail waits for it. So the root of
-    S g · S f with the new strength must fall more slowly than step^(-3/4) from one look at fresh gradients to the next, the first
-    gradients being the first look. In pictures it falls as 1/step, on a checkerboard of single texels hardly at all. And it must be at
-    least a twentieth of what it was at first: where less is left, there is little to gain, and single texels would follow the noise of
-    the reference. What is gained in detail is easily lost to noise: where fresh gradients come to show less than 0.6 of what successive
-    ones agree on, by a standard error, the strength is that of the first fit again.
+    - The descent grows by more than 2.8 standard errors.
+    - S g · S f is at least 0.45 of S g · S g', and 0.15 of |S g|²; the rest is noise, which would no longer be averaged.
+    - The gradient of the detail persists: the root of S g · S f with the new strength decays more slowly than step^(-3/4) between two
+      tests (the first gradients are the first test). Smoothed steps recover detail too, only later, so less smoothing helps only if
+      detail waits for it. For photographs it decays as 1/step, for a checkerboard of single texels hardly at all.
+    - It is at least a twentieth of its first value. Otherwise there is little to gain, and single texels would fit the reference's noise.
 
-    What is no noise of what successive gradients agree on, is `confirmed`.
+    If new gradients later confirm less than 0.6 of the agreement of successive ones, by a standard error, the strength of the first fit
+    is restored.
 
     Attributes:
-        share: of the λ given, in (0, 1].
-        count: pairs of gradients that the first fit has seen.
-        sums: (n, 2), over them, of S g · S g' and |S g|² for the n candidates.
-        fresh: of up to 16 fresh gradients since the last change, (3, 1 + n) each: S g · S f, |S g|² and S g · S g' for this share and the
-            candidates.
-        unjudged: how many of these came after the last judgement.
-        gain: |S g|² with this share over that with the share before, where fresh gradients have changed it at this step; 1 elsewhere.
-        level: |S g|² with this share, where it was changed at this step; 0 elsewhere.
-        steps: gradients seen after the first.
-        seen: of the last look, (1 + n,): S g · S f for the n candidates, and the mean of `steps` then; empty before the first.
-        confirmed: the share of S g · S g' that is S g · S f, at most, in [0.02, 1]: by how much gradients agree for what is no noise.
-        last: the summary of the last gradient (`Sobolev.summary`), where there is one; else empty.
+        share: fraction of the given λ, in (0, 1].
+        count: number of pairs of gradients in the first fit.
+        sums: sums of S g · S g' and |S g|² over these pairs for the n candidates, (n, 2).
+        fresh: products for up to 16 new gradients since the last change, (3, 1 + n) each: S g · S f, |S g|² and S g · S g' for this share
+            and the candidates.
+        unjudged: number of these since the last test.
+        gain: |S g|² with this share relative to the previous share, if it changed at this step; otherwise 1.
+        level: |S g|² with this share, if it changed at this step; otherwise 0.
+        steps: number of gradients after the first.
+        seen: result of the last test, (1 + n,): S g · S f for the n candidates, and the mean of `steps`; empty before the first.
+        confirmed: upper estimate of the fraction of S g · S g' that S g · S f confirms, in [0.02, 1].
+        last: summary of the last gradient (`Sobolev.summary`), if there is one; else empty.
     """
 
     share: float = 1.0
@@ -103,47 +102,47 @@ class StrengthFit:
     last: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def begun(self, preconditioner: Sobolev, gradient: Array) -> StrengthFit:
-        """With a first gradient, as it is."""
+        """Return the fit after a first, unpreconditioned gradient."""
         summary = preconditioner.summary(gradient)
         return self if summary is None else replace(self, last=summary)
 
     def after(
         self, preconditioner: Sobolev, previous: Array, gradient: Array, fresh: Array | None = None
     ) -> StrengthFit:
-        """With another pair of gradients.
+        """Return the fit after a further pair of gradients.
 
         Args:
-            preconditioner: with all of λ.
-            previous: the gradient of the last step, preconditioned with this share.
-            gradient: that of this step, as it is.
-            fresh: that of this step's samples alone; None where it was not estimated. Left out where it is not finite.
+            preconditioner: preconditioner with the full λ.
+            previous: gradient of the last step, preconditioned with this share.
+            gradient: gradient of this step, not preconditioned.
+            fresh: gradient from this step's samples only; None if not estimated. Ignored if not finite.
         """
         summary = preconditioner.summary(gradient)
         if summary is not None and not len(self.last):
             return replace(self, gain=1.0, level=0.0, last=summary)
-        found = replace(self, gain=1.0, level=0.0, steps=self.steps + 1)
+        fit = replace(self, gain=1.0, level=0.0, steps=self.steps + 1)
         pair = _Pair(previous, gradient, self.last, summary)
-        if found.count < STEPS:
-            found = found._with_pair(preconditioner, pair)
+        if fit.count < STEPS:
+            fit = fit._with_pair(preconditioner, pair)
         else:
             if fresh is not None:
                 newer = _Pair(previous, fresh, self.last, preconditioner.summary(fresh))
-                found = found._with_fresh(preconditioner, pair, newer)
-            found = found._judged() if found.unjudged >= _ROWS else found
-        return found if summary is None else replace(found, last=summary)
+                fit = fit._with_fresh(preconditioner, pair, newer)
+            fit = fit._judged() if fit.unjudged >= _ROWS else fit
+        return fit if summary is None else replace(fit, last=summary)
 
     def _with_pair(self, preconditioner: Sobolev, pair: _Pair) -> StrengthFit:
-        """The first fit, with another pair."""
-        found = self
+        """Return the first fit with a further pair."""
+        fit = self
         if self.count == 0:
             strength = preconditioner.strength_of(arrays.shape(pair.gradient))
-            found = replace(self, sums=np.zeros((_candidates(strength), 2)))
+            fit = replace(self, sums=np.zeros((_candidates(strength), 2)))
         smooth = preconditioner.scaled(self.share)
-        sums = found.sums + pair.descents(smooth, found._shares / self.share).T
-        return replace(found, share=_share(sums), count=self.count + 1, sums=sums)
+        sums = fit.sums + pair.descents(smooth, fit._shares / self.share).T
+        return replace(fit, share=_share(sums), count=self.count + 1, sums=sums)
 
     def _with_fresh(self, preconditioner: Sobolev, pair: _Pair, fresh: _Pair) -> StrengthFit:
-        """With the products of another fresh gradient."""
+        """Return the fit with the products of a further new gradient."""
         smooth, shares = preconditioner.scaled(self.share), np.append(1.0, self._shares / self.share)
         products, squares = fresh.descents(smooth, shares)
         agreement, _ = pair.descents(smooth, shares)
@@ -153,15 +152,15 @@ class StrengthFit:
         return replace(self, fresh=(*self.fresh, row)[-2 * _ROWS :], unjudged=self.unjudged + 1)
 
     def _judged(self) -> StrengthFit:
-        """With the strength that the fresh gradients speak for."""
+        """Return the fit after a test by the new gradients."""
         rows = np.stack(self.fresh)
         products, squares = rows[:, 0], rows[:, 1]
         first, before = _share(self.sums), self._before
         looked = np.append(products[-self.unjudged :, 1:].mean(axis=0), self.steps - 0.5 * (self.unjudged - 1))
-        found = replace(self, seen=looked, unjudged=0)
+        fit = replace(self, seen=looked, unjudged=0)
         if self.share < first and sum(_confirmed(rows[-self.unjudged :], 0)) < _KEPT:
             known = np.interp(math.log(first), np.log(self._shares[::-1]), squares.mean(axis=0)[:0:-1])
-            return found._changed(first, float(known), squares[:, 0].mean())
+            return fit._changed(first, float(known), squares[:, 0].mean())
         descents = products / np.sqrt(squares)
         means = descents.mean(axis=0)[1:]
         best = int(np.argmax(means >= _LEAST_FRESH_DESCENT * means.max()))
@@ -175,33 +174,33 @@ class StrengthFit:
             and looked[best] > before[best] * (before[-1] / looked[-1]) ** (2 * _SLOWEST)
             and looked[best] * self.count >= _LEAST_LEFT**2 * self.sums[best, 0]
         ):
-            return found._changed(float(self._shares[best]), square, squares[:, 0].mean())
-        return replace(found, confirmed=_most_confirmed(rows))
+            return fit._changed(float(self._shares[best]), square, squares[:, 0].mean())
+        return replace(fit, confirmed=_most_confirmed(rows))
 
     def _changed(self, share: float, level: float, before: float) -> StrengthFit:
-        """With another strength, of which nothing is known yet; |S g|² with it, and with the one before."""
+        """Return the fit with another strength; `level` and `before` are |S g|² with it and with the previous one."""
         gain = float(level / before)
         return replace(self, share=share, gain=gain, level=float(level), fresh=(), unjudged=0, confirmed=1.0)
 
     @property
     def _before(self) -> np.ndarray:
-        """`seen`, or of the first fit."""
+        """`seen`, or its equivalent from the first fit."""
         return self.seen if len(self.seen) else np.append(self.sums[:, 0] / self.count, 0.5 * (self.count + 1))
 
     @property
     def _shares(self) -> np.ndarray:
-        """Of the candidates, (n,)."""
+        """Fractions of λ of the candidates, (n,)."""
         return _FACTOR ** -np.arange(len(self.sums), dtype=float)
 
 
 @dataclass(frozen=True)
 class _Pair:
-    """Two gradients.
+    """Two successive gradients.
 
     Attributes:
-        previous: the earlier, preconditioned.
-        gradient: the later, as it is.
-        first, second: the summaries of both, as they are, where the second is not None.
+        previous: the earlier gradient, preconditioned.
+        gradient: the later gradient, not preconditioned.
+        first, second: summaries of both without preconditioning, if `second` is not None.
     """
 
     previous: Array
@@ -220,28 +219,27 @@ def _candidates(strength: float) -> int:
 
 
 def _confirmed(rows: np.ndarray, candidate: int) -> tuple[float, float]:
-    """The share of what successive gradients agree on that fresh ones confirm, with a candidate's strength, and its standard error.
+    """Return the fraction of the agreement of successive gradients that new ones confirm with a candidate, and its standard error.
 
-    Σ S g · S f / Σ S g · S g' of rows (k, 3, 1 + n) that count alike, each over its |S g|².
-
-    (1, 0) where successive gradients do not agree: there is then nothing to confirm.
+    It is Σ S g · S f / Σ S g · S g' over rows (k, 3, 1 + n), each divided by its |S g|². (1, 0) if successive gradients do not agree,
+    because there is nothing to confirm.
     """
     products, agreement = rows[:, (0, 2), candidate].T / rows[:, 1, candidate]
     if agreement.sum() <= 0:
         return 1.0, 0.0
-    found = products.sum() / agreement.sum()
-    error = (products - found * agreement).std(ddof=1) * math.sqrt(len(rows)) / agreement.sum()
-    return float(found), float(error)
+    ratio = products.sum() / agreement.sum()
+    error = (products - ratio * agreement).std(ddof=1) * math.sqrt(len(rows)) / agreement.sum()
+    return float(ratio), float(error)
 
 
 def _most_confirmed(rows: np.ndarray) -> float:
-    """Two standard errors above the share that fresh gradients confirm with the present strength, within [0.02, 1]."""
+    """Return the confirmed fraction at the current strength plus two standard errors, clamped to [0.02, 1]."""
     share, error = _confirmed(rows, 0)
     return min(max(share + 2.0 * error, _LEAST_CONFIRMED), 1.0)
 
 
 def _share(sums: np.ndarray) -> float:
-    """From the sums of a `StrengthFit`; between candidates, where the straight line over log λ meets the least descent."""
+    """Return the share from the sums of a `StrengthFit`, interpolated between candidates linearly over log λ."""
     products, squares = sums.T
     descent = products / np.sqrt(np.where(squares > 0, squares, np.inf))
     least = _LEAST_DESCENT * descent.max()
@@ -262,15 +260,15 @@ class FittedSobolevState(TransformState):
     """State of `FittedSobolev`.
 
     Attributes:
-        gradient: Gradient of the last step, preconditioned; zeros before the first.
-        strengths: {key: fit of the strength}, of the parameters whose preconditioner is a `Sobolev`.
+        gradient: Preconditioned gradient of the last step; zeros before the first.
+        strengths: {key: fit of the strength} of the parameters whose preconditioner is a `Sobolev`.
     """
 
     gradient: Tree = field(metadata=GRADIENTS)
     strengths: dict[str, StrengthFit] = field(default_factory=dict)
 
     def upsampled(self, upsampler: Upsampler) -> FittedSobolevState:
-        """See `Upsamplable`: the strength is fitted anew."""
+        """Interpolate the gradient, and restart the fit of refined parameters."""
         strengths = {key: StrengthFit() if key in upsampler.shares else fit for key, fit in self.strengths.items()}
         return replace(super().upsampled(upsampler), strengths=strengths)
 
@@ -278,10 +276,10 @@ class FittedSobolevState(TransformState):
 @register
 @dataclass(frozen=True)
 class FittedSobolev(StepTransform):
-    """Precondition gradients, and remember them for the transforms that follow.
+    """Precondition gradients, and store them for later transforms.
 
-    The strength of a `Sobolev` is the greatest that is of use: it is fitted to successive gradients, see `StrengthFit`. Any other
-    preconditioner is applied as it is. Gradients of other parameters stay as they are. The gradient keeps its unit.
+    The strength of a `Sobolev` is an upper limit; it is fitted to successive gradients, see `StrengthFit`. Any other preconditioner is
+    applied unchanged. Gradients of other parameters are unchanged. The gradient keeps its unit.
 
     Args:
         preconditioner: S; None for none.
@@ -312,7 +310,7 @@ class FittedSobolev(StepTransform):
         return transform
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> FittedSobolevState:
-        """See `StepTransform.init`. Raises `InputError` for a parameter that the preconditioner does not suit, or an unknown one."""
+        """Return the state before the first step. Raises `InputError` for an unknown parameter, or one that S does not support."""
         del learning_rates
         for key in self.preconditioned:
             if key not in parameters:
@@ -323,13 +321,13 @@ class FittedSobolev(StepTransform):
         return FittedSobolevState(trees.zeros_like(parameters), dict.fromkeys(fitted, StrengthFit()))
 
     def update(self, update: StepUpdate, state: FittedSobolevState) -> tuple[StepUpdate, FittedSobolevState]:
-        """See `StepTransform.update`. Waits for the device where a strength is fitted."""
+        """Precondition the gradient. Waits for the device if a strength is fitted."""
         raw = update.gradient
         if update.made == 0:
             strengths = {key: fit.begun(self._sobolev(key), raw[key]) for key, fit in state.strengths.items()}
         else:
-            found = update.estimate.get(FreshGradient)
-            fresh: Mapping[str, Array] = {} if found is None else found.values
+            fresh_gradient = update.estimate.get(FreshGradient)
+            fresh: Mapping[str, Array] = {} if fresh_gradient is None else fresh_gradient.values
             strengths = {
                 key: fit.after(self._sobolev(key), state.gradient[key], raw[key], fresh.get(key))
                 for key, fit in state.strengths.items()
@@ -347,7 +345,7 @@ class FittedSobolev(StepTransform):
         ), following
 
     def choices(self, state: FittedSobolevState, made: int) -> tuple[str, ...]:
-        """See `StepTransform.choices`: how strongly gradients are smoothed."""
+        """Return the fitted strengths relative to the given ones."""
         del made
         fitted = [f"{key} {fit.share:.2g}" for key, fit in state.strengths.items() if fit.count]
         return (f"smoothing, as a share of the strongest: {listed(fitted)}",) if fitted else ()
@@ -375,7 +373,7 @@ class FittedSobolev(StepTransform):
 class ApplyPreconditioner(StepTransform):
     """Apply the preconditioner of this step to the direction.
 
-    With `FittedSobolev` before it and a scaling between the two, the parameter moves along S (S g / scale).
+    With `FittedSobolev` before it and a scaling in between, the parameter moves along S (S g / scale).
     """
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""Transforms that remember earlier directions."""
+"""Transforms with momentum."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class MeanDirection(TransformState):
 class GradientMean(StepTransform):
     """Replace the direction by its debiased exponentially weighted mean: m ← β₁ m + (1 − β₁) g (Kingma and Ba 2015).
 
-    It has the unit of the direction. The debiasing is left to the step (`StepUpdate.divisor`).
+    It has the unit of the direction. The step applies the debiasing (`StepUpdate.divisor`).
 
     Args:
         decay: β₁, in [0, 1).
@@ -64,7 +64,7 @@ class Velocity(TransformState):
 class DecayingSum(StepTransform):
     """Replace the direction by its decaying sum: u ← μ u + g (Polyak's heavy ball).
 
-    A constant direction g ends in g / (1 − μ).
+    A constant direction g converges to g / (1 − μ).
 
     Args:
         momentum: μ, in [0, 1).

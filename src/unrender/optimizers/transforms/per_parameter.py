@@ -31,12 +31,12 @@ class PerParameterState:
     others: tuple[Any, ...]
 
     def upsampled(self, upsampler: Upsampler) -> PerParameterState:
-        """See `Upsamplable`: as each of the states."""
+        """Interpolate each of the states."""
         parts = (tuple(upsampled(state, upsampler) for state in part) for part in (self.own, self.others))
         return PerParameterState(*parts)
 
     def restarted(self, fresh: PerParameterState) -> PerParameterState:
-        """See `Restartable`: as each of the states."""
+        """Restart each of the states."""
         pairs = ((self.own, fresh.own), (self.others, fresh.others))
         return PerParameterState(*(tuple(map(restarted, old, new)) for old, new in pairs))
 
@@ -44,12 +44,12 @@ class PerParameterState:
 @register
 @dataclass(frozen=True)
 class PerParameter(StepTransform):
-    """Apply some transforms to the parameters in `keys`, others to the rest.
+    """Apply some transforms to the parameters in `keys`, and others to the rest.
 
     Args:
         keys: Keys of parameters.
-        transforms: For those, first to last.
-        others: For all others, first to last.
+        transforms: Transforms of these, in order.
+        others: Transforms of all others, in order.
     """
 
     keys: tuple[str, ...] = ()
@@ -63,7 +63,7 @@ class PerParameter(StepTransform):
 
     @property
     def requires(self) -> tuple[type[Capability], ...]:
-        """What the transforms require."""
+        """Capabilities that the transforms require."""
         return tuple(kind for part in (*self.transforms, *self.others) for kind in part.requires)
 
     def on_meshes(
@@ -76,7 +76,7 @@ class PerParameter(StepTransform):
         return replace(self, transforms=own, others=others)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> PerParameterState:
-        """See `StepTransform.init`. Raises `InputError` for a key that is no parameter."""
+        """Return the states before the first step. Raises `InputError` for an unknown key."""
         if unknown := next((key for key in self.keys if key not in parameters), None):
             raise InputError(f'PerParameter: keys: unknown parameter "{unknown}"')
         states = []
@@ -88,14 +88,14 @@ class PerParameter(StepTransform):
     def update(self, update: StepUpdate, state: PerParameterState) -> tuple[StepUpdate, PerParameterState]:
         results, following = [], []
         for parts, before, own in ((self.transforms, state.own, True), (self.others, state.others, False)):
-            found, states = self._restricted(update, own), []
+            group, states = self._restricted(update, own), []
             for part, each in zip(parts, before, strict=True):
-                found, after = part.update(found, each)
+                group, after = part.update(group, each)
                 states.append(after)
-            # The groups' common factors may differ from now on: they become factors of the parameters.
-            scale = found.factor / found.divisor
-            factors = {key: found.factors.get(key, 1.0) * scale for key in found.direction}
-            results.append(replace(found, factors=factors))
+            # The groups' common factors may differ after their transforms, so they become factors of the parameters.
+            scale = group.factor / group.divisor
+            factors = {key: group.factors.get(key, 1.0) * scale for key in group.direction}
+            results.append(replace(group, factors=factors))
             following.append(tuple(states))
         own, others = results
         merged: dict[str, Any] = {name: {**getattr(own, name), **getattr(others, name)} for name in _TREES}

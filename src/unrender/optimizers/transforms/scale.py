@@ -37,14 +37,14 @@ class MeanSquare(TransformState):
 class ScaleByRms(StepTransform):
     """Divide the direction by √v̂ + ε, with the debiased mean v̂ of the squared gradient (Kingma and Ba 2015).
 
-    The result has no unit. Where a `FittedSobolev` changes the smoothing, v becomes as large as the gradients of the new smoothing.
+    The result has no unit. If a `FittedSobolev` changes the smoothing, v is rescaled to the gradients with the new smoothing.
 
     Args:
         decay: β₂, decay of the mean, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
         uniform: Whether all elements of a parameter are divided by the largest √v̂ among them (Nicolet et al. 2021).
-        long_memory: Whether all gradients have equal weight in v from step 1 / (1 − β₂) on. A constant decay makes steps grow as gradients
-            vanish (Reddi et al. 2018, "On the Convergence of Adam and Beyond").
+        long_memory: Whether all gradients have equal weight in v from step 1 / (1 − β₂) on. A constant decay makes steps grow as
+            gradients vanish (Reddi et al. 2018, "On the Convergence of Adam and Beyond").
     """
 
     decay: float = 0.999
@@ -61,15 +61,15 @@ class ScaleByRms(StepTransform):
         return MeanSquare(trees.zeros_like(parameters))
 
     def update(self, update: StepUpdate, state: MeanSquare) -> tuple[StepUpdate, MeanSquare]:
-        """See `StepTransform.update`. Waits for the device where the smoothing changes."""
+        """Scale the direction. Waits for the device if the smoothing changes."""
         weight, weights = self._weights(update.made)
         debias = 1.0 / math.sqrt(weights)
         second: Tree = {}
         direction: Tree = {}
         for key, g in update.gradient.items():
             level, before = update.smoothing.get(key, SMOOTHING_UNCHANGED).level, state.second_moment[key]
-            if level > 0.0 and (whole := arrays.number(arrays.total(before))) > 0.0:
-                before = before * arrays.scalar(level * self._weights(update.made - 1)[1] / whole, g)
+            if level > 0.0 and (sum_before := arrays.number(arrays.total(before))) > 0.0:
+                before = before * arrays.scalar(level * self._weights(update.made - 1)[1] / sum_before, g)
             if self.long_memory:
                 before = before * arrays.scalar(1.0 - weight, g)
                 second[key] = before + arrays.scalar(weight, g) * (g * g)
@@ -93,13 +93,13 @@ class ScaleByRms(StepTransform):
 @register
 @dataclass(frozen=True)
 class ScaleByDeviation(StepTransform):
-    """Divide the direction by √(Var g + ε), with the variance that the estimator provides (Balint et al. 2023, Eq. 21).
+    """Divide the direction by √(Var g + ε), with the variance from the estimator (Balint et al. 2023, Eq. 21).
 
     The result has no unit.
 
     Args:
         epsilon: ε, in squared units of the gradient, > 0.
-        rule: "deviation", the paper's; "walk" also multiplies by √((1 − α) / (1 + α)) with the weight of the past α, see `MetaAdam`.
+        rule: "deviation" is the paper's; "walk" also multiplies by √((1 − α) / (1 + α)) with the weight α of the past, see `MetaAdam`.
     """
 
     epsilon: float = 1e-24
@@ -112,7 +112,7 @@ class ScaleByDeviation(StepTransform):
 
     @property
     def requires(self) -> tuple[type[Capability], ...]:
-        """The variance; by the rule "walk" the weight of the past, too."""
+        """The variance; for the rule "walk" also the weight of the past."""
         return (Variance, PastWeight) if self.rule == "walk" else (Variance,)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:

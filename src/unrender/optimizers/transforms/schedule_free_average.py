@@ -12,9 +12,9 @@ from unrender.core.trees import Tree
 from unrender.optimizers.transforms.base import SMOOTHING_UNCHANGED, VALUES, StepTransform, StepUpdate, TransformState
 
 _WARMUP = 2
-"""Steps over which the rate rises."""
+"""Number of steps over which the learning rate increases."""
 _PROJECTED = 1e-5
-"""Difference, relative to parameter and first rate, from which a parameter counts as projected onto its bounds; below it, as rounded."""
+"""Difference, relative to the parameter and the first learning rate, above which a parameter counts as projected onto its bounds."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Iterates(TransformState):
 @register
 @dataclass(frozen=True)
 class ScheduleFreeAverage(StepTransform):
-    """Step by step on z, average z in x, and place the parameters y between the two. The last transform of a chain.
+    """Take steps on z, average z in x, and place the parameters y between the two. Must be the last transform of a chain.
 
         z ← z − η_t direction,   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
 
-    x is the mean of z with weights that grow as t^r. The rate is halved at the first step. Iterates z and x are projected onto the bounds
-    together with the parameters. Where the smoothing becomes stronger, z starts again at x.
+    x is the mean of z with weights that grow as t^r. The learning rate is halved at the first step. Iterates z and x are projected onto
+    the bounds together with the parameters. If the smoothing becomes stronger, z restarts at x.
 
     Args:
         beta: β, in [0, 1).
@@ -77,7 +77,7 @@ class ScheduleFreeAverage(StepTransform):
         return fast + self.beta * (average - fast)
 
     def _within_bounds(self, fast: Array, average: Array, y: Array, least: float) -> tuple[Array, Array]:
-        """Return z and x on the same side of a bound as the parameters y, where the bound has moved y by more than `least`."""
+        """Return z and x clamped to y where a bound has moved y by more than `least`."""
         planned = self._between(fast, average)
         tolerance = arrays.absolute(planned) * _PROJECTED + least
         above, below = planned - y > tolerance, y - planned > tolerance

@@ -1,4 +1,4 @@
-"""Directions shortened where gradients are noise, as by Wiener's filter."""
+"""Directions shortened by the fraction of signal in the gradient, as in Wiener's filter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MEMORY = 0.8
 """Decay of the sums over steps."""
 
 _LEAST_SIGNAL = 0.02
-"""The least factor of a step: gradients that were noise may come to tell something."""
+"""Smallest factor of a step, because gradients of pure noise may contain signal later."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class GradientProducts(TransformState):
     """State of `WienerShrinkage`.
 
     Attributes:
-        product: Exponentially weighted sum of g_t g_{t-1} of every element.
-        square: The same of (g_t² + g_{t-1}²) / 2.
+        product: Exponentially weighted sum of g_t g_{t-1} per element.
+        square: Exponentially weighted sum of (g_t² + g_{t-1}²) / 2 per element.
     """
 
     product: Tree = field(metadata=MEAN_SQUARES)
@@ -40,13 +40,13 @@ class GradientProducts(TransformState):
 @register
 @dataclass(frozen=True)
 class WienerShrinkage(StepTransform):
-    """Multiply each element's direction by the share of its gradient that is signal, in [0.02, 1].
+    """Multiply each element's direction by the fraction of signal in its gradient, in [0.02, 1].
 
         max(s, 0.02),   s = S² ⟨g_t g_{t-1}⟩ / S² ⟨(g_t² + g_{t-1}²) / 2⟩
 
-    The means ⟨·⟩ are over the last steps and the channels of a cell; S² averages over its neighbours. Two gradients share the signal, not
-    the noise. A `FittedSobolev` before it provides S and the last gradient. Where fresh samples do not confirm the product, it counts by
-    the share confirmed. The direction keeps its unit, and is biased toward zero.
+    The means ⟨·⟩ are over recent steps and the channels of a cell; S² averages over neighbours. Two successive gradients share the
+    signal, not the noise. A `FittedSobolev` before it provides S and the last gradient. The product is multiplied by the fraction that
+    independent samples confirm. The direction keeps its unit, and is biased toward zero.
 
     Args:
         keys: Parameters whose direction is shortened; a `FittedSobolev` must precondition them.
@@ -58,7 +58,7 @@ class WienerShrinkage(StepTransform):
         object.__setattr__(self, "keys", checked_keys("WienerShrinkage: keys", self.keys))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> GradientProducts:
-        """See `StepTransform.init`. Raises `InputError` for a key that is no parameter."""
+        """Return the state before the first step. Raises `InputError` for an unknown key."""
         del learning_rates
         if unknown := next((key for key in self.keys if key not in parameters), None):
             raise InputError(f'WienerShrinkage: keys: unknown parameter "{unknown}"')
@@ -66,7 +66,7 @@ class WienerShrinkage(StepTransform):
         return GradientProducts(zeros, dict(zeros))
 
     def update(self, update: StepUpdate, state: GradientProducts) -> tuple[StepUpdate, GradientProducts]:
-        """See `StepTransform.update`. Waits for the device but for large textures."""
+        """Shorten the direction. Waits for the device except for large textures."""
         direction, products, squares = dict(update.direction), dict(state.product), dict(state.square)
         previous = update.require_previous("WienerShrinkage")
         for key in self.keys:
@@ -90,17 +90,16 @@ class WienerShrinkage(StepTransform):
 def signal_share(
     smooth: Preconditioner, product: Array, square: Array, unknown: float, confirmed: float, vertices: int
 ) -> Array:
-    """The share of signal per element, in [0.02, 1], of the shape and kind of `product`, as in Wiener's filter.
+    """Return the fraction of signal per element, in [0.02, 1], with the shape and type of `product` (Wiener's filter).
 
-    max(s, 0.02), s = S² ⟨g_t g_{t-1}⟩ / S² ⟨(g_t² + g_{t-1}²) / 2⟩, with means over the channels of a cell: two gradients share the signal,
-    not the noise.
+    It is max(s, 0.02), s = S² ⟨g_t g_{t-1}⟩ / S² ⟨(g_t² + g_{t-1}²) / 2⟩, with means over the channels of a cell.
 
     Args:
         smooth: S, which averages over neighbours.
-        product, square: the sums over steps that the means ⟨·⟩ are of.
-        unknown: the part of the answer that is 1, since little is known yet, in [0, 1].
-        confirmed: the share of the products that is no noise remembered.
-        vertices: of the mesh whose values these are, (n V,); 0 of textures and grids.
+        product, square: sums over steps of the two products.
+        unknown: weight of the prior value 1, in [0, 1], for the first steps.
+        confirmed: fraction of the products that is not reused noise.
+        vertices: number of vertices of the mesh that carries the values, (n V,); 0 for textures and grids.
     """
     shape = arrays.shape(product)
     if not vertices and isinstance(smooth, Sobolev) and smooth.is_on_device(shape):
@@ -112,35 +111,35 @@ def signal_share(
     for _ in range(2):
         flat = np.asarray(smooth.apply(flat))
     means = flat.reshape(means.shape)
-    whole, squares = means[..., :1] * confirmed, means[..., 1:]
-    share = np.where(squares > 0, whole / np.where(squares > 0, squares, 1.0), 1.0)
+    signal, squares = means[..., :1] * confirmed, means[..., 1:]
+    share = np.where(squares > 0, signal / np.where(squares > 0, squares, 1.0), 1.0)
     share = np.clip((1.0 - unknown) * np.clip(share, 0.0, 1.0) + unknown, _LEAST_SIGNAL, 1.0)
-    found = np.broadcast_to(share, parts[0].shape).astype(np.float32).reshape(shape)
-    return arrays.like(found, product)
+    shares = np.broadcast_to(share, parts[0].shape).astype(np.float32).reshape(shape)
+    return arrays.like(shares, product)
 
 
 def _on_device(smooth: Sobolev, product: Array, square: Array, unknown: float, confirmed: float) -> Array:
-    """The same of textures and grids so large that they stay where they are; lazy on Dr.Jit."""
+    """Return the same for textures and grids that are large enough to stay on the device; lazy for Dr.Jit."""
     *cells, channels = arrays.shape(product)
     kind = arrays.flat(product)
     element = arrays.arange(kind, math.prod(cells) * channels)
     cell = element // channels
-    whole, squares = (
+    signal, squares = (
         arrays.gather(arrays.flat(smooth.apply_twice(_summed(x, (*cells, 1)))), cell) for x in (product, square)
     )
-    whole = whole * arrays.scalar(confirmed, kind)
+    signal = signal * arrays.scalar(confirmed, kind)
     known = squares > 0
-    share = arrays.where(known, whole / arrays.where(known, squares, 1.0), 1.0)
+    share = arrays.where(known, signal / arrays.where(known, squares, 1.0), 1.0)
     part = arrays.scalar(unknown, kind)
     share = arrays.clip((1.0 - part) * arrays.clip(share, 0.0, 1.0) + part, _LEAST_SIGNAL, 1.0)
     return arrays.shaped(share, (*cells, channels), product)
 
 
 def _summed(x: Array, shape: tuple[int, ...]) -> Array:
-    """The sum over channels, of the shape (*cells, 1)."""
+    """Return the sum over channels, of shape (*cells, 1)."""
     channels, flat = arrays.shape(x)[-1], arrays.flat(x)
     first = arrays.arange(flat, math.prod(shape)) * channels
-    found = arrays.gather(flat, first)
+    sums = arrays.gather(flat, first)
     for channel in range(1, channels):
-        found = found + arrays.gather(flat, first + channel)
-    return arrays.shaped(found, shape, x)
+        sums = sums + arrays.gather(flat, first + channel)
+    return arrays.shaped(sums, shape, x)
