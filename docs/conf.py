@@ -51,7 +51,8 @@ add_module_names = False
 
 
 def setup(app):
-    """Add what the pages need from the records."""
+    """Add links to benchmarks and to notebooks."""
+    app.connect("source-read", site_pages.offer_notebook)
     app.connect("source-read", site_pages.link_benchmarks)
 
 

@@ -48,6 +48,13 @@ def link_benchmarks(app: Any, docname: str, source: list[str]) -> None:
         source[0] += "\n" + "".join(f"\n[{name}]: /benchmarks/{name}.md" for name in sorted(named))
 
 
+def offer_notebook(app: Any, docname: str, source: list[str]) -> None:
+    """Put a link to the executed `.ipynb` below the heading of a tutorial."""
+    if "{code-cell}" in source[0]:
+        link = f"{{nb-download}}`This page as a notebook <{docname.rpartition('/')[2]}.ipynb>`"
+        source[0] = re.sub(r"^# .*$", rf"\g<0>\n\n{link}", source[0], count=1, flags=re.MULTILINE)
+
+
 def gallery_page(folder: Path) -> str:
     """Return a page with a picture of every problem, and what comes out. The pictures go to `folder`."""
     record = records.read(benchmarks()["suite"].folder) or {"problems": {}}
