@@ -158,7 +158,7 @@ def test_missing_capabilities_are_refused_and_not_made_up(names: tuple[str, ...]
         renderer.with_meshes({"map": None}, [])
     with pytest.raises(InputError, match="differential_bsdf"):
         renderer.with_differential_bsdf()
-    with pytest.raises(InputError, match="draws emitters in its own way"):
+    with pytest.raises(InputError, match="does not support custom emitter sampling"):
         session.emitters()
 
 

@@ -287,6 +287,6 @@ def test_a_value_that_a_plugin_refuses_is_an_input_error() -> None:
 def test_more_camera_rays_than_a_launch_has_are_refused() -> None:
     session = problem(box()).renderer.prepare([WALL], None, False)
     with pytest.raises(
-        ur.InputError, match=r"camera rays at once: a launch has less than 2³²; take fewer samples per pixel"
+        ur.InputError, match=r"camera rays: a launch is limited to fewer than 2³²; reduce the samples per pixel"
     ):
         session.image({}, SampleRequest(0, 1 << 24, 1))

@@ -54,12 +54,12 @@ def gradient(description: Any, key: str = KEY, request: SampleRequest | None = N
 @pytest.mark.parametrize(
     ("more", "key", "message"),
     [
-        ({"camera": {"type": "orthographic"}}, KEY, r"limited to perspective sensors, of which the scene has none"),
+        ({"camera": {"type": "orthographic"}}, KEY, r"limited to perspective sensors; the scene has none"),
         ({"camera": {"type": "orthographic"}}, "thing.rotation", r"limited to perspective sensors"),
         ({"ball": {"type": "sphere", "radius": 0.1}}, "ball.translation", r"ball is no mesh \(Sphere\)"),
         ({"camera": {"type": "orthographic"}}, "camera.translation", "move perspective sensors only"),
         ({"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}, KEY, "with media"),
-        ({"thing": {"type": "cube", "emitter": {"type": "area"}}}, KEY, "do not move emitters"),
+        ({"thing": {"type": "cube", "emitter": {"type": "area"}}}, KEY, "do not support moving emitters"),
     ],
 )
 def test_what_has_no_boundary_is_refused_in_one_line(more: dict[str, Any], key: str, message: str) -> None:

@@ -192,7 +192,7 @@ def test_moving_shapes_and_cameras_beside_instances_are_refused_and_colours_are_
     description = scene(**instances(ball(bsdf=diffuse())), ball=ball(bsdf=diffuse()))
     renderer = MitsubaRenderer(description, DEPTH, keys=["ball.translation"])
     for key in ("ball.translation", "sensor.translation"):
-        with pytest.raises(InputError, match="silhouettes of the scene's instances"):
+        with pytest.raises(InputError, match="do not support scenes with instances"):
             renderer.prepare([key], None)
     renderer.prepare(["sensor.rotation"], None)
     renderer.prepare(["group.part_0.bsdf.reflectance.value"], "path")

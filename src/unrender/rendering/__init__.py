@@ -1,1 +1,1 @@
-"""Renderers: the port that methods see, Mitsuba's answer, and an analytic one."""
+"""Renderers: the protocol that methods use, its Mitsuba implementation and analytic implementations in NumPy."""

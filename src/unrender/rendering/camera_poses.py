@@ -1,4 +1,4 @@
-"""Where the cameras of a capture stood, as one parameter: small corrections of all poses, without what moves all alike."""
+"""Small corrections of all camera poses of a capture as one parameter, without the common similarity transform."""
 
 from __future__ import annotations
 
@@ -31,21 +31,26 @@ from unrender.rendering.wrapper import SessionWrapper
 POSES = "poses"
 """The parameter's key. No scene has it: Mitsuba's keys have a dot."""
 _FEWEST = 3
-"""Cameras: two that may move as one have less than one pose left between them."""
+"""Minimum number of cameras. Two cameras have fewer than 6 degrees of freedom beyond their common similarity transform."""
 
 
 class Corrections:
-    """What the rows of the parameter mean.
+    """Map between the parameter `poses` (V, 6) and the pose parameters of V cameras.
 
-    Row v is (ω, t): the camera turns by the rotation vector ω about its own place, in degrees along the axes of the world, and shifts by t,
-    in units of an arc of one degree at the cameras' distance R (root mean square) from their middle m: the same number does about the
-    same to a picture, whichever of the six it is.
+    Row v is (ω, t). The rotation vector ω turns the camera about its own position, in degrees along the world axes. The
+    vector t translates it. The unit of t is the length of an arc of one degree at the distance R. R is the root mean
+    square distance of the cameras from their centroid m. A unit of any of the six numbers therefore changes a picture
+    by a similar amount.
 
-    A motion and a scaling of all cameras together, ω the same for all and t = ω × (c_v - m) + τ + s (c_v - m), can be taken up by the
-    asset and its light. So the part of the rows that is such a one, to first order, is projected out: P = 1 - G (Gᵀ G)⁻¹ Gᵀ.
+    A similarity transform of all cameras, to first order ω the same for all and t = ω × (c_v - m) + τ + s (c_v - m), is
+    equivalent to a transform of the asset and its lights. This part of the rows is projected out: P = 1 - G (Gᵀ G)⁻¹
+    Gᵀ.
 
     Args:
-        cameras: at least 3.
+        cameras: {sensor: its camera}, at least 3.
+
+    Raises:
+        InputError: fewer than 3 cameras.
     """
 
     def __init__(self, cameras: Mapping[int, Camera]):
@@ -71,25 +76,29 @@ class Corrections:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of the parameter."""
+        """Shape of the parameter, (V, 6)."""
         return len(self.cameras), 6
 
     def projected(self, rows: np.ndarray) -> np.ndarray:
-        """Rows (..., V, 6) without what moves all cameras alike."""
+        """Return rows (..., V, 6) without the common similarity transform of all cameras."""
         flat = rows.reshape(*rows.shape[:-2], -1).astype(np.float64)
         return (flat - (flat @ self._common) @ self._common.T).reshape(rows.shape)
 
     def poses(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """{key: (..., 3)} of the cameras' own parameters, of rows (..., V, 6)."""
+        """Return {key: (..., 3)} of the cameras' pose parameters for rows (..., V, 6): rotations in radians,
+        translations in world units.
+        """
         moved = self.projected(rows)
-        found = {}
+        poses = {}
         for row, camera in enumerate(self.cameras.values()):
-            found[camera.rotation] = np.radians(moved[..., row, :3]).astype(np.float32)
-            found[camera.translation] = (self.unit * moved[..., row, 3:]).astype(np.float32)
-        return found
+            poses[camera.rotation] = np.radians(moved[..., row, :3]).astype(np.float32)
+            poses[camera.translation] = (self.unit * moved[..., row, 3:]).astype(np.float32)
+        return poses
 
     def gradient(self, poses: Mapping[str, np.ndarray]) -> np.ndarray:
-        """By the rows, (V, 6), of that by the cameras' own parameters; those that are missing have none."""
+        """Return the gradient by the rows, (V, 6), from the gradient by the cameras' pose parameters. A camera without
+        entries contributes 0.
+        """
         rows = np.zeros(self.shape)
         for row, camera in enumerate(self.cameras.values()):
             if camera.rotation in poses:
@@ -99,21 +108,21 @@ class Corrections:
 
 
 class PosedCameras(WithParameter):
-    """A renderer whose cameras have one parameter together, `poses` (V, 6): see `Corrections`.
+    """A renderer with the parameter `poses` (V, 6) for all cameras together, see `Corrections`.
 
-    Images and batches are as unbiased as the inner renderer's, and gradients, too. `tangent_moment` leaves the poses out. Two states share
-    random numbers, not paths.
+    Images, batches and gradients are as unbiased as the inner renderer's. `tangent_moment` omits the derivatives by the
+    poses. Two states share random numbers, not paths.
 
     Args:
-        inner: what renders the scene; it knows its cameras.
-        sensors: those that have a row, in this order.
+        inner: renderer of the scene; it implements `WithCameras`.
+        sensors: indices of the sensors that have a row, in the order of the rows.
 
     Attributes:
-        corrections: what the rows mean.
+        corrections: map between rows and pose parameters.
         notices: of the inner renderer.
 
     Raises:
-        InputError: fewer than 3 sensors, one that cannot be moved, or a renderer that does not know where they stand.
+        InputError: fewer than 3 sensors, a sensor that cannot be moved, or a renderer that does not implement `WithCameras`.
     """
 
     key = POSES
@@ -129,7 +138,6 @@ class PosedCameras(WithParameter):
         self.corrections = Corrections({sensor: known[sensor] for sensor in self.rows})
 
     def info(self) -> ParameterInfo:
-        """See `WithParameter.info`: (V, 6)."""
         first = next(iter(self.corrections.cameras.values()))
         of = self.inner.parameters()[first.translation]
         return ParameterInfo(
@@ -150,14 +158,14 @@ class PosedCameras(WithParameter):
 
 @dataclass(frozen=True)
 class PosedPaths:
-    """What `adjoint` needs to walk the paths of a rendering again: the inner renderer's, and of which sensors they are."""
+    """Paths of a rendering: those of the inner renderer, and the indices of the rendered sensors."""
 
     inner: object
     sensors: tuple[int, ...]
 
 
 class PosedCamerasSession(SessionWrapper):
-    """Images and derivatives with respect to the cameras' poses and to the parameters of a session. See `RenderSession`."""
+    """A session that renders and differentiates with respect to the cameras' poses and the inner session's parameters."""
 
     def __init__(self, renderer: PosedCameras, inner: RenderSession):
         super().__init__(inner)
@@ -169,36 +177,38 @@ class PosedCamerasSession(SessionWrapper):
         poses = self._renderer.corrections.poses(np.asarray(parameters[POSES]))
         return self._inner.image_batch({**rest, **poses}, request)
 
-    def _shown(self, found: Rendering, request: SampleRequest) -> Rendering:
-        return replace(found, paths=PosedPaths(found.paths, _sensors(request)))
+    def _shown(self, rendering: Rendering, request: SampleRequest) -> Rendering:
+        return replace(rendering, paths=PosedPaths(rendering.paths, _sensors(request)))
 
     def _paths(self, paths: PosedPaths) -> Any:
         return paths.inner
 
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
-        """Return those of the scene's parameters; the poses are left out."""
+        """Return the tangents of the scene's parameters, and zeros for the pose parameters."""
         poses = self._state({POSES: parameters[POSES]})
         still = {key: arrays.zeros_like(value) for key, value in poses.items()}
         return {**{key: value for key, value in tangents.items() if key != POSES}, **still}
 
     def _state(self, parameters: Tree) -> Tree:
-        """With the cameras' own parameters: the same arrays for the same poses, which the scene then need not set again."""
-        given = parameters[POSES]
-        known = next((tree for poses, tree in self._trees if poses is given), None)
+        """Return the parameters of the inner session. Equal poses give identical arrays, so the scene need not set them
+        again.
+        """
+        rows = parameters[POSES]
+        known = next((tree for poses, tree in self._trees if poses is rows), None)
         if known is None:
             renderer = self._renderer
-            found = renderer.corrections.poses(arrays.numpy(given))
-            known = {key: renderer.array(value) for key, value in found.items()}
-            self._trees = [*self._trees[-1:], (given, known)]
+            values = renderer.corrections.poses(arrays.numpy(rows))
+            known = {key: renderer.array(value) for key, value in values.items()}
+            self._trees = [*self._trees[-1:], (rows, known)]
         return {**{key: value for key, value in parameters.items() if key != POSES}, **known}
 
-    def _gradient(self, parameters: Tree, found: Tree, paths: PosedPaths) -> Tree:
+    def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: PosedPaths) -> Tree:
         renderer = self._renderer
         cameras = list(renderer.corrections.cameras.values())
         seen = [cameras[renderer.rows[sensor]] for sensor in paths.sensors if sensor in renderer.rows]
         keys = [key for camera in seen for key in (camera.rotation, camera.translation)]
-        rows = renderer.corrections.gradient({key: arrays.numpy(found[key]) for key in keys})
-        return {key: renderer.array(rows) if key == POSES else found[key] for key in parameters}
+        rows = renderer.corrections.gradient({key: arrays.numpy(inner_gradient[key]) for key in keys})
+        return {key: renderer.array(rows) if key == POSES else inner_gradient[key] for key in parameters}
 
 
 def _sensors(request: SampleRequest) -> tuple[int, ...]:

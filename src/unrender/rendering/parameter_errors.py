@@ -1,4 +1,4 @@
-"""The error of a parameter, in terms of what its values stand for: numbers, normals or directions."""
+"""Errors of parameter values by their role: numbers, normals or directions."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy as np
 from unrender.core import periodic
 
 Role = Literal["value", "normal", "direction"]
-"""What the values of a parameter stand for: numbers; a normal map, n = 2 x - 1; vectors of which the direction counts."""
+"""Meaning of a parameter's values: numbers, a normal map (n = 2 x - 1), or vectors of which only the direction matters."""
 
 _MOST_COLUMNS = 8
-"""Repeated columns that a record may name."""
+"""Maximum number of repeated columns that a record may state."""
 _SHORTEST = 1e-12
-"""Length below which a vector has no direction; its angle counts as 90°."""
+"""Minimum length of a vector that has a direction. A shorter vector has an angle of 90°."""
 
 
 @dataclass(frozen=True)
 class ErrorMeasure:
-    """How far values are from the truth.
+    """Error measure between values and the ground truth.
 
-    Numbers have the root mean square difference. Normals and directions have the mean angle in degrees after normalisation, since images
-    tell nothing of their lengths.
+    The error of numbers is the root mean square difference. The error of normals and directions is the mean angle in
+    degrees after normalisation, since images do not depend on their lengths.
 
     Attributes:
-        role: what the values stand for; arrays of normals and directions have the vectors' components last, or are flat.
-        repeated: number of columns at each end that repeat others and do not count, see `core.periodic`.
+        role: meaning of the values. Arrays of normals and directions have the vectors' components on the last axis, or are flat.
+        repeated: number of columns at each end that repeat others and are ignored, see `core.periodic`.
     """
 
     role: Role = "value"
@@ -36,25 +36,27 @@ class ErrorMeasure:
 
     @property
     def name(self) -> str:
-        """What the error is, in a few words."""
+        """Short name of the error."""
         return "RMSE" if self.role == "value" else "mean angle"
 
     @property
     def unit(self) -> str:
-        """The unit of the error, "" for that of the values."""
+        """Unit of the error; "" if it is the unit of the values."""
         return "" if self.role == "value" else "°"
 
     def text(self, error: float) -> str:
-        """Return an error with its unit, to four digits."""
+        """Return an error with its unit, with four significant digits."""
         return f"{error:.4g}{self.unit}"
 
     def error(self, values: np.ndarray, truth: np.ndarray, where: np.ndarray | None = None) -> float | None:
-        """Return the error over all elements, or over those cells where `where` holds; None where shapes differ or nothing is left.
+        """Return the error over all elements, or over the cells that `where` selects.
+
+        Return None if the shapes differ or no element remains.
 
         Args:
-            values: of the parameter.
-            truth: of the same shape.
-            where: (...) without the last axis, truth values; None for everywhere.
+            values: values of the parameter.
+            truth: ground truth, of the same shape.
+            where: (...) booleans over the leading axes of `values`; None for all cells.
         """
         if values.shape != truth.shape or values.size == 0:
             return None
@@ -70,7 +72,7 @@ class ErrorMeasure:
         return mean if self.role != "value" else float(np.sqrt(mean))
 
     def name_with_median(self, values: np.ndarray, truth: np.ndarray) -> str:
-        """Return `name`, of angles with their median, which few wrong vectors do not move."""
+        """Return `name`; for angles, add their median, which is robust to outliers."""
         if self.role == "value" or values.shape != truth.shape or values.size == 0:
             return self.name
         return f"{self.name}; median {self.text(float(np.median(self._angles(values, truth))))}"
@@ -79,11 +81,11 @@ class ErrorMeasure:
         return np.square(self._unknown(values - truth), dtype=np.float64)
 
     def _angles(self, values: np.ndarray, truth: np.ndarray) -> np.ndarray:
-        """The angle between the vectors of each cell, in degrees."""
-        found, wanted = (self._vectors(self._unknown(x)) for x in (values, truth))
-        lengths = np.linalg.norm(found, axis=-1) * np.linalg.norm(wanted, axis=-1)
-        across = np.linalg.norm(np.cross(found, wanted), axis=-1)
-        angles = np.degrees(np.arctan2(across, np.sum(found * wanted, axis=-1)))
+        """Return the angle between the vectors of each cell, in degrees."""
+        vectors, reference = (self._vectors(self._unknown(x)) for x in (values, truth))
+        lengths = np.linalg.norm(vectors, axis=-1) * np.linalg.norm(reference, axis=-1)
+        cross = np.linalg.norm(np.cross(vectors, reference), axis=-1)
+        angles = np.degrees(np.arctan2(cross, np.sum(vectors * reference, axis=-1)))
         return np.where(lengths > _SHORTEST, angles, 90.0)
 
     def _vectors(self, x: np.ndarray) -> np.ndarray:
@@ -95,26 +97,26 @@ class ErrorMeasure:
         return periodic.interior(x, self.repeated)
 
     def record(self) -> dict[str, Any]:
-        """Return the measure in JSON's types, see `from_record`."""
+        """Return the measure as JSON types, the inverse of `from_record`."""
         return asdict(self)
 
 
 PLAIN = ErrorMeasure()
-"""The root mean square difference of all elements."""
+"""Root mean square difference of all elements."""
 
 
-def from_record(given: Any) -> ErrorMeasure:
-    """Return the measure that `ErrorMeasure.record` describes; the plain one for what is malformed or missing."""
-    if not isinstance(given, Mapping):
+def from_record(record: Any) -> ErrorMeasure:
+    """Return the measure that `ErrorMeasure.record` describes, or `PLAIN` if the record is malformed or missing."""
+    if not isinstance(record, Mapping):
         return PLAIN
-    role, repeated = given.get("role", "value"), given.get("repeated", 0)
+    role, repeated = record.get("role", "value"), record.get("repeated", 0)
     if role not in get_args(Role) or type(repeated) is not int or not 0 <= repeated <= _MOST_COLUMNS:
         return PLAIN
     return ErrorMeasure(role, repeated)
 
 
 def title(measures: Iterable[ErrorMeasure]) -> str:
-    """Return what the axis of a chart of parameter errors is."""
+    """Return the axis title of a chart of parameter errors."""
     roles = {measure.name for measure in measures}
     if roles <= {PLAIN.name}:
         return "Parameter error (RMSE)"

@@ -1,4 +1,6 @@
-"""Two views of a renderer: one that differentiates some of its parameters alone, and one that holds some of them at given values."""
+"""Renderers that restrict another: one differentiates a subset of the parameters, the other fixes some parameters at
+constant values.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,13 @@ from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
 
 class PartialDerivatives(RendererWrapper):
-    """A renderer that changes all parameters and differentiates all but some: the derivatives by these are returned as 0.
+    """A renderer that sets the derivatives of some parameters to 0.
 
-    They need not be differentiable: of all others the gradient is exact, to the renderer, at whatever values these have.
+    These parameters change and need not be differentiable. The gradient by all others is that of the inner renderer at
+    their current values.
 
     Args:
-        inner: what renders the scene.
+        inner: renderer of the scene.
         constant: keys of the parameters whose derivatives are 0.
     """
 
@@ -36,7 +39,7 @@ class PartialDerivatives(RendererWrapper):
 
 
 class _PartialSession(SessionWrapper):
-    """See `PartialDerivatives`."""
+    """A session that sets the tangents and gradients of constant parameters to 0."""
 
     def __init__(self, inner: RenderSession, constant: frozenset[str]):
         super().__init__(inner)
@@ -45,16 +48,18 @@ class _PartialSession(SessionWrapper):
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
         return {k: arrays.zeros_like(x) if k in self._constant else x for k, x in tangents.items()}
 
-    def _gradient(self, parameters: Tree, found: Tree, paths: Any) -> Tree:
-        return {key: arrays.zeros_like(x) if key in self._constant else found[key] for key, x in parameters.items()}
+    def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
+        return {
+            key: arrays.zeros_like(x) if key in self._constant else inner_gradient[key] for key, x in parameters.items()
+        }
 
 
 class HeldParameters(RendererWrapper):
-    """A renderer of the scene with some parameters at given values: what renders others at many values, and differentiates nothing.
+    """A renderer of the scene with some parameters fixed at constant values.
 
     Args:
-        inner: what renders the scene.
-        held: {key: array} of the parameters that do not change.
+        inner: renderer of the scene.
+        held: {key: array} of the fixed parameters. Sessions return no derivatives by them.
     """
 
     def __init__(self, inner: Renderer, held: Tree):
@@ -70,7 +75,7 @@ class HeldParameters(RendererWrapper):
 
 
 class _HeldSession(SessionWrapper):
-    """See `HeldParameters`."""
+    """A session that adds the fixed parameters to each state and removes them from each gradient."""
 
     def __init__(self, inner: RenderSession, held: Tree):
         super().__init__(inner)
@@ -82,8 +87,8 @@ class _HeldSession(SessionWrapper):
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
         return {**trees.zeros_like(self._held), **tangents}
 
-    def _gradient(self, parameters: Tree, found: Tree, paths: Any) -> Tree:
-        return {key: found[key] for key in parameters}
+    def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
+        return {key: inner_gradient[key] for key in parameters}
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         count = len(next(iter(parameters.values())))

@@ -1,4 +1,4 @@
-"""What photographs have beside a scene: response, exposure, vignetting and corrections of their cameras' poses, around a renderer."""
+"""Parameters of photographs around the renderer of a scene: response, exposure, vignetting and camera poses."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ __all__ = [
 ]
 
 OF_PHOTOGRAPHS = (POSES, VIGNETTING, EXPOSURE, RESPONSE)
-"""Keys of parameters that no scene has, from the inside out."""
+"""Keys of the photographs' parameters, from the innermost renderer to the outermost. No scene has these keys."""
 
 
 def check_response(names: Collection[str]) -> None:
-    """Raise `InputError` where exposures are unknown beside a response."""
+    """Raise `InputError` if both the response and the exposures are unknown."""
     if RESPONSE in names and EXPOSURE in names:
         raise InputError(
-            f"{RESPONSE}: with {EXPOSURE} unknown, too, a response is undetermined up to a power of radiance; leave out one of them"
+            f"{RESPONSE}: if {EXPOSURE} is unknown too, the response is undetermined up to a power of radiance; leave out one"
         )
 
 
 def scene_renderer(renderer: Renderer) -> Renderer:
-    """Return what renders the scene alone, without ties and parameters of photographs."""
+    """Return the renderer of the scene alone, without ties and parameters of photographs."""
     renderer = _without_photographs(renderer)
     return renderer.inner if isinstance(renderer, TiedRenderer) else renderer
 
 
 def member_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the values with the members of ties in place of these."""
+    """Return the values with each tie replaced by its members."""
     base = _without_photographs(renderer)
     return base.scene_values(values) if isinstance(base, TiedRenderer) else dict(values)
 
@@ -56,7 +56,9 @@ def _without_photographs(renderer: Renderer) -> Renderer:
 
 
 def sensors_with_rows(renderer: Renderer) -> tuple[int, ...] | None:
-    """The sensors that have exposures or corrections, in the order of their rows; None where none has."""
+    """Return the indices of the sensors that have rows of exposures or poses, in the order of the rows; None if there
+    are no such rows.
+    """
     while isinstance(renderer, WithParameter):
         if isinstance(renderer, (ExposedRenderer, PosedCameras)):
             return tuple(renderer.rows)
@@ -65,16 +67,16 @@ def sensors_with_rows(renderer: Renderer) -> tuple[int, ...] | None:
 
 
 def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequence[int]) -> Renderer:
-    """The renderer with those parameters of photographs that are among the keys.
+    """Return the renderer with the parameters of photographs that are among the keys.
 
     Args:
-        renderer: of a scene; or one that has these parameters, whose rows are kept where `sensors` are among them: they are of some of its
-            views then.
-        keys: of all parameters.
-        sensors: of the views.
+        renderer: renderer of a scene, with or without these parameters. If it has them and its rows include all `sensors`, it is returned
+            unchanged: the views are a subset of its views.
+        keys: keys of all parameters.
+        sensors: indices of the views' sensors.
 
     Raises:
-        InputError: poses are among the keys, and the sensors cannot be moved; or both response and exposure are.
+        InputError: the keys include the poses, and a sensor cannot be moved; or they include both response and exposure.
     """
     check_response(keys)
     wanted = [key for key in OF_PHOTOGRAPHS if key in keys]
@@ -83,22 +85,23 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
     rows = sensors_with_rows(renderer)
     if set(wanted) <= renderer.parameters().keys() and (rows is None or set(rows) >= set(sensors)):
         return renderer
-    found = _without_photographs(renderer)
+    wrapped = _without_photographs(renderer)
     if POSES in wanted:
-        found = PosedCameras(found, list(sensors))
+        wrapped = PosedCameras(wrapped, list(sensors))
     if VIGNETTING in wanted:
-        found = VignettedRenderer(found)
+        wrapped = VignettedRenderer(wrapped)
     if EXPOSURE in wanted:
-        found = ExposedRenderer(found, sensors)
-    return RespondingRenderer(found) if RESPONSE in wanted else found
+        wrapped = ExposedRenderer(wrapped, sensors)
+    return RespondingRenderer(wrapped) if RESPONSE in wanted else wrapped
 
 
 def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the values that a scene can hold: without response, exposures and vignetting, with the poses of its cameras and all members of
-    ties."""
-    found = {key: value for key, value in values.items() if key not in OF_PHOTOGRAPHS}
+    """Return the values that a scene can store: camera poses and the members of ties, without response, exposure and
+    vignetting.
+    """
+    scene = {key: value for key, value in values.items() if key not in OF_PHOTOGRAPHS}
     while isinstance(renderer, WithParameter):
         if isinstance(renderer, PosedCameras) and POSES in values:
-            found |= renderer.corrections.poses(np.asarray(values[POSES]))
+            scene |= renderer.corrections.poses(np.asarray(values[POSES]))
         renderer = renderer.inner
-    return renderer.scene_values(found) if isinstance(renderer, TiedRenderer) else found
+    return renderer.scene_values(scene) if isinstance(renderer, TiedRenderer) else scene

@@ -1,4 +1,4 @@
-"""One unknown that stands for several parameters of a scene: a renderer around another one."""
+"""Ties: one unknown that sets several parameters of a scene, each times a constant factor."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ __all__ = ["Tie", "TieError", "TiedRenderer", "with_ties"]
 
 
 class TieError(InputError):
-    """What is wrong with a tie.
+    """An invalid tie.
 
     Args:
         key: name of the unknown.
-        what: one line.
+        what: error message of one line.
     """
 
     def __init__(self, key: str, what: str):
@@ -44,14 +44,14 @@ class TieError(InputError):
 
 @dataclass(frozen=True)
 class Tie:
-    """One unknown and the parameters of the scene that follow it: each is a factor times its value.
+    """One unknown and the scene parameters that it sets: each is a constant factor times its value.
 
     Args:
         key: name of the unknown.
         factors: {key of a parameter of the scene: factor, not 0}.
 
     Raises:
-        InputError: no member, or a factor that is 0 or no finite number.
+        InputError: no member, or a factor that is 0 or not finite.
     """
 
     key: str
@@ -66,7 +66,7 @@ class Tie:
                 raise InputError(f"{member}: expected a factor other than 0")
 
     def info(self, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
-        """Return what a renderer says of the unknown. Raises `TieError` where the members do not go together."""
+        """Return the description of the unknown. Raise `TieError` if the members are incompatible."""
         for member in self.factors:
             if member not in known:
                 raise TieError(self.key, f"the scene has no parameter {member}{did_you_mean(member, known)}")
@@ -106,7 +106,7 @@ class Tie:
         )
 
     def _limits(self, infos: Iterable[ParameterInfo]) -> tuple[float | None, float | None]:
-        """Return the range in which every member is within its own."""
+        """Return the range of the unknown in which every member is within its own limits."""
         lows, highs = [], []
         for info, factor in zip(infos, self.factors.values(), strict=True):
             ends = [None if end is None else end / factor for end in (info.lowest, info.highest)]
@@ -118,11 +118,12 @@ class Tie:
 
 
 def with_ties(renderer: Renderer, ties: Iterable[Tie]) -> Renderer:
-    """Return the renderer with these unknowns in place of their members; itself where it has these already, or there are none.
+    """Return the renderer with these unknowns in place of their members.
 
-    Parameters of photographs around a renderer with other ties are left out.
+    Return the renderer itself if it has these ties already, and the renderer of the scene if `ties` is empty. If the
+    ties change, parameters of photographs around the renderer are dropped.
 
-    Raises `TieError` where the members of one do not go together, or one has a member of another.
+    Raises `TieError` if the members of a tie are incompatible, or two ties share a member.
     """
     ties, base = tuple(ties), renderer
     while isinstance(base, WithParameter):
@@ -138,33 +139,33 @@ class TiedRenderer(RendererWrapper):
     """A renderer whose unknowns are ties. Images, gradients and tangents are as unbiased as the inner renderer's.
 
     Args:
-        inner: renders the scene.
-        ties: unknowns that stand for several parameters.
+        inner: renderer of the scene.
+        ties: unknowns that set several parameters each.
     """
 
     def __init__(self, inner: Renderer, ties: tuple[Tie, ...]):
         super().__init__(inner)
         self.ties = ties
         self.max_depth = getattr(inner, "max_depth", 6)
-        known, taken = inner.parameters(), dict[str, str]()
+        known, owner = inner.parameters(), dict[str, str]()
         infos = {tie.key: tie.info(known) for tie in ties}
         for tie in ties:
             for member in tie.factors:
-                if member in taken:
-                    raise TieError(tie.key, f"{member} is tied to {taken[member]} already")
-                taken[member] = tie.key
+                if member in owner:
+                    raise TieError(tie.key, f"{member} is tied to {owner[member]} already")
+                owner[member] = tie.key
             if tie.key in known and tie.key not in tie.factors:
                 raise TieError(
                     tie.key, f"{tie.key} is a parameter of the scene itself; expected one of keys, or another name"
                 )
-        self._info = {**{key: info for key, info in known.items() if key not in taken}, **infos}
+        self._info = {**{key: info for key, info in known.items() if key not in owner}, **infos}
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`. Members of ties are none of their own."""
+        """Return every parameter by key. A tie replaces its members."""
         return self._info
 
     def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`: of a tie, the value of its first member over that factor."""
+        """Return the scene's own values. The value of a tie is that of its first member over the member's factor."""
         first = {tie.key: next(iter(tie.factors.items())) for tie in self.ties}
         inner = self.inner.values([first[key][0] if key in first else key for key in keys])
         return {key: inner[first[key][0]] * (1 / first[key][1]) if key in first else inner[key] for key in keys}
@@ -172,7 +173,6 @@ class TiedRenderer(RendererWrapper):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        """See `Renderer.prepare`."""
         wanted = differentiated(keys, derivatives)
         inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(wanted)))
         return TiedSession(self, inner)
@@ -184,22 +184,22 @@ class TiedRenderer(RendererWrapper):
         return TiedRenderer(inner, self.ties)
 
     def expanded(self, keys: Iterable[str]) -> list[str]:
-        """Return the parameters of the inner renderer that these keys stand for."""
+        """Return the keys of the inner renderer's parameters that these keys set."""
         factors = {tie.key: list(tie.factors) for tie in self.ties}
         return [member for key in keys for member in factors.get(key, [key])]
 
     def scene_values(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return {key of the inner renderer: value} for values of these keys."""
-        found = {}
+        scaled = {}
         for key, value in values.items():
             tie = next((tie for tie in self.ties if tie.key == key), None)
             factors = {key: 1.0} if tie is None else tie.factors
-            found |= {member: _scaled(value, factor) for member, factor in factors.items()}
-        return found
+            scaled |= {member: _scaled(value, factor) for member, factor in factors.items()}
+        return scaled
 
 
 class TiedSession(SessionWrapper):
-    """Images and derivatives with respect to ties. See `RenderSession`."""
+    """A session that renders and differentiates with respect to ties."""
 
     def __init__(self, renderer: TiedRenderer, inner: RenderSession):
         super().__init__(inner)
@@ -214,32 +214,36 @@ class TiedSession(SessionWrapper):
         return self._renderer.scene_values(tangents)
 
     def _state(self, parameters: Tree) -> Tree:
-        """Return the values of the scene's parameters: the same arrays for the same value, which the scene need not set again."""
-        found: Tree = {}
+        """Return the values of the scene's parameters. An identical value gives identical arrays, so the scene need not
+        set them again.
+        """
+        state: Tree = {}
         for key, value in parameters.items():
             if key not in self._ties:
-                found[key] = value
+                state[key] = value
                 continue
-            members = next((tree for given, tree in self._known if given is value), None)
+            members = next((tree for known, tree in self._known if known is value), None)
             if members is None:
                 members = {member: _scaled(value, factor) for member, factor in self._ties[key].items()}
                 self._known = [*self._known[1 - 2 * len(self._ties) :], (value, members)]
-            found |= members
-        return found
+            state |= members
+        return state
 
-    def _gradient(self, parameters: Tree, found: Tree, paths: Any) -> Tree:
-        """Return the gradient by the unknowns: of a tie, the members' by their factors, summed."""
-        gathered: Tree = {}
+    def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
+        """Return the gradient by the unknowns. The gradient by a tie is the sum of its members' gradients times their
+        factors.
+        """
+        gradient: Tree = {}
         for key in parameters:
             factors = self._ties.get(key, {key: 1.0})
-            parts = [found[member] * factor for member, factor in factors.items() if member in found]
+            parts = [inner_gradient[member] * factor for member, factor in factors.items() if member in inner_gradient]
             if parts:
-                gathered[key] = sum(parts[1:], parts[0])
-        return gathered
+                gradient[key] = sum(parts[1:], parts[0])
+        return gradient
 
 
 def _scaled(value: Any, factor: float) -> Any:
-    """Return a value times a factor; a value that all states of a batch share stays one."""
+    """Return a value times a factor. A value that is broadcast over a batch remains broadcast."""
     if factor == 1:
         return value
     if isinstance(value, np.ndarray) and value.ndim and len(value) > 1 and value.strides[0] == 0:

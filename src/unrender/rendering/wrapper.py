@@ -1,4 +1,4 @@
-"""Renderers and sessions that wrap another: all that they do not change goes to the one inside, optional capabilities included."""
+"""Base classes of renderers and sessions that wrap another and forward everything that they do not override."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from unrender.rendering.renderer import (
 
 
 class RendererWrapper:
-    """A renderer that answers as the one inside it does. Subclasses override what they change.
+    """A renderer that forwards every call to its inner renderer. Subclasses override what they change.
 
     Args:
-        inner: what renders the scene.
+        inner: renderer of the scene.
     """
 
     inner: Renderer
@@ -46,7 +46,7 @@ class RendererWrapper:
 
     @property
     def notices(self) -> tuple[str, ...]:
-        """What the inner renderer does otherwise than its scene asks for, one line each."""
+        """Deviations of the inner renderer from what its scene asks for, one line each."""
         return tuple(getattr(self.inner, "notices", ()))
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
@@ -67,67 +67,70 @@ class RendererWrapper:
         return self.inner.prepare(keys, space, derivatives)
 
     def formats(self) -> Sequence[PictureFormat]:
-        """Return the format of each sensor's film: RGB of any sign where the inner renderer has no films."""
+        """Return the format of each sensor's film; `format_of`'s default if the inner renderer has no films."""
         return [format_of(self.inner, sensor) for sensor in range(len(self.resolutions()))]
 
     def cameras(self) -> Mapping[int, Camera]:
-        """Return the cameras that can be moved: none where the inner renderer does not know any."""
+        """Return {sensor: camera} of the cameras that can be moved; empty if the inner renderer has none."""
         return self.inner.cameras() if isinstance(self.inner, WithCameras) else {}
 
     def with_differential_bsdf(self) -> Renderer:
-        """Return the wrapped `with_differential_bsdf` of the inner renderer. Raises `InputError` where it has none."""
+        """Return the wrapped `with_differential_bsdf` of the inner renderer. Raise `InputError` if it does not support
+        this.
+        """
         return self._around(with_differential_bsdf(self.inner))
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
-        """Return the wrapped `with_meshes` of the inner renderer. Raises `InputError` where it has none."""
+        """Return the wrapped `with_meshes` of the inner renderer. Raise `InputError` if it does not support this."""
         if not isinstance(self.inner, Remeshable):
-            raise InputError(f"{', '.join(meshes)}: this renderer's meshes keep their triangles")
+            raise InputError(f"{', '.join(meshes)}: this renderer cannot replace meshes; keep their triangles fixed")
         known = self.inner.parameters()
         return self._around(self.inner.with_meshes(meshes, [key for key in keys if key in known]))
 
     def _around(self, inner: Renderer) -> Renderer:
-        made = copy.copy(self)
-        made.inner = inner
-        return made
+        wrapped = copy.copy(self)
+        wrapped.inner = inner
+        return wrapped
 
 
 class SessionWrapper:
-    """A session that answers as the one inside it does, at parameters that it maps.
+    """A session that maps parameters, images and gradients to and from an inner session.
 
-    Subclasses override the maps `_state`, `_tangents`, `_gradient`, `_shown` and `_weights`, or whole methods.
+    Subclasses override the maps `_state`, `_tangents`, `_gradient`, `_shown`, `_paths` and `_weights`, or public
+    methods.
 
     Args:
-        inner: renders the scene.
+        inner: session that renders the scene.
     """
 
     def __init__(self, inner: RenderSession):
         self._inner = inner
 
     def _state(self, parameters: Tree) -> Tree:
-        """Return the parameters of the inner session."""
+        """Return the inner session's parameters for outer ones."""
         return parameters
 
     def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
-        """Return the tangents of the inner session's parameters."""
+        """Return the inner session's tangents for outer ones."""
         del parameters
         return self._state(tangents)
 
-    def _gradient(self, parameters: Tree, found: Tree, paths: Any) -> Tree:
-        """Return the gradient by the outer parameters from that by the inner ones."""
+    def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
+        """Return the gradient by the outer parameters for that by the inner ones."""
         del parameters, paths
-        return found
+        return inner_gradient
 
-    def _shown(self, found: Rendering, request: SampleRequest) -> Rendering:
-        """Return the outer rendering of an inner one."""
+    def _shown(self, rendering: Rendering, request: SampleRequest) -> Rendering:
+        """Return the outer rendering for an inner one."""
         del request
-        return found
+        return rendering
 
     def _paths(self, paths: Any) -> Any:
-        """Return the inner session's paths of an outer rendering."""
+        """Return the inner session's paths for those of an outer rendering."""
         return paths
 
     def _weights(self, weights: Array) -> Array:
-        """Return derivatives by the inner session's images from derivatives by the outer ones."""
+        """Return the derivatives by the inner session's images for those by the outer ones."""
         return weights
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
@@ -137,36 +140,36 @@ class SessionWrapper:
         return self._inner.image_batch(self._state(parameters), request)
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        found = self._inner.image_pair(self._state(current), self._state(previous), request, space)
-        return self._shown(found, request)
+        rendering = self._inner.image_pair(self._state(current), self._state(previous), request, space)
+        return self._shown(rendering, request)
 
     def adjoint(self, parameters: Tree, paths: Any, weights: Array) -> Tree:
-        found = self._inner.adjoint(self._state(parameters), self._paths(paths), self._weights(weights))
-        return self._gradient(parameters, found, paths)
+        gradient = self._inner.adjoint(self._state(parameters), self._paths(paths), self._weights(weights))
+        return self._gradient(parameters, gradient, paths)
 
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Any, weights: Array, weights_previous: Array
     ) -> tuple[Tree, Tree]:
         states, both = (self._state(current), self._state(previous)), map(self._weights, (weights, weights_previous))
-        found = self._inner.adjoint_pair(*states, self._paths(paths), *both)
-        return self._gradient(current, found[0], paths), self._gradient(previous, found[1], paths)
+        gradients = self._inner.adjoint_pair(*states, self._paths(paths), *both)
+        return self._gradient(current, gradients[0], paths), self._gradient(previous, gradients[1], paths)
 
     def tangent_moment(self, parameters: Tree, paths: Any, tangents: Tree) -> Array:
         inner_tangents = self._tangents(parameters, tangents)
         return self._inner.tangent_moment(self._state(parameters), self._paths(paths), inner_tangents)
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
-        """Return the inner session's `CountingSession.vertices`: ones where it does not count."""
+        """Return the inner session's `CountingSession.vertices`, or ones if it does not count."""
         return counted_vertices(self._inner, self._state(parameters), request)
 
     def emitters(self) -> np.ndarray:
-        """Return the inner session's `EmitterSession.emitters`. Raises `InputError` where it has none."""
+        """Return the inner session's `EmitterSession.emitters`. Raise `InputError` if it does not support this."""
         return drawing_emitters(self._inner).emitters()
 
     def emitter_moments(
         self, parameters: Tree, paths: Any, tangents: Tree, weights: Array, noise: Array
     ) -> EmitterMoments:
-        """Return the inner session's `EmitterSession.emitter_moments`. The noise is that of the inner session's channels."""
+        """Return the inner session's `EmitterSession.emitter_moments`. `noise` refers to the inner session's channels."""
         state, inner_tangents = self._state(parameters), self._tangents(parameters, tangents)
         inner = drawing_emitters(self._inner)
         return inner.emitter_moments(state, self._paths(paths), inner_tangents, self._weights(weights), noise)

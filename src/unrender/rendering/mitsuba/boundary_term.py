@@ -1,4 +1,4 @@
-"""The boundary part of path gradients, for the parameters that move meshes; and where there is none."""
+"""Boundary term of path gradients for parameters that move meshes, and reasons why a shape has none."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from unrender.rendering.renderer import SampleRequest
 __all__ = ["BoundaryTerm", "moved_shape", "obstacles"]
 
 _STREAM = 3
-"""Of the key of a request: numbers that its paths do not have."""
+"""Stream of a request's key, whose random numbers are independent of its paths."""
 
 
 def moved_shape(scene: LoadedScene, key: str) -> str:
-    """The id of the shape whose points a parameter moves, "" where it moves none."""
+    """Return the id of the shape whose points a parameter moves; "" if it moves none."""
     if key in scene.poses:
         target = scene.poses.key(key).target
         return "" if is_bare(scene.scene, target) else target
@@ -39,40 +39,38 @@ def moved_shape(scene: LoadedScene, key: str) -> str:
 
 
 def obstacles(pair: ScenePair, targets: Iterable[str]) -> dict[str, str]:
-    """{target: why there is no boundary derivative of a moving shape, "" where there is}."""
+    """Return {target: reason why a moving shape has no boundary derivative, "" if it has one}."""
     shapes = {shape.id(): shape for shape in pair.current.shapes()}
     return {target: _obstacle(pair, target, shapes.get(target)) for target in targets}
 
 
 def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     if pair.volumetric:
-        return "path gradients of moving shapes know no media"
+        return "path gradients of moving shapes do not support media"
     if any(sensor.film().sample_border() and not is_box(sensor.film()) for sensor in pair.current.sensors()):
         return "path gradients of moving shapes do not support sample_border: leave it out of the film"
     if shape is None:
-        return "path gradients do not move instances"
+        return "path gradients do not support moving instances"
     if has_instances(pair.current):
-        return "boundary derivatives do not know the silhouettes of the scene's instances"
+        return "boundary derivatives do not support scenes with instances"
     known = pair.current_parameters
     if not shape.is_mesh() or not any(f"{target}.{name}" in known for name in (POSITIONS, "to_world")):
-        return f"{target} is no mesh ({shape.class_name()}), which boundary derivatives are limited to"
+        return f"{target} is not a mesh ({shape.class_name()}); boundary derivatives are limited to meshes"
     if shape.is_emitter():
-        return "path gradients do not move emitters"
+        return "path gradients do not support moving emitters"
     kinds = [sensor.class_name() for sensor in pair.current.sensors()]
     if "PerspectiveCamera" not in kinds:
-        return (
-            f"boundary derivatives are limited to perspective sensors, of which the scene has none ({', '.join(kinds)})"
-        )
+        return f"boundary derivatives are limited to perspective sensors; the scene has none ({', '.join(kinds)})"
     return ""
 
 
 class BoundaryTerm:
-    """Boundary derivatives with respect to parameters that move meshes, to be added to those of path replay.
+    """Boundary derivatives with respect to parameters that move meshes, which are added to those of path replay.
 
     Args:
         pair: both loads of the scene.
         moving: ids of the shapes that move.
-        max_depth: longest path in segments, >= 1.
+        max_depth: maximum path length in segments, >= 1.
     """
 
     def __init__(self, pair: ScenePair, moving: Iterable[str], max_depth: int):
@@ -86,36 +84,38 @@ class BoundaryTerm:
         self._resolutions = pair.resolutions
 
     def accumulate(self, scene: LoadedScene, request: SampleRequest, weights: mi.TensorXf) -> None:
-        """Add to the gradients of the scene's leaves those of the mean over groups g of sum(weights[g] * image), by as many samples as
-        the request has, rounded up to a power of two for pixels of its own choice, of numbers of their own.
+        """Add the boundary term of the mean over groups g of sum(weights[g] * image) to the gradients of the scene's leaves.
+
+        It takes as many samples as the request, rounded up to a power of two if the request chooses pixels. Their random numbers are
+        independent of those of the rendering.
 
         Args:
             scene: its parameters are set and attached.
-            request: of the rendering; the boundary's numbers are independent of its own.
-            weights: of `RenderSession.adjoint`.
+            request: request of the rendering.
+            weights: weights of `RenderSession.adjoint`.
         """
         for view in views_of(request, weights, self._resolutions):
             sensor, seed, samples = self._samples(scene, request, view)
-            found = self._integrator.weighted_image(scene.scene, sensor, view.image, seed, samples)
-            if dr.grad_enabled(found):
-                dr.backward(found, dr.ADFlag.ClearInterior)
+            image = self._integrator.weighted_image(scene.scene, sensor, view.image, seed, samples)
+            if dr.grad_enabled(image):
+                dr.backward(image, dr.ADFlag.ClearInterior)
 
     def tangent_moment(
         self, scene: LoadedScene, request: SampleRequest, combined: tuple[float, ...] | None = None
     ) -> mi.TensorXf:
-        """The squared boundary derivative of each pixel of a request along the tangents of the scene, (N, 3).
+        """Return the squared boundary derivative of each pixel of a request along the tangents of the scene, (N, 3).
 
-        Of as many samples as `accumulate` takes: their noise is part of the second moment, as it is of the gradient.
+        It takes as many samples as `accumulate`. Their noise is part of the second moment, as it is of the gradient.
 
         Args:
             scene: its parameters are set, and have tangents.
-            request: of the rendering.
-            combined: weights of the channels in a sum that is squared in their place; None to square each.
+            request: request of the rendering.
+            combined: channel weights of a sum that is squared in place of each channel; None to square each channel.
         """
         count = math.prod(self._resolutions[request.sensor]) if request.pixels is None else dr.width(request.pixels)
-        found = dr.zeros(mi.Float, 3 * count)
-        nothing = dr.zeros(mi.TensorXf, (1, count, 3))
-        for view in views_of(request, nothing, self._resolutions):
+        moments = dr.zeros(mi.Float, 3 * count)
+        zeros = dr.zeros(mi.TensorXf, (1, count, 3))
+        for view in views_of(request, zeros, self._resolutions):
             sensor, seed, samples = self._samples(scene, request, view)
             image = self._integrator.tangent_image(scene.scene, sensor, seed, samples)
             element = dr.arange(mi.UInt32, 3 * dr.width(view.pixels))
@@ -127,18 +127,18 @@ class BoundaryTerm:
             else:
                 parts = [w * dr.gather(mi.Float, image.array, of_pixel - channel + c) for c, w in enumerate(combined)]
                 derivative = sum(parts[1:], parts[0])
-            dr.scatter(found, dr.square(derivative), into)
-        return mi.TensorXf(found, (count, 3))
+            dr.scatter(moments, dr.square(derivative), into)
+        return mi.TensorXf(moments, (count, 3))
 
     @staticmethod
     def _samples(scene: LoadedScene, request: SampleRequest, view: ViewWeights) -> tuple[mi.Sensor, int, int]:
-        """Of a view: its sensor, and the seed and number of its boundary samples."""
+        """Return a view's sensor, and the seed and number of its boundary samples."""
         sensor = scene.scene.sensors()[view.sensor]
         if sensor.class_name() != "PerspectiveCamera":
             raise InputError(
-                f"sensor {sensor.id()}: moving shapes have path gradients in perspective views only, and it is another "
-                f"({sensor.class_name()}): --method smoothed"
+                f"sensor {sensor.id()}: path gradients of moving shapes are limited to perspective sensors, got "
+                f"{sensor.class_name()}; use --method smoothed"
             )
-        # A mini-batch has another number of each view's pixels at each step; kernels are recorded anew for each.
+        # The number of a view's pixels in a mini-batch varies between steps, and each size needs its own kernel recording.
         samples = view.samples if request.pixels is None else 1 << (view.samples - 1).bit_length()
         return sensor, Key(request.seed, 0, _STREAM).fold(view.sensor).uint32(), samples

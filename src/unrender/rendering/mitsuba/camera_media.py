@@ -1,6 +1,6 @@
-"""Which medium each sensor of a scene stands in, also where the scene's description does not say it.
+"""Medium that surrounds each sensor of a scene, including sensors whose description does not name it.
 
-Mitsuba takes a sensor without a `medium` to stand in none: a camera in the middle of a cloud then sees nothing of it.
+Mitsuba assumes that a sensor without a `medium` is outside all media. A camera inside a cloud would then not see the cloud.
 """
 
 from __future__ import annotations
@@ -19,44 +19,44 @@ from unrender.rendering.mitsuba.scene_loading import media
 _log = logging.getLogger("unrender")
 
 _RAYS = 8
-"""Camera rays along each axis of the film."""
+"""Number of camera rays along each axis of the film."""
 
 _SURFACES = 64
-"""That a ray may pass before it meets the boundary of a medium."""
+"""Maximum number of surfaces that a ray passes before the boundary of a medium."""
 
 _AT_A_POINT = ("PerspectiveCamera", "ThinLensCamera", "RadianceMeter")
 
 
 def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
-    """The medium of each sensor, or None.
+    """Return the medium of each sensor, or None.
 
-    A sensor's own `medium` counts. Where it has none, its rays are followed to the first boundary of a medium: what lies on their side
-    of it, for most of them, is the sensor's. Logs a warning where that is a medium.
+    A sensor's own `medium` takes precedence. Without one, its rays are traced to their first medium boundary, and the medium that most
+    of them come from is the sensor's. A warning is logged for each sensor whose medium is determined in this manner.
 
     Args:
         scene: `mitsuba.Scene`.
-        quiet: log nothing.
+        quiet: suppress the warnings.
     """
-    found = []
+    result = []
     for sensor in scene.sensors():
         medium = sensor.get_medium()
         if medium is None and _may_be_inside(scene, sensor):
             medium = _surrounding(scene, sensor)
             if medium is not None and not quiet:
                 _log.warning(
-                    "sensor %s: it names no medium, but stands inside one; it is rendered as standing in it",
+                    "sensor %s: it names no medium, but is inside one; it is rendered inside this medium",
                     sensor.id(),
                 )
-        found.append(medium)
-    return found
+        result.append(medium)
+    return result
 
 
 def _may_be_inside(scene: Any, sensor: Any) -> bool:
-    """False only where no shape with a medium can be around the sensor, which costs no kernel to find out."""
+    """Return False only if no shape with a medium can contain the sensor. This test needs no kernel."""
     shapes = [shape for shape in all_shapes(scene) if shape.is_medium_transition()]
     if not shapes:
         return False
-    if {*shapes} - {*scene.shapes()}:  # the box of a shape group's child is not where its instances stand
+    if {*shapes} - {*scene.shapes()}:  # the bounding box of a shape group's child does not bound its instances
         return True
     if sensor.class_name() not in _AT_A_POINT or any(shape.exterior_medium() is not None for shape in shapes):
         return True
@@ -74,7 +74,7 @@ def _aperture_radius(lens: Any) -> float:
 
 
 def _surrounding(scene: Any, sensor: Any) -> Any:
-    """The medium that most of the sensor's rays which meet a boundary come from, or None."""
+    """Return the medium that most of the sensor's rays come from at their first medium boundary, or None."""
     x, y = (np.mgrid[:_RAYS, :_RAYS].reshape(2, -1) + 0.5) / _RAYS
     position: Any = mi.Point2f(mi.Float(x), mi.Float(y))
     aperture: Any = mi.Point2f(mi.Float(y), mi.Float(x))
@@ -98,7 +98,7 @@ def _surrounding(scene: Any, sensor: Any) -> Any:
 
 
 def medium_id(medium: Any) -> int:
-    """Its registry id, 0 for None."""
+    """Return the medium's registry id, 0 for None."""
     pointer: Any = mi.MediumPtr(medium)
     number: Any = dr.reinterpret_array(mi.UInt32, pointer)
     return int(number.numpy()[0])

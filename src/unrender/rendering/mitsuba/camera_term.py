@@ -1,4 +1,4 @@
-"""Derivatives of pictures by the poses and fields of view of the sensors that took them; and where there are none."""
+"""Derivatives of images by the poses and fields of view of their sensors, and reasons why a sensor has none."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from unrender.rendering.mitsuba.view_weights import views_of
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
 
 _STREAM = 4
-"""Of the key of a request: numbers that neither its paths nor boundaries have."""
+"""Stream of a request's key, whose random numbers are independent of its paths and of its boundary samples."""
 _LENSES = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
-"""Mitsuba's own parameters of a perspective sensor."""
+"""Mitsuba's lens parameters of a perspective sensor."""
 
 
 def moved_sensor(scene: LoadedScene, key: str) -> str:
-    """The id of the sensor whose picture a parameter shifts, "" where it is no parameter of a sensor."""
+    """Return the id of the sensor that a parameter moves or whose lens it changes; "" if it is not a parameter of a sensor."""
     owner, _, name = key.rpartition(".")
     if key in scene.poses:
         owner = scene.poses.key(key).target
@@ -33,51 +33,53 @@ def moved_sensor(scene: LoadedScene, key: str) -> str:
 
 
 def sensor_obstacle(pair: ScenePair, target: str) -> str:
-    """Why there is no derivative by a sensor's parameters, "" where there is."""
+    """Return the reason why there is no derivative by a sensor's parameters; "" if there is one."""
     if pair.volumetric:
-        return "path gradients of moving sensors know no media"
+        return "path gradients of moving sensors do not support media"
     kind = next(sensor.class_name() for sensor in pair.current.sensors() if sensor.id() == target)
     if kind != "PerspectiveCamera":
-        return f"path gradients move perspective sensors only, and {target} is another ({kind})"
+        return f"path gradients of sensors are limited to perspective sensors; {target} is a {kind}"
     return ""
 
 
 def translation_obstacle(pair: ScenePair) -> str:
-    """Why there is no derivative by a sensor's position, "" where there is."""
+    """Return the reason why there is no derivative by a sensor's position; "" if there is one."""
     if has_instances(pair.current):
-        return "boundary derivatives do not know the silhouettes of the scene's instances"
+        return "boundary derivatives do not support scenes with instances"
     return ""
 
 
 def lens_parameters(pair: ScenePair) -> dict[str, ParameterInfo]:
-    """{key: what the renderer says of it}: Mitsuba's own parameters of perspective sensors, which it marks as not differentiable."""
-    found = {}
+    """Return {key: description} of the lens parameters of perspective sensors. Mitsuba marks these as not differentiable."""
+    parameters = {}
     for index, sensor in enumerate(pair.current.sensors()):
         for name in _LENSES:
             key = f"{sensor.id()}.{name}"
             if key in pair.current_parameters and not sensor_obstacle(pair, sensor.id()):
                 limits = pair.physical_range(key)
-                why = "it changes what the sensor sees"
-                found[key] = ParameterInfo((), True, False, why, limits.low, limits.high, viewpoint=True, sensor=index)
-    return found
+                reason = "it changes what the sensor sees"
+                parameters[key] = ParameterInfo(
+                    (), True, False, reason, limits.low, limits.high, viewpoint=True, sensor=index
+                )
+    return parameters
 
 
 def no_tangents(keys: Iterable[str]) -> str:
-    """Return why pixels cannot be drawn by the variance of these derivatives, all by parameters of sensors."""
+    """Return the error message for adaptive pixel sampling with derivatives by sensor parameters only."""
     return (
-        f"parameter {', '.join(sorted(keys))}: adaptive pixels do not know how derivatives by a sensor vary: "
-        "--method plain, or draw pixels uniformly (scheme = uniform)"
+        f"parameter {', '.join(sorted(keys))}: adaptive pixel sampling does not support derivatives by a sensor's parameters; "
+        "use --method plain, or sample pixels uniformly (scheme = uniform)"
     )
 
 
 class CameraTerm:
-    """Derivatives with respect to the parameters of sensors, to be added to those of path replay, which holds the sensors' rays.
+    """Derivatives with respect to sensor parameters, which are added to those of path replay with fixed camera rays.
 
     Args:
         pair: both loads of the scene.
-        keys: the parameters, of sensors all.
-        max_depth: longest path in segments, >= 1.
-        still: whether shapes stand still.
+        keys: keys of the parameters, all of sensors.
+        max_depth: maximum path length in segments, >= 1.
+        still: whether shapes do not move.
     """
 
     def __init__(self, pair: ScenePair, keys: Iterable[str], max_depth: int, still: bool):
@@ -96,13 +98,15 @@ class CameraTerm:
         self._resolutions = pair.resolutions
 
     def accumulate(self, scene: LoadedScene, request: SampleRequest, weights: mi.TensorXf) -> None:
-        """Add to the gradients of the scene's leaves those of the mean over groups g of sum(weights[g] * image), by as many samples as
-        the request has, of numbers of its own. See `BoundaryTerm.accumulate`."""
+        """Add the derivatives of the mean over groups g of sum(weights[g] * image) to the gradients of the scene's leaves.
+
+        It takes as many samples as the request, with independent random numbers, see `BoundaryTerm.accumulate`.
+        """
         key = Key(request.seed, 0, _STREAM)
         for view in views_of(request, weights, self._resolutions):
             if view.sensor in self._motions:
                 sensor = scene.scene.sensors()[view.sensor]
                 motion = self._motions[view.sensor]
-                found = motion.weighted_image(scene.scene, sensor, view, key.fold(view.sensor).uint32())
-                if dr.grad_enabled(found):
-                    dr.backward(found, dr.ADFlag.ClearInterior)
+                image = motion.weighted_image(scene.scene, sensor, view, key.fold(view.sensor).uint32())
+                if dr.grad_enabled(image):
+                    dr.backward(image, dr.ADFlag.ClearInterior)

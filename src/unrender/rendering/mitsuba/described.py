@@ -1,7 +1,8 @@
-"""Ready-made Mitsuba objects whose description is not lost.
+"""Descriptions of ready-made Mitsuba objects, recorded for export.
 
-A scene dictionary may hold ready-made objects, such as a `mitsuba.Mesh` with its BSDF. Mitsuba's objects do not tell what they were made
-of, and exporting a scene needs to know: a function that makes its scene's dictionary makes such objects by `load_described`.
+A scene dictionary may hold ready-made objects, such as a `mitsuba.Mesh` with its BSDF. Mitsuba's objects do not expose the description
+that they were made from, which the export of a scene requires. A function that builds a scene dictionary therefore makes such objects
+by `load_described`.
 """
 
 from __future__ import annotations
@@ -19,18 +20,21 @@ _recorded: ContextVar[Recorded | None] = ContextVar("recorded", default=None)
 
 
 def load_described(description: dict[str, Any]) -> Any:
-    """`mitsuba.load_dict(description)`; inside `recorded_descriptions` the object is remembered with its description."""
-    made = mi.load_dict(description)
+    """Return `mitsuba.load_dict(description)`. Inside `recorded_descriptions`, record the object with its description."""
+    result = mi.load_dict(description)
     recorded = _recorded.get()
     if recorded is not None:
-        recorded.append((made, description))
-    return made
+        recorded.append((result, description))
+    return result
 
 
 @contextmanager
 def recorded_descriptions() -> Iterator[Recorded]:
-    """A list of (object, description) of all that `load_described` makes inside. Objects live as long as the list does, no longer:
-    Mitsuba objects outside the scenes of a run keep Dr.Jit from freezing kernels."""
+    """Yield a list of (object, description), which collects every object that `load_described` makes inside the context.
+
+    The list keeps the objects alive; discard it early. Mitsuba objects outside the scenes of a run prevent Dr.Jit from freezing
+    kernels.
+    """
     recorded: Recorded = []
     token = _recorded.set(recorded)
     try:

@@ -1,8 +1,8 @@
-"""Scene descriptions, parsed and checked before Mitsuba loads what they name.
+"""Scene descriptions, parsed and checked before Mitsuba instantiates them.
 
-A description may come from somebody else. So Mitsuba's own two steps, parsing and making objects, are taken one by one: between them the
-types of plugins and the files that objects name are checked, names of files become absolute, and objects are made where Mitsuba finds no
-plugins but its own. `mitsuba.load_file` and `mitsuba.load_dict` do both at once, with the scene's folder among the places of plugins.
+A description may come from an untrusted source. Mitsuba's two steps, parsing and instantiation, therefore run separately. In between,
+the plugin types and the files that objects name are checked, and file names become absolute. Instantiation only finds Mitsuba's own
+plugins. `mitsuba.load_file` and `mitsuba.load_dict` run both steps at once, and add the scene's folder to the plugin search path.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _NO_PLUGINS = ("scene", "ref", *_COLOURS)
 _MATERIAL = re.compile(r"[\w.+-]{1,100}")
 _POINTERS = "blender"
 _NEEDED = {"bitmap": (_FILE, "bitmap", "data"), "blendbsdf": ("weight",)}
-"""{type: names, of which one must be given}."""
+"""{type: properties, one of which is required}."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,8 @@ class Parsed:
     """A description that was parsed and checked.
 
     Attributes:
-        state: `mitsuba.parser.ParserState`; names of files that exist are absolute.
+        config: `mitsuba.parser.ParserConfig` of the parse.
+        state: `mitsuba.parser.ParserState`; names of existing files are absolute.
     """
 
     config: Any
@@ -47,17 +48,17 @@ class Parsed:
     _checks: scene_assets.AssetChecks = field(default_factory=scene_assets.AssetChecks)
 
     def instantiate(self) -> Any:
-        """The object that the description makes. Uses up `state`.
+        """Return the object that the description defines. This consumes `state`.
 
         Raises:
-            InputError: a file that it names is missing, malformed or too large; an object lacks what Mitsuba needs.
+            InputError: a file that it names is missing, malformed or too large, or an object lacks a property that Mitsuba needs.
         """
         for node in self.state.nodes:
             _check_complete(node.props)
             self._check_files(node.props)
         with variant.two_threads(), plugins.only(plugins.own_folder()), _printable_log():
-            found = mi.parser.instantiate(self.config, self.state)
-        return found[0] if isinstance(found, list) else found
+            result = mi.parser.instantiate(self.config, self.state)
+        return result[0] if isinstance(result, list) else result
 
     def _check_files(self, props: Any) -> None:
         plugin = props.plugin_name()
@@ -69,20 +70,20 @@ class Parsed:
 
 
 def load(description: Path | Mapping[str, Any]) -> Any:
-    """The object that an XML file or a dictionary describes. Shapes are not merged, so that two loads have them in the same order.
+    """Return the object that an XML file or a dictionary describes. Shapes are not merged, so two loads have them in the same order.
 
     Raises:
-        InputError: see `parse` and `Parsed.instantiate`. What Mitsuba itself refuses is an exception of its own.
+        InputError: see `parse` and `Parsed.instantiate`. Mitsuba's own refusals have their original type.
     """
     return parse(description).instantiate()
 
 
 def parse(description: Path | Mapping[str, Any]) -> Parsed:
-    """Parse an XML file or a dictionary, and resolve its references. No plugin but Mitsuba's own is loaded.
+    """Parse an XML file or a dictionary, and resolve its references. Only Mitsuba's own plugins are loaded.
 
     Raises:
-        InputError: its XML is malformed or includes files from outside its folder; a type is not the name of a plugin, or of one that lies
-            beside the scene. What Mitsuba itself refuses is an exception of its own.
+        InputError: the XML is malformed or includes files from outside its folder; or a type is not the name of a plugin, or names a plugin
+            in the scene's folder. Mitsuba's own refusals have their original type.
     """
     config = mi.parser.ParserConfig(variant.ensure())
     config.merge_equivalent = config.merge_meshes = config.parallel = False
@@ -92,9 +93,9 @@ def parse(description: Path | Mapping[str, Any]) -> Parsed:
         state, search = _parse_xml(config, description)
     else:
         search = []
-        given = _Dictionary(search, others).checked(description)
+        dictionary = _Dictionary(search, others).checked(description)
         with plugins.only(plugins.own_folder()), _printable_log():
-            state = mi.parser.parse_dict(config, given)
+            state = mi.parser.parse_dict(config, dictionary)
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
     _check_types({node.props.plugin_name() for node in state.nodes}, isinstance(description, Path))
@@ -105,14 +106,14 @@ def parse(description: Path | Mapping[str, Any]) -> Parsed:
 
 
 def _parse_xml(config: Any, path: Path) -> tuple[Any, list[Path]]:
-    """The parser's state, and where files are that the scene names."""
+    """Return the parser's state, and the search path of the files that the scene names."""
     expected = scene_files.read(path).xml
     with plugins.only(path.absolute().parent), _printable_log():
         state = mi.parser.parse_file(config, str(path.absolute()))
         search = plugins.search_paths()
     read = [Path(str(file)).resolve() for file in state.files]
     if sorted(read) != sorted(file.resolve() for file in expected):
-        raise InputError(f"scene {path}: its includes cannot be followed")
+        raise InputError(f"scene {path}: its includes cannot be resolved")
     return state, search
 
 
@@ -120,11 +121,11 @@ def _check_types(names: set[str], is_file: bool) -> None:
     for name in sorted(names - set(_NO_PLUGINS)):
         plugins.check_type(name)
     if is_file and _POINTERS in names:
-        raise InputError(f"type {_POINTERS}: takes addresses in memory, which no file can know")
+        raise InputError(f"type {_POINTERS}: needs memory addresses, which a file cannot contain; remove it")
 
 
 def _check_complete(props: Any) -> None:
-    """Raise `InputError` for an object without what Mitsuba needs and does not check: it would end the process."""
+    """Raise `InputError` for an object without a property that Mitsuba needs but does not check: it would abort the process."""
     plugin = props.plugin_name()
     needed = _NEEDED.get(plugin)
     if needed and not any(name in props for name in needed):
@@ -132,30 +133,31 @@ def _check_complete(props: Any) -> None:
 
 
 def _settle(props: Any, search: Sequence[Path]) -> None:
-    """Make the name of an object's file absolute where there is one."""
+    """Make the file name of an object absolute if the file exists."""
     if _is_text(props, _FILE) and (found := scene_files.resolve(props[_FILE], search)) is not None:
         props[_FILE] = str(found.resolve())
 
 
 def _check_paths(nodes: Any) -> None:
-    """Raise `InputError` where there are too many ways from the scene to its objects.
+    """Raise `InputError` if there are too many paths from the scene to its objects.
 
-    Objects that hold one another by reference twice each double them, and who walks through a scene goes all ways. There are no circles.
+    Objects that reference each other twice double the number of paths at each level, and a traversal follows every path. There are no
+    cycles.
     """
     resolved = mi.Properties.Type.ResolvedReference
-    ways: dict[int, int] = {}
+    paths: dict[int, int] = {}
     pending = [0]
     while pending:
         index = pending[-1]
         props = nodes[index].props
         held = [props[name].index() for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118
-        if missing := [child for child in held if child not in ways]:
+        if missing := [child for child in held if child not in paths]:
             pending += missing
             continue
-        ways[pending.pop()] = 1 + sum(ways[child] for child in held)
-    if ways[0] > _MOST_PATHS:
+        paths[pending.pop()] = 1 + sum(paths[child] for child in held)
+    if paths[0] > _MOST_PATHS:
         raise InputError(
-            f"its objects hold one another in {shorten(str(ways[0]), 40)} ways, expected at most {_MOST_PATHS}"
+            f"its objects reference one another along {shorten(str(paths[0]), 40)} paths, expected at most {_MOST_PATHS}"
         )
 
 
@@ -165,58 +167,58 @@ def _is_text(props: Any, name: str) -> bool:
 
 @dataclass
 class _Dictionary:
-    """Checks a dictionary: Mitsuba's parser looks up plugins as it goes, and reads spectra.
+    """Checker of a scene dictionary. Mitsuba's parser looks up plugins and reads spectra while it parses.
 
     Attributes:
-        search: where files are that it names; its folders of resources are added.
-        others: where Mitsuba looks after that.
+        search: search path of the files that the dictionary names; its resource folders are added.
+        others: folders that Mitsuba searches afterwards.
     """
 
     search: list[Path]
     others: Sequence[Path]
 
-    def checked(self, given: Mapping[str, Any], depth: int = 0) -> dict[str, Any]:
-        """A copy without folders of resources, and with the names of spectra's files absolute."""
+    def checked(self, description: Mapping[str, Any], depth: int = 0) -> dict[str, Any]:
+        """Return a copy without resource folders and with absolute file names of spectra."""
         if depth > _DEEPEST:
             raise InputError(f"nested more than {_DEEPEST} deep")
-        kind = given.get("type")
+        kind = description.get("type")
         if isinstance(kind, str) and kind not in _NO_PLUGINS:
             plugins.check_type(kind)
-        if kind in _COLOURS and isinstance(name := given.get(_FILE), (str, Path)):
-            return {**given, _FILE: str(self._spectrum(name))}
-        found = {}
-        for key, value in given.items():
+        if kind in _COLOURS and isinstance(name := description.get(_FILE), (str, Path)):
+            return {**description, _FILE: str(self._spectrum(name))}
+        result = {}
+        for key, value in description.items():
             if not isinstance(value, dict):
-                found[key] = str(value) if key == _FILE and isinstance(value, Path) else value
+                result[key] = str(value) if key == _FILE and isinstance(value, Path) else value
             elif depth == 0 and value.get("type") == _RESOURCES:
                 self._add_resources(value)
             else:
-                found[key] = self.checked(value, depth + 1)
-        return found
+                result[key] = self.checked(value, depth + 1)
+        return result
 
-    def _add_resources(self, given: Mapping[str, Any]) -> None:
-        name = str(given.get("path", ""))
+    def _add_resources(self, resources: Mapping[str, Any]) -> None:
+        name = str(resources.get("path", ""))
         place = scene_files.resolve(name, [Path(), *self.search, *self.others])
         if place is None or not place.is_dir():
             raise InputError(f"resources: {shorten(name, 200)}: no such folder")
         self.search.insert(0, place.absolute())
 
     def _spectrum(self, name: str | Path) -> Path:
-        found = scene_files.resolve(str(name), [*self.search, *self.others])
-        if found is None:
+        path = scene_files.resolve(str(name), [*self.search, *self.others])
+        if path is None:
             raise InputError(f"spectrum {shorten(str(name), 200)}: no such file")
-        spectrum_files.check(found)
-        return found.absolute()
+        spectrum_files.check(path)
+        return path.absolute()
 
 
 @contextmanager
 def _printable_log() -> Iterator[None]:
-    """Let Mitsuba's messages reach the terminal in printable text alone: they quote names from files."""
+    """Redirect Mitsuba's messages to a logger that only prints printable text, since they quote names from files."""
     logger: Any = getattr(mi, "logger")()  # noqa: B009 (its type is unknown)
     if logger is None:  # in a thread that is not Mitsuba's
         yield
         return
-    kept = [logger.appender(index) for index in range(logger.appender_count())]
+    appenders = [logger.appender(index) for index in range(logger.appender_count())]
     ours = _PrintableLog()
     logger.clear_appenders()
     logger.add_appender(ours)
@@ -224,17 +226,17 @@ def _printable_log() -> Iterator[None]:
         yield
     finally:
         logger.clear_appenders()
-        for appender in kept:
+        for appender in appenders:
             logger.add_appender(appender)
 
 
 class _PrintableLog(mi.Appender):
-    """Writes to standard error what Mitsuba warns of."""
+    """Appender that writes Mitsuba's messages to standard error."""
 
     def append(self, level: Any, text: str) -> None:
-        """See `mitsuba.Appender`."""
+        """Write one message of any level."""
         del level
         print(one_line(" ".join(text.split())), file=sys.stderr)
 
     def log_progress(self, progress: float, name: str, formatted: str, eta: str, ptr: Any = None) -> None:
-        """Progress of loading is not shown."""
+        """Ignore the progress of loading."""

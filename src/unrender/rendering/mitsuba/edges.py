@@ -1,6 +1,6 @@
-"""The edges of all meshes of a scene, where visibility changes when geometry moves.
+"""Edges of all meshes of a scene, the candidates for visibility discontinuities.
 
-Which edge borders on which face is found once; positions are read from the scene whenever they are asked for, with their derivatives.
+The adjacency of edges and faces is computed once. Positions are read from the scene at each use, with their derivatives.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ __all__ = ["EdgePoints", "EdgeTable", "MeshEdges", "edges_of"]
 
 @dataclass(frozen=True)
 class MeshEdges:
-    """Of one mesh: two ends, the third corner of two adjacent faces (E,), and whether the edge is one."""
+    """Edges of one mesh.
+
+    Attributes:
+        ends: vertex indices of both ends, (E, 2).
+        thirds: index of the opposite vertex of two adjacent faces, (E, 2).
+        always, crease: see `EdgePoints`, (E,).
+    """
 
     ends: np.ndarray
     thirds: np.ndarray
@@ -30,13 +36,13 @@ class MeshEdges:
 
 
 class EdgePoints:
-    """Edges, gathered per lane. No dataclass: Dr.Jit would take it for state of its loops.
+    """Edges gathered per lane. This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
 
     Attributes:
-        start, end: `mi.Point3f`, attached where the caller resumes gradients.
-        third, other_third: `mi.Point3f`, the opposite corners of two adjacent faces, the same one where there is one face only; detached.
-        always: whether it may be a silhouette from everywhere: at the border of a mesh, or with more than two faces.
-        crease: whether the shading is discontinuous across it.
+        start, end: `mi.Point3f`, attached if the caller resumes gradients.
+        third, other_third: `mi.Point3f`, opposite corners of two adjacent faces, equal if there is only one face; detached.
+        always: whether it may be a silhouette from every direction: at the border of a mesh, or with more than two faces.
+        crease: whether shading is discontinuous across the edge.
     """
 
     def __init__(self, start: Any, end: Any, third: Any, other_third: Any, always: Any, crease: Any):
@@ -44,31 +50,31 @@ class EdgePoints:
         self.always, self.crease = always, crease
 
     def sides(self, direction: Any) -> tuple[Any, Any]:
-        """On which sides of the plane through the edge and `direction` the two faces lie: two signed distances, detached."""
+        """Return on which side of the plane through the edge and `direction` each face lies: two signed distances, detached."""
         start = dr.detach(self.start)
         normal = dr.cross(dr.detach(self.end) - start, direction)
         return dr.dot(normal, self.third - start), dr.dot(normal, self.other_third - start)
 
     def is_silhouette(self, direction: Any) -> Any:
-        """Whether the faces lie on one side of it, seen along `direction`."""
+        """Return whether both faces lie on the same side of the edge, seen along `direction`."""
         one, other = self.sides(direction)
         return self.always | (one * other > 0)
 
 
 class EdgeTable:
-    """The edges of all meshes of a scene.
+    """Edges of all meshes of a scene.
 
-    Vertices at the same place count as one when faces are matched, so that seams of texture coordinates are no borders. Triangles
-    without area have no edges of their own.
+    Vertices at the same position are merged to match faces, so seams of texture coordinates are not borders. Triangles without area
+    have no edges.
 
     Args:
         scene: `mi.Scene`.
         moving: ids of the shapes that move.
-        loaded: {id: positions (3 V,)} to match faces by, where a mesh may hold others by now.
+        loaded: {id: positions (3 V,)} to match faces by, if a mesh may have other positions by now.
 
     Attributes:
-        count: of edges, those of moving shapes first.
-        moving: how many are of moving shapes.
+        count: number of edges; those of moving shapes come first.
+        moving: number of edges of moving shapes.
     """
 
     def __init__(self, scene: Any, moving: AbstractSet[str], loaded: Mapping[str, np.ndarray] | None = None):
@@ -81,11 +87,11 @@ class EdgeTable:
         self.moving = 0
         for name in self._order:
             mesh = by_id[name]
-            found = edges_of(mesh, (loaded or {}).get(name))
-            parts.append((found, first))
+            edges = edges_of(mesh, (loaded or {}).get(name))
+            parts.append((edges, first))
             first += dr.width(mesh_layout.positions(mesh)) // 3
             if name in moving:
-                self.moving += len(found.always)
+                self.moving += len(edges.always)
         ends = np.concatenate([part.ends + offset for part, offset in parts])
         thirds = np.concatenate([part.thirds + offset for part, offset in parts])
         self.count = len(ends)
@@ -95,12 +101,12 @@ class EdgeTable:
         self._crease = mi.Bool(np.concatenate([part.crease for part, _ in parts]))
 
     def positions(self, scene: Any) -> Any:
-        """The vertices of all meshes, one behind the other, `mi.Float`; attached where the caller resumes gradients."""
+        """Return the concatenated vertices of all meshes, `mi.Float`; attached if the caller resumes gradients."""
         by_id = {shape.id(): shape for shape in scene.shapes() if shape.is_mesh()}
         return dr.concat([mesh_layout.positions(by_id[name]) for name in self._order])
 
     def at(self, positions: Any, index: Any, active: Any = True) -> EdgePoints:
-        """The edges of these numbers."""
+        """Return the edges of these indices."""
         ends, thirds = (
             [dr.gather(mi.UInt32, column, index, active) for column in pair] for pair in (self._ends, self._thirds)
         )
@@ -112,7 +118,7 @@ class EdgeTable:
 
 
 def edges_of(mesh: Any, positions: np.ndarray | None) -> MeshEdges:
-    """The edges of a mesh, each once."""
+    """Return the edges of a mesh, each once."""
     points = np.array(mesh_layout.positions(mesh) if positions is None else positions).reshape(-1, 3)
     faces = np.array(mesh_layout.faces(mesh)).reshape(-1, 3).astype(np.int64)
     _, welded = np.unique(points, axis=0, return_inverse=True)

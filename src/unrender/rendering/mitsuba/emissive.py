@@ -1,20 +1,19 @@
-"""A medium that emits and absorbs, and scatters nothing: Mitsuba's plugin `emissive`, for fits of radiance fields.
+"""Emissive and absorbing medium without scattering: the Mitsuba plugin `emissive`, for fits of radiance fields.
 
     {"type": "emissive", "sigma_t": volume, "emission": volume}
 
-Along a ray the radiance is ∫ T(t) σₜ(t) e(t) dt, with the extinction σₜ of `sigma_t` in inverse scene units, and the radiance e of
-`emission`: the same in all directions. With 3 or 8 volumes more, `emission_1` to `emission_3` or `emission_8`, all of them are
-coefficients of spherical harmonics of degree 1 or 2, and in the direction d
+Along a ray the radiance is ∫ T(t) σₜ(t) e(t) dt, with the extinction σₜ of `sigma_t` in inverse scene units. The emitted radiance e of
+`emission` is isotropic. With 3 or 8 further volumes, `emission_1` to `emission_3` or `emission_8`, all volumes are coefficients of
+spherical harmonics of degree 1 or 2. In the direction d
 
     e(d) = s log(1 + exp(Σ_k c_k Y_k(d) / s)),    s = 0.05,
 
-which is positive, and the sum itself where this is well above s. c_0 is `emission`, c_k is `emission_k`, and Y_k are the real spherical
-harmonics over that of degree 0:
+which is positive and approaches the sum where the sum is well above s. c_0 is `emission`, c_k is `emission_k`, and Y_k are the real
+spherical harmonics divided by that of degree 0:
 
     1,  √3 y, √3 z, √3 x,  √15 xy, √15 yz, √5 (3z² - 1)/2, √15 xz, √15 (x² - y²)/2.
 
-Only the kernels of this package know of it: Mitsuba's own integrators take its light for
-scattering.
+Only the kernels of this package support it. Mitsuba's own integrators treat its emission as scattering.
 """
 
 from __future__ import annotations
@@ -28,24 +27,24 @@ import mitsuba as mi
 from unrender.core.errors import InputError
 
 COEFFICIENT = "emission_"
-"""What the names of the volumes beyond `emission` begin with."""
+"""Prefix of the names of the volumes other than `emission`."""
 FUNCTIONS = (1, 4, 9)
-"""Spherical harmonics up to degree 0, 1 and 2."""
+"""Numbers of spherical harmonics up to degree 0, 1 and 2."""
 _SOFTNESS = 0.05
 
 
 def register() -> None:
-    """Make the plugin known to the variant that is set. Again does nothing."""
+    """Register the plugin with the active variant. Repeated calls do nothing."""
     _plugin(mi.variant())
 
 
 def emits(medium: Any) -> bool:
-    """Whether a medium is such a one."""
+    """Return whether a medium is of the `emissive` plugin."""
     return isinstance(medium, _plugin(mi.variant()))
 
 
 def is_positive(medium: Any) -> bool:
-    """Whether a medium is such a one that emits more than nothing in every direction: one of spherical harmonics of degree 1 or 2."""
+    """Return whether a medium emits in every direction: an `emissive` medium with spherical harmonics of degree 1 or 2."""
     return emits(medium) and bool(medium.more)
 
 
@@ -58,25 +57,25 @@ def _volume(properties: Any, name: str) -> Any:
 
 
 def harmonics(d: Any, count: int) -> list[Any]:
-    """The first 4 or 9 real spherical harmonics in the direction d, over that of degree 0."""
-    found = [1.0, 3**0.5 * d.y, 3**0.5 * d.z, 3**0.5 * d.x]
+    """Return the first 4 or 9 real spherical harmonics in the direction d, divided by that of degree 0."""
+    values = [1.0, 3**0.5 * d.y, 3**0.5 * d.z, 3**0.5 * d.x]
     if count == 9:
-        found += [15**0.5 * d.x * d.y, 15**0.5 * d.y * d.z, 5**0.5 / 2 * (3 * d.z * d.z - 1)]
-        found += [15**0.5 * d.x * d.z, 15**0.5 / 2 * (d.x * d.x - d.y * d.y)]
-    return found
+        values += [15**0.5 * d.x * d.y, 15**0.5 * d.y * d.z, 5**0.5 / 2 * (3 * d.z * d.z - 1)]
+        values += [15**0.5 * d.x * d.z, 15**0.5 / 2 * (d.x * d.x - d.y * d.y)]
+    return values
 
 
 def _positive(x: Any) -> Any:
-    """s log(1 + exp(x / s)), without overflow."""
+    """Return s log(1 + exp(x / s)), without overflow."""
     return dr.maximum(x, 0) + _SOFTNESS * dr.log(1 + dr.exp(-dr.abs(x) / _SOFTNESS))
 
 
 @cache
 def _plugin(variant: str) -> type:
-    del variant  # the base class is that of the variant that is set
+    del variant  # a cache key only: the base class belongs to the active variant
 
     class EmissiveMedium(mi.Medium):
-        """Its "scattering coefficient" is what it emits, σₜ e: where a kernel finds that instead of light to scatter."""
+        """The medium. Its "scattering coefficient" is the emission σₜ e, which kernels add as radiance."""
 
         def __init__(self, properties: Any):
             super().__init__(properties)
@@ -115,12 +114,12 @@ def _plugin(variant: str) -> type:
             return σₜ * self._radiance(mei, active), self.majorant - σₜ, σₜ
 
         def _radiance(self, mei: Any, active: Any) -> Any:
-            found = self.emission.eval(mei, active)
+            value = self.emission.eval(mei, active)
             if not self.more:
-                return found
+                return value
             for volume, Y in zip(self.more, harmonics(mei.wi, len(self.more) + 1)[1:], strict=True):
-                found = dr.fma(volume.eval(mei, active), Y, found)
-            return _positive(found)
+                value = dr.fma(volume.eval(mei, active), Y, value)
+            return _positive(value)
 
         def intersect_aabb(self, ray: Any) -> Any:
             return self.sigma_t.bbox().ray_intersect(ray)

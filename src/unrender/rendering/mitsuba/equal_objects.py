@@ -1,6 +1,7 @@
-"""Equal objects of a description, which `mi.load_file` and `mi.load_dict` merge unless they are told `optimize=False`.
+"""Equal objects of a description, which `mi.load_file` and `mi.load_dict` merge unless `optimize=False`.
 
-There one key then changes several objects; here each has its own. References that are made by setting such a key show another scene.
+After a merge, one key changes several objects; here each object has its own key. References that were rendered by setting such a key in
+a merged scene show a different scene.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ _NUMBERS = ("Float", "Integer", "Bool", "Vector", "Color")
 
 
 def equal_objects(nodes: Sequence[Any]) -> tuple[tuple[str, ...], ...]:
-    """Names of objects that are equal, a tuple for each such set; an object that is held by reference is one.
+    """Return the names of equal objects, one tuple per set. An object that is held by reference counts once.
 
     Args:
-        nodes: of `mitsuba.parser.ParserState`, references resolved.
+        nodes: nodes of `mitsuba.parser.ParserState`, references resolved.
     """
     contents: dict[int, Any] = {}
     names = {0: ""}
@@ -28,21 +29,21 @@ def equal_objects(nodes: Sequence[Any]) -> tuple[tuple[str, ...], ...]:
         names.setdefault(index, name)
     for index, _ in reversed(order):
         contents[index] = _content(nodes[index], contents, index)
-    found: dict[Any, list[str]] = {}
+    groups: dict[Any, list[str]] = {}
     for index, name in names.items():
         if _kind(nodes[index]) in _MERGED:
-            found.setdefault(contents[index], []).append(name)
-    return tuple(tuple(sorted(equal)) for equal in found.values() if len(equal) > 1)
+            groups.setdefault(contents[index], []).append(name)
+    return tuple(tuple(sorted(equal)) for equal in groups.values() if len(equal) > 1)
 
 
 def merge_notices(keys: Iterable[str], equal: Iterable[Sequence[str]]) -> list[str]:
-    """One line for each parameter of an object that has equals.
+    """Return one notice for each parameter whose object has equal objects.
 
     Args:
-        keys: of the unknowns.
-        equal: of `equal_objects`.
+        keys: keys of the unknowns.
+        equal: result of `equal_objects`.
     """
-    found = []
+    notices = []
     for key in keys:
         for names in equal:
             own = next((name for name in names if key.startswith(f"{name}.")), None)
@@ -50,29 +51,29 @@ def merge_notices(keys: Iterable[str], equal: Iterable[Sequence[str]]) -> list[s
                 continue
             other = next(name for name in names if name != own)
             more = f" and {len(names) - 2} more" if len(names) > 2 else ""
-            found.append(
-                f"{key}: {own} equals {other}{more}, and Mitsuba merges equal objects: one key then changes them all, here {key} and "
-                f"{other}{key.removeprefix(own)} are two; load the scene of references with optimize=False"
+            notices.append(
+                f"{key}: {own} equals {other}{more}, and Mitsuba merges equal objects, so that one key changes them all. Here {key} and "
+                f"{other}{key.removeprefix(own)} are separate; load the scene of references with optimize=False"
             )
             break
-    return found
+    return notices
 
 
 def _from_scene(nodes: Sequence[Any]) -> list[tuple[int, str]]:
-    """(index, name) of all objects below the scene, each behind those that hold it."""
-    found: dict[int, str] = {}
-    waiting = [(0, "")]
-    while waiting:
-        index, name = waiting.pop()
-        found.pop(index, None)
-        found[index] = name
+    """Return (index, name) of all objects of the scene, each after those that hold it."""
+    names: dict[int, str] = {}
+    pending = [(0, "")]
+    while pending:
+        index, name = pending.pop()
+        names.pop(index, None)
+        names[index] = name
         for number, (prop, child) in enumerate(_children(nodes[index].props)):
-            waiting.append((child, _name(nodes[child], name, prop, nodes[index].props.plugin_name(), number)))
-    return list(found.items())
+            pending.append((child, _name(nodes[child], name, prop, nodes[index].props.plugin_name(), number)))
+    return list(names.items())
 
 
 def _name(node: Any, holder: str, prop: str, plugin: str, number: int) -> str:
-    """As `mi.traverse` names an object: by its id where it has one of its own, else by what holds it, of which it is child `number`."""
+    """Return the name that `mi.traverse` uses: the object's own id, or else the name of its holder, whose child `number` it is."""
     own = node.props.id()
     if not holder or (own and own != prop and not own.startswith("_")):
         return own or prop
@@ -93,7 +94,7 @@ def _kind(node: Any) -> str:
 
 
 def _content(node: Any, contents: dict[int, Any], index: int) -> Any:
-    """What decides an object, hashable; of what cannot be compared its index, which no other has."""
+    """Return a hashable description of an object. A value that cannot be compared is replaced by the object's unique index."""
     values = []
     props = node.props
     for name in sorted(props.keys()):

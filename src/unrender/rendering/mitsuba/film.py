@@ -1,7 +1,8 @@
-"""From pixels to camera rays, from path radiance back to pixels: each pixel has samples of its own, drawn by the film's filter.
+"""Conversion of pixels to camera rays, and of path radiance to pixels. Each pixel has its own samples, distributed by the film's
+filter.
 
-Per-pixel statistics need pixels whose samples are their own, so a pixel is the mean of samples that lie where its reconstruction filter
-puts them (`pixel_filter.py`); with a box filter, in its square.
+Per-pixel statistics require samples that belong to one pixel. A pixel is therefore the mean of samples that are distributed according
+to its reconstruction filter (`pixel_filter.py`). The samples of a box filter are uniform in the pixel's square.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 
 @dataclass
 class RepeatingSampler:
-    """Independent samples that are the same in every copy of an image: lane i shares its numbers with lane i + period.
+    """Sampler of independent numbers that are equal in every copy of an image: lane i shares its numbers with lane i + period.
 
-    Stands for a `mitsuba.Sampler`; mutable, as that is, since it is state of the path tracer's loop.
+    It replaces a `mitsuba.Sampler`. It is mutable, as that is, since it is state of the path tracer's loop.
 
     Attributes:
-        period: lanes of one image.
+        period: number of lanes of one image.
         rng: `mitsuba.PCG32`, once seeded.
-        lanes: `mi.UInt32`, the lane whose numbers each one is to have, in place of its own; None for its own.
+        lanes: `mi.UInt32`, for each lane the lane whose numbers it uses; None for its own.
     """
 
     period: int
@@ -33,13 +34,13 @@ class RepeatingSampler:
     lanes: Any = None
 
     def seed(self, seed: Any, lanes: int) -> None:
-        """Start anew with `lanes` lanes."""
+        """Seed the generator for `lanes` lanes."""
         lane = dr.arange(mi.UInt32, lanes) % self.period if self.lanes is None else self.lanes
         state, sequence = mi.sample_tea_32(seed, lane)  # pyright: ignore[reportCallIssue, reportArgumentType]
         self.rng = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
 
     def clone(self) -> RepeatingSampler:
-        """Another with the same numbers to come."""
+        """Return a sampler with the same future numbers."""
         return RepeatingSampler(self.period, mi.PCG32(self.rng), self.lanes)  # pyright: ignore[reportCallIssue]
 
     def wavefront_size(self) -> int:
@@ -47,46 +48,46 @@ class RepeatingSampler:
         return dr.width(self.rng)
 
     def next_1d(self, active: Any = True) -> Any:
-        """A uniform number per lane, in lanes that are not active, too."""
+        """Return a uniform number per lane, including inactive lanes."""
         del active
         return self.rng.next_float32()
 
     def next_2d(self, active: Any = True) -> Any:
-        """Two of them."""
+        """Return two uniform numbers per lane, including inactive lanes."""
         del active
         first = self.rng.next_float32()
         return mi.Point2f(first, self.rng.next_float32())
 
 
 def independent(sampler: Any, lanes: int) -> RepeatingSampler:
-    """Random numbers apart from those of the path, which is replayed and must meet its own again."""
+    """Return a sampler independent of the path's sampler, whose state does not change. A replay of the path sees the same numbers."""
     copy: Any = sampler.clone()
     bits: Any = dr.reinterpret_array(mi.UInt32, copy.next_1d())
-    given = copy.lanes if isinstance(copy, RepeatingSampler) else None
-    lane: Any = dr.arange(mi.UInt32, lanes) if given is None else given
+    lanes_of_path = copy.lanes if isinstance(copy, RepeatingSampler) else None
+    lane: Any = dr.arange(mi.UInt32, lanes) if lanes_of_path is None else lanes_of_path
     state, sequence = mi.sample_tea_32(bits, lane)
     rng: Any = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
     return RepeatingSampler(lanes, rng)
 
 
 def _seed(sampler: Any, seed: Any, lanes: int) -> None:
-    """Raises `InputError` for more lanes than Dr.Jit counts."""
+    """Seed a sampler. Raise `InputError` for more lanes than Dr.Jit supports."""
     if lanes >= 1 << 32:
-        raise InputError(f"{lanes} camera rays at once: a launch has less than 2³²; take fewer samples per pixel")
+        raise InputError(f"{lanes} camera rays: a launch is limited to fewer than 2³²; reduce the samples per pixel")
     sampler.seed(seed, lanes)
 
 
 @dataclass(frozen=True)
 class CameraSamples:
-    """What a sensor makes camera rays of, per lane; samples of a pixel side by side.
+    """Arguments of `mitsuba.Sensor.sample_ray_differential` per lane. Samples of a pixel are adjacent.
 
     Attributes:
-        sensor: `mitsuba.Sensor`, or `mitsuba.SensorPtr` where each pixel has its own.
+        sensor: `mitsuba.Sensor`, or `mitsuba.SensorPtr` if each pixel has its own.
         time: `mi.Float`.
-        position: `mi.Point2f` on the film, from 0 to 1; beyond where the film samples its border.
+        position: `mi.Point2f` on the film, from 0 to 1; beyond if the film samples its border.
         aperture: `mi.Point2f` in [0, 1).
         spp: rays per pixel.
-        weight: `mi.Float`, of the reconstruction filter; None where all are 1.
+        weight: `mi.Float`, weight of the reconstruction filter; None if all weights are 1.
     """
 
     sensor: Any
@@ -109,7 +110,7 @@ def camera_samples(
     filters: PixelFilters | None = None,
     number: int = 0,
 ) -> CameraSamples:
-    """Samples of one sensor's film; copies * count * spp lanes.
+    """Return samples of one sensor's film; copies * count * spp lanes.
 
     Args:
         sensor: `mitsuba.Sensor`.
@@ -117,12 +118,12 @@ def camera_samples(
         seed: `mi.UInt32` of width 1.
         spp: rays per pixel.
         pixels: `mi.UInt32` of flat indices, or None for all pixels in order.
-        count: how many pixels.
-        copies: of the whole image, one behind the other.
-        timed: whether sensors open at different times (`open_at_different_times`): the time is then an input of the kernel, which all of
-            them share, and no constant in it.
-        filters: with this sensor's among them; None for a box filter.
-        number: of this sensor's in `filters`.
+        count: number of pixels.
+        copies: number of concatenated copies of the image.
+        timed: whether sensors open at different times (`open_at_different_times`). The time is then an input of the shared kernel instead
+            of a constant.
+        filters: filters of all sensors; None for a box filter.
+        number: index of this sensor in `filters`.
     """
     film = sensor.film()
     width, height = int(film.crop_size()[0]), int(film.crop_size()[1])
@@ -149,7 +150,7 @@ def camera_samples(
 def _positions(
     pixel: Any, sampler: Any, size: tuple[Any, Any], filters: PixelFilters | None, film: Any
 ) -> tuple[Any, Any]:
-    """Positions in pixels, of samples of pixels by column and row, and the filter's weights, None for ones."""
+    """Return film positions in pixels for samples of pixels (column, row), and the filter's weights, None for ones."""
     if filters is None:
         return mi.Point2f(pixel) + sampler.next_2d(), None
     u = sampler.next_2d()
@@ -159,25 +160,25 @@ def _positions(
 
 
 def open_at_different_times(sensors: Any) -> bool:
-    """Whether a list of `mitsuba.Sensor` has shutters that open at different times, such as those of a turntable."""
+    """Return whether the shutters of a list of `mitsuba.Sensor` open at different times, such as those of a turntable."""
     return len({float(sensor.shutter_open()) for sensor in sensors}) > 1
 
 
 def camera_samples_of_many(
     sensors: Any, films: Films, sampler: Any, seed: Any, spp: int, pixels: Any, count: int
 ) -> CameraSamples:
-    """Samples of pixels that belong to different sensors; count * spp lanes.
+    """Return samples of pixels that belong to different sensors; count * spp lanes.
 
     Args:
-        sensors: `mitsuba.SensorPtr`, all of the scene's.
-        films: of all of them, with the index of each pixel's sensor.
+        sensors: `mitsuba.SensorPtr`, all sensors of the scene.
+        films: data of all films, with the index of each pixel's sensor.
         sampler, seed, spp, pixels, count: see `camera_samples`.
     """
     lanes = count * spp
     _seed(sampler, seed, lanes)
     pixel, which = (per_sample(of_pixel, spp, count) for of_pixel in (pixels, films.which))
     width, height = dr.gather(mi.UInt32, films.widths, which), dr.gather(mi.UInt32, films.heights, which)
-    # LLVM fills up its vectors with lanes that read 0, and dividing by that ends the process.
+    # LLVM pads its vectors with lanes that read 0. A division by this 0 would abort the process.
     y = pixel // dr.maximum(width, 1)
     position, weight = _positions(mi.Point2u(pixel - y * width, y), sampler, (width, height), films.filters, which)
     time = mi.Float(0)
@@ -189,16 +190,16 @@ def camera_samples_of_many(
     return CameraSamples(dr.gather(mi.SensorPtr, sensors, which), time, position, aperture, spp, weight)
 
 
-def rays(samples: CameraSamples, hiding: Any = None) -> tuple[Any, Any]:
-    """`mi.RayDifferential3f` and its weight per lane; `hiding`: the scene whose emitters are left out, or None."""
+def rays(samples: CameraSamples, hidden_in: Any = None) -> tuple[Any, Any]:
+    """Return `mi.RayDifferential3f` and its weight per lane. If `hiding` is a scene, its directly visible emitters are skipped."""
     ray, weight = samples.sensor.sample_ray_differential(samples.time, 0.5, samples.position, samples.aperture)
     ray.scale_differential(samples.spp**-0.5)
     weight = weight if samples.weight is None else weight * samples.weight
-    return (ray, weight) if hiding is None else _past_emitters(hiding, ray, weight)
+    return (ray, weight) if hidden_in is None else _past_emitters(hidden_in, ray, weight)
 
 
 def _past_emitters(scene: Any, ray: Any, weight: Any) -> tuple[Any, Any]:
-    """Camera rays from behind the emitters that they meet first, and their weights, 0 where they then meet nothing: `hide_emitters`."""
+    """Move camera rays behind the emitters that they hit first (`hide_emitters`). Rays without a further hit have weight 0."""
 
     def passing(o: Any, active: Any, meets: Any) -> Any:
         return active
@@ -208,7 +209,7 @@ def _past_emitters(scene: Any, ray: Any, weight: Any) -> tuple[Any, Any]:
         onward.o = o
         pi = scene.ray_intersect_preliminary(onward, coherent=True, active=active)
         meets = dr.select(active, pi.is_valid(), meets)
-        active = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (of each lane)
+        active = active & pi.is_valid() & (pi.shape.emitter() != None)  # noqa: E711 (per lane)
         si = pi.compute_surface_interaction(onward, mi.RayFlags.Minimal, active)
         return dr.select(active, si.spawn_ray(onward.d).o, o), active, meets
 
@@ -219,31 +220,31 @@ def _past_emitters(scene: Any, ray: Any, weight: Any) -> tuple[Any, Any]:
 
 
 def sampler_at(positions: Any, spp: int, count: int) -> RepeatingSampler:
-    """The sampler of a part of an image: each pixel has the numbers that it has as part of the whole.
+    """Return the sampler of a part of an image, in which each pixel has the same numbers as in the full image.
 
     Args:
-        positions: `mi.UInt32`, of each pixel in the whole.
-        spp, count: of the part.
+        positions: `mi.UInt32`, index of each pixel in the full image.
+        spp, count: samples per pixel and number of pixels of the part.
     """
     sample = dr.arange(mi.UInt32, count * spp) % spp
     return RepeatingSampler(count * spp, lanes=per_sample(positions, spp, count) * spp + sample)
 
 
 def per_sample(of_pixel: Any, spp: int, count: int) -> Any:
-    """`mi.UInt32` of each pixel, repeated for each of its samples: count to count * spp lanes."""
+    """Repeat each pixel's `mi.UInt32` for each of its samples: from count to count * spp lanes."""
     return dr.gather(mi.UInt32, of_pixel, dr.arange(mi.UInt32, count * spp) // spp)
 
 
 @dataclass(frozen=True)
 class Films:
-    """What rays of several sensors need to know of them.
+    """Data of several sensors' films that their camera rays need.
 
     Attributes:
-        widths, heights: of the films in pixels, `mi.UInt32`.
-        aperture: whether any needs an aperture sample.
-        shutters: opening times and durations, `mi.Float`; None where all are 0.
-        filters: reconstruction filters; None where all are box filters.
-        which: `mi.UInt32`, the index of each pixel's sensor; None where all pixels are one sensor's.
+        widths, heights: film sizes in pixels, `mi.UInt32`.
+        aperture: whether any sensor needs an aperture sample.
+        shutters: opening times and durations, `mi.Float`; None if all are 0.
+        filters: reconstruction filters; None if all are box filters.
+        which: `mi.UInt32`, index of each pixel's sensor; None if all pixels belong to one sensor.
     """
 
     widths: Any
@@ -255,7 +256,7 @@ class Films:
 
     @classmethod
     def of(cls, sensors: Any) -> Films:
-        """Of a list of `mitsuba.Sensor`."""
+        """Return the data of a list of `mitsuba.Sensor`."""
         sizes = [sensor.film().crop_size() for sensor in sensors]
         times = [float(sensor.shutter_open_time()) for sensor in sensors]
         shutters = None
@@ -272,16 +273,16 @@ class Films:
 
 
 def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any:
-    """The mean of each pixel's samples, per group.
+    """Return the mean of each pixel's samples, per group.
 
     Args:
-        radiance: `mi.Spectrum`, evaluated, lanes ordered as `camera_samples` makes them.
+        radiance: `mi.Spectrum`, evaluated, lanes in the order of `camera_samples`.
         spp: samples per pixel, in all groups.
-        groups: the samples of a pixel are cut into that many equal runs.
-        shape: of one image, (H, W, 3) or (N, 3).
+        groups: number of equal, contiguous groups that a pixel's samples are split into.
+        shape: shape of one image, (H, W, 3) or (N, 3).
 
     Returns:
-        `mi.TensorXf` (groups, *shape). Sums in a fixed order: equal seeds give equal bits.
+        `mi.TensorXf` (groups, *shape). Sums have a fixed order: equal seeds give equal bits.
     """
     size = spp // groups
     sums = [dr.block_sum(radiance[c], size) if size > 1 else radiance[c] for c in range(3)]
@@ -295,12 +296,12 @@ def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any
 
 
 def film_adjoint(weights: Any, spp: int, count: int) -> Any:
-    """The adjoint of `develop` averaged over the groups: each lane's share of its pixel's and group's weight.
+    """Return the adjoint of `develop` averaged over the groups: the weight of each lane.
 
     Args:
         weights: `mi.TensorXf` (groups, H, W, 3) or (groups, N, 3).
         spp: samples per pixel, in all groups.
-        count: how many pixels.
+        count: number of pixels.
 
     Returns:
         `mi.Spectrum` per lane: weights[group, pixel] / spp.

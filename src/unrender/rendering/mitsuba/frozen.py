@@ -15,24 +15,24 @@ from unrender.core.errors import InputError
 
 _log = logging.getLogger("unrender")
 _ATTEMPTS = 3
-"""Failures in a row after which a function is traced at every call."""
+"""Number of consecutive failures after which a function is traced at every call."""
 _INDEPENDENT = "the argument does not depend on the input variable"
-"""From Dr.Jit's error where a derivative was asked for and there is none."""
+"""Part of Dr.Jit's error message for a derivative that does not exist."""
 
 
 class FrozenFunction:
-    """A function that Dr.Jit records at its first call and replays at later ones. Where it cannot be recorded, it is traced each time.
+    """A function that Dr.Jit records at its first call and replays at later ones. If it cannot be recorded, it is traced at each call.
 
-    A call through a pointer sees the objects of every scene in the process, those of the caller's own scenes too. Some of these, such as
-    lights with textures, make tables at their first use, which no recording can hold. The traced call that follows a failure makes them, so
-    the next call tries again, up to three times in a row.
+    A virtual call sees the objects of every scene in the process, including the caller's own. Some of them, such as textured emitters,
+    build tables at their first use, which cannot be recorded. The traced call after a failure builds them. The next call therefore
+    records again, up to three consecutive times.
 
-    A replay that fails raises its error: out of memory, say, is no reason to trace at every call from then on.
+    An error in a replay is raised, since out of memory, for example, does not justify tracing at every later call.
 
-    Mitsuba objects outside the scenes that it is handed, even unused ones, can keep Dr.Jit from recording.
+    Mitsuba objects outside the scenes that are passed in, even unused ones, can prevent Dr.Jit from recording.
 
     Args:
-        function: of device arrays and Mitsuba objects. It may be called again after it failed.
+        function: function of device arrays and Mitsuba objects. It may be called again after it failed.
         recordable: whether to record it at all.
     """
 
@@ -44,12 +44,12 @@ class FrozenFunction:
         self._threads = dr.thread_count()
 
     def __call__(self, prepare: Callable[[], None], *arguments: Any) -> Any:
-        """What the function returns. `prepare` is called before each attempt, to undo what a failed one has left."""
+        """Return the function's result. `prepare` is called before each attempt, to undo the effects of a failed one."""
         prepare()
         if self._frozen is None:
             return self._function(*arguments)
         if dr.thread_count() != self._threads:
-            # A recording keeps sums with a place for each thread: replayed by more, it would write beyond them.
+            # Recorded reductions have one slot per thread. A replay with more threads would write out of bounds.
             self._threads, self._recorded = dr.thread_count(), False
             self._frozen = _recorder(self._function, self._tracing)
         self._tracing.happened = False
@@ -59,7 +59,7 @@ class FrozenFunction:
             if self._recorded and not self._tracing.happened:
                 raise
             prepare()
-            result = self._function(*arguments)  # its own error is the one that counts
+            result = self._function(*arguments)  # an error of the function itself propagates
             self._failures += 1
             self._frozen = _recorder(self._function, self._tracing) if self._failures < _ATTEMPTS else None
             if self._frozen is None:
@@ -71,15 +71,13 @@ class FrozenFunction:
 
 
 class _Tracing:
-    """Whether a call has run the function to record it, or tried to. An object of its own, so that recordings hold no cycle of
-    references.
-    """
+    """Flag whether a call has traced the function. It is a separate object, so recordings hold no reference cycle."""
 
     happened = False
 
 
 def _recorder(function: Callable[..., Any], tracing: _Tracing) -> Callable[..., Any]:
-    """The function, frozen. A replay does not run it, and so leaves `tracing` as it is."""
+    """Return the frozen function. A replay does not run it and leaves `tracing` unchanged."""
 
     def traced(*arguments: Any) -> Any:
         tracing.happened = True
@@ -89,7 +87,7 @@ def _recorder(function: Callable[..., Any], tracing: _Tracing) -> Callable[..., 
 
 
 def _without_garbage_collection(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Arrays that die in the middle of a recording abort the process."""
+    """Call a function with garbage collection disabled: arrays that die during a recording abort the process."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -101,7 +99,7 @@ def _without_garbage_collection(function: Callable[..., Any], *arguments: Any) -
 
 @contextmanager
 def naming(keys: Iterable[str]) -> Iterator[None]:
-    """Turn Dr.Jit's error about a picture that depends on no parameter into an `InputError` that names the parameters."""
+    """Turn Dr.Jit's error about an image that depends on no parameter into an `InputError` that names the parameters."""
     try:
         yield
     except RuntimeError as error:
@@ -109,7 +107,7 @@ def naming(keys: Iterable[str]) -> Iterator[None]:
             raise
         names = ", ".join(sorted(keys))
         raise InputError(
-            f"parameter {names}: the picture depends on it through nothing that Mitsuba differentiates: --method smoothed"
+            f"parameter {names}: Mitsuba cannot differentiate the image with respect to it; use --method smoothed"
         ) from error
 
 
@@ -121,5 +119,5 @@ def _first_cause(error: BaseException) -> BaseException:
 
 @functools.cache
 def _warn(reason: str) -> None:
-    """Once for each reason."""
+    """Log the warning once for each reason."""
     _log.warning("a kernel could not be recorded and is traced at every call, which is slower: %s", reason)

@@ -1,11 +1,11 @@
-"""A renderer with known integrals and known gradients, in NumPy: what proves the methods without a path tracer.
+"""A NumPy renderer with known integrals and gradients, which tests methods without a path tracer.
 
 Pixel p, channel c of sensor s is the integral over u in [0, 1)² of
 
     f(u; θ) = b_pc + a_pc · θ̄ + g(θ)_pc (2 u₁ - 1) + h_pc (2 u₂ - 1),        g(θ) = noise · (a_pc · θ̄),
 
-with θ̄ all parameters flattened in key order. Its exact value is I = b + A θ̄, its gradient A; noise that grows with θ (g) and noise that
-does not (h) are shared or not between two states exactly as a path tracer's are.
+where θ̄ is the concatenation of all flattened parameters in the order of the keys. The exact image is I = b + A θ̄, its
+Jacobian A. Noise that scales with θ (g) and noise that does not (h) are shared between two states as in a path tracer.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest,
 
 @dataclass(frozen=True)
 class AnalyticPaths:
-    """The random numbers of a rendering, (pixels, channels, spp, 2), and how they are grouped."""
+    """Random numbers of a rendering, (pixels, channels, spp, 2), with the number of groups and the chosen pixels."""
 
     numbers: np.ndarray
     groups: int
@@ -33,7 +33,7 @@ class AnalyticPaths:
 
     @cached_property
     def centred(self) -> np.ndarray:
-        """(2, groups, pixels * channels): each group's mean of 2 u - 1, for both of its numbers."""
+        """Mean of 2 u - 1 over each group's samples, for both random numbers: (2, groups, pixels * channels)."""
         pixels, channels, spp, _ = self.numbers.shape
         parts = (2 * self.numbers - 1).reshape(pixels * channels, self.groups, spp // self.groups, 2)
         return parts.mean(axis=2).T
@@ -46,11 +46,14 @@ class AnalyticRenderer:
         values: {key: array}, the scene's own values.
         matrix: A, (height * width * 3, n) for n parameters in all, in the order of `values`.
         offset: b, (height, width, 3), or a number.
-        noise: share of A θ̄ that varies uniformly between -noise and noise, per sample.
-        grain: h, half-width of the noise that does not depend on θ, per sample.
+        noise: relative half-width of the multiplicative noise: a sample of A θ̄ varies uniformly by ± noise.
+        grain: h, half-width of the additive noise, which does not depend on θ, per sample.
         shape: (height, width) of the film.
-        sensors: how many sensors, all alike.
-        shares_paths: what `ParameterInfo.shares_paths` says of every parameter.
+        sensors: number of identical sensors.
+        shares_paths: `ParameterInfo.shares_paths` of every parameter.
+
+    Raises:
+        InputError: the matrix does not have the shape that values and film imply.
     """
 
     def __init__(
@@ -83,23 +86,23 @@ class AnalyticRenderer:
         return [self.shape] * self.sensors
 
     def array(self, values: np.ndarray) -> np.ndarray:
-        """A NumPy array in double precision."""
+        """Return a NumPy array in double precision."""
         return np.array(values, np.float64)
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> AnalyticRenderer:
-        """See `Renderer.prepare`. It holds no state, so it is a session itself."""
+        """Return the renderer itself, which is stateless and therefore its own session."""
         del derivatives
         for key in keys:
             if key not in self._values:
                 raise InputError(f"parameter {key}: the scene has none of that name")
             if space == "path" and not self.shares_paths:
-                raise InputError(f'parameter {key}: space="path" cannot carry it; use space="primary"')
+                raise InputError(f'parameter {key}: space="path" cannot share its paths; use space="primary"')
         return self
 
     def exact(self, parameters: Tree) -> np.ndarray:
-        """The exact image (H, W, 3)."""
+        """Return the exact image (H, W, 3)."""
         return (self.offset + self.matrix @ self._flat(parameters)).reshape(*self.shape, 3)
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
@@ -113,7 +116,7 @@ class AnalyticRenderer:
         return np.concatenate([self._images(state, paths) for state in states])
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`. Both spaces share the random numbers, which is all there is to share."""
+        """Render two states with the same random numbers, in either space."""
         del space
         paths = self._paths(request)
         return Rendering(self._images(current, paths), self._images(previous, paths), paths)
@@ -142,8 +145,8 @@ class AnalyticRenderer:
         samples = slopes * (1 + self.noise * (2 * paths.numbers[..., 0] - 1))
         shape = (*self.shape, 3) if paths.pixels is None else (len(paths.pixels), 3)
         squares = (samples**2).reshape(-1, 3, paths.groups, samples.shape[-1] // paths.groups).mean(axis=-1)
-        found = np.moveaxis(squares, -1, 0).reshape(paths.groups, *shape)
-        return found if paths.groups > 1 else found[0]
+        moments = np.moveaxis(squares, -1, 0).reshape(paths.groups, *shape)
+        return moments if paths.groups > 1 else moments[0]
 
     def _flat(self, parameters: Tree) -> np.ndarray:
         return np.concatenate([np.ravel(parameters.get(key, value)) for key, value in self._values.items()])
@@ -155,8 +158,8 @@ class AnalyticRenderer:
 
     def _paths(self, request: SampleRequest) -> AnalyticPaths:
         count = self.shape[0] * self.shape[1] if request.pixels is None else len(request.pixels)
-        drawn = count if request.positions is None else int(np.max(request.positions)) + 1
-        numbers = np.random.default_rng(request.seed).random((drawn, 3, request.spp, 2))
+        total = count if request.positions is None else int(np.max(request.positions)) + 1
+        numbers = np.random.default_rng(request.seed).random((total, 3, request.spp, 2))
         if request.positions is not None:
             numbers = numbers[request.positions]
         return AnalyticPaths(numbers, request.groups, request.pixels)

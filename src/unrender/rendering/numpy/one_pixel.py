@@ -14,13 +14,13 @@ from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Rendering, RenderSession, SampleRequest, Space
 
 RATE = "rate"
-"""The key of the parameter of `ExponentialRenderer`, λ."""
+"""Key of λ, the parameter of `ExponentialRenderer`."""
 POINT = "x"
-"""The key of the parameter of `QuadraticRenderer`."""
+"""Key of x, the parameter of `QuadraticRenderer`."""
 
 
 class _OnePixel:
-    """A renderer of one pixel and one parameter. It holds no state, so it is a session itself."""
+    """A renderer of one pixel and one parameter. It is stateless and therefore its own session."""
 
     key: ClassVar[str]
 
@@ -51,7 +51,7 @@ class _OnePixel:
 
 @dataclass(frozen=True)
 class ExponentialPaths:
-    """The samples of a rendering at λ = 1, (groups, *shape of a picture, samples of each)."""
+    """Samples of a rendering at λ = 1, (groups, *shape of a picture, samples per group)."""
 
     unit: np.ndarray
 
@@ -59,12 +59,12 @@ class ExponentialPaths:
 class ExponentialRenderer(_OnePixel):
     """The mean of an exponential distribution: the toy problem of Balint et al. 2023, Fig. 2.
 
-    A sample is x(u; λ) = −log(1 − u) / λ for a uniform u, so its mean is 1/λ, its variance 1/λ², its derivative −x/λ. All three channels
-    are equal.
+    A sample is x(u; λ) = −log(1 − u) / λ for a uniform u. Its mean is 1/λ, its variance 1/λ², its derivative −x/λ. All
+    three channels are equal.
 
     Args:
-        rate: its own λ, > 0.
-        lowest: the smallest λ that a descent may reach, > 0.
+        rate: the scene's own λ, > 0.
+        lowest: lower limit of λ in an optimisation, > 0.
     """
 
     key = RATE
@@ -90,7 +90,7 @@ class ExponentialRenderer(_OnePixel):
         return means[:, None, None, :]
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`. Both spaces share the random numbers, which is all there is to share."""
+        """Render two states with the same random numbers, in either space."""
         del space
         rendering = self.image(current, request)
         return Rendering(rendering.images, self._images(previous, rendering.paths), rendering.paths)
@@ -101,8 +101,8 @@ class ExponentialRenderer(_OnePixel):
 
     def tangent_moment(self, parameters: Tree, paths: ExponentialPaths, tangents: Tree) -> np.ndarray:
         slopes = paths.unit * float(tangents[RATE]) / float(parameters[RATE]) ** 2
-        found = np.repeat(np.mean(slopes**2, axis=-1)[..., None], 3, axis=-1)
-        return found if len(found) > 1 else found[0]
+        moments = np.repeat(np.mean(slopes**2, axis=-1)[..., None], 3, axis=-1)
+        return moments if len(moments) > 1 else moments[0]
 
     def _images(self, parameters: Tree, paths: ExponentialPaths) -> np.ndarray:
         means = paths.unit.mean(axis=-1) / float(parameters[RATE])
@@ -110,16 +110,18 @@ class ExponentialRenderer(_OnePixel):
 
 
 class QuadraticRenderer(_OnePixel):
-    """A quadratic form: with L2 against black, the loss is xᵀ A x, to the last digit.
+    """A quadratic form: the L2 loss against a black reference is exactly xᵀ A x.
 
-    The picture is linear, its channels J x with Jᵀ J = 3 A, since the loss is the mean over three channels. No noise: derivatives of
-    the loss are known in closed form, ∇ = 2 A x and ∇² = 2 A, and smoothing by a Gaussian only adds a constant, Σᵢ Aᵢᵢ σᵢ².
+    The picture is linear. Its channels are J x with Jᵀ J = 3 A, since the loss is the mean over three channels. There
+    is no noise. The derivatives of the loss are known in closed form, ∇ = 2 A x and ∇² = 2 A. Smoothing by a Gaussian
+    only adds the constant Σᵢ Aᵢᵢ σᵢ².
 
     Args:
-        matrix: A, (n, n) for n from 1 to 3, symmetric, no eigenvalue below 0.
-        point: its own x, (n,).
+        matrix: A, (n, n) for n from 1 to 3, symmetric, without negative eigenvalues.
+        point: the scene's own x, (n,).
 
-    Raises `InputError` where no picture has this form.
+    Raises:
+        InputError: the shapes do not match, or the matrix is not symmetric and positive semi-definite.
     """
 
     key = POINT
@@ -134,7 +136,7 @@ class QuadraticRenderer(_OnePixel):
         values, vectors = np.linalg.eigh(self.matrix)
         if not np.array_equal(self.matrix, self.matrix.T) or values[0] < -1e-9 * abs(values[-1]):
             raise InputError("matrix: must be symmetric and have no eigenvalue below 0")
-        # The symmetric root of 3 A; channels that x does not reach stay black.
+        # J is the symmetric square root of 3 A, padded with zero rows. The remaining channels are black.
         root = vectors * np.sqrt(3 * np.maximum(values, 0)) @ vectors.T
         self._jacobian = np.concatenate([root, np.zeros((3 - n, n))])
 
@@ -145,29 +147,24 @@ class QuadraticRenderer(_OnePixel):
         return {key: self._point.copy() for key in keys}
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`. Exact."""
         return Rendering(self._images(parameters, request), None, request)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
-        """See `RenderSession.image_batch`. Exact."""
         del request
         return (np.asarray(parameters[POINT]) @ self._jacobian.T)[:, None, None, :]
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`. Exact in both spaces."""
         del space
         return Rendering(self._images(current, request), self._images(previous, request), request)
 
     def adjoint(self, parameters: Tree, paths: Any, weights: np.ndarray) -> Tree:
-        """See `RenderSession.adjoint`. Exact."""
         del parameters, paths
         return {POINT: weights.reshape(len(weights), -1, 3).sum(axis=1).mean(axis=0) @ self._jacobian}
 
     def tangent_moment(self, parameters: Tree, paths: SampleRequest, tangents: Tree) -> np.ndarray:
-        """See `RenderSession.tangent_moment`. Exact."""
         del parameters
-        found = self._images(tangents, paths) ** 2
-        return found if paths.groups > 1 else found[0]
+        moments = self._images(tangents, paths) ** 2
+        return moments if paths.groups > 1 else moments[0]
 
     def _images(self, parameters: Tree, request: SampleRequest) -> np.ndarray:
         shape = (1, 1) if request.pixels is None else (len(request.pixels),)
