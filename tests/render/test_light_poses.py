@@ -144,7 +144,7 @@ def test_a_posed_light_beside_a_posed_shape(kind: str) -> None:
     [
         ("point", ["lamp.rotation"], "did you mean lamp.position"),
         ("point", ["lamp.position", "lamp.translation"], "lamp.position places the same object"),
-        ("spot", ["lamp.rotation", "lamp.rotation.y"], "stands for the same coordinate"),
+        ("spot", ["lamp.rotation", "lamp.rotation.y"], "sets the same coordinate"),
         ("cube", ["lamp.vertex_positions", "lamp.scale"], "lamp.vertex_positions places the same object"),
         ("envmap", ["lamp.translation"], "did you mean"),
         ("spot", ["lamp.to_world"], "its type AffineTransform4f has no derivatives"),

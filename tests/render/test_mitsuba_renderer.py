@@ -272,7 +272,7 @@ def test_a_value_that_a_plugin_refuses_is_an_input_error() -> None:
     session = made.renderer.prepare([key], None, False)
     first = session.image({key: mi.TensorXf([3.0], ())}, SampleRequest(0, 4, 1)).images[0].numpy()
     with pytest.raises(
-        ur.InputError, match=r"sky\.turbidity: Mitsuba refuses the value, give it bounds: .*out of range"
+        ur.InputError, match=r"sky\.turbidity: Mitsuba refuses the value; give the parameter bounds: .*out of range"
     ):
         session.image({key: mi.TensorXf([0.6], ())}, SampleRequest(0, 4, 1))
     refused = mi.TensorXf([0.6], ())

@@ -123,7 +123,7 @@ def test_hidden_emitters_beside_media_are_refused() -> None:
         "fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}},
         "lamp": {"type": "sphere", "emitter": {"type": "area"}},
     }
-    with pytest.raises(ur.InputError, match="hide_emitters does not go with participating media"):
+    with pytest.raises(ur.InputError, match="hide_emitters is not supported with participating media"):
         notices(scene)
 
 

@@ -155,10 +155,10 @@ def test_what_poses_refuse() -> None:
     assert "sky.rotation" not in known  # it looks the same from everywhere
     assert known["block.translation"].shape == (3,)
     assert known["block.scale"].shape == ()
-    with pytest.raises(ur.InputError, match=r"block\.rotation stands for the same coordinate"):
+    with pytest.raises(ur.InputError, match=r"block\.rotation sets the same coordinate"):
         renderer.prepare(["block.rotation", "block.rotation.y"], None, derivatives=False)
     assert known["block.rotation"].differentiable
-    for key, why in (("ball.rotation", "ball is no mesh"),):
+    for key, why in (("ball.rotation", "ball is not a mesh"),):
         with pytest.raises(ur.InputError, match=rf"cannot be recovered by path gradients.*{why}.*SmoothedDerivatives"):
             renderer.prepare([key], None)
     renderer.prepare(["block.rotation", "sensor.x_fov"], None, derivatives=False)  # the lens goes with poses

@@ -1,4 +1,4 @@
-"""Length, roulette and first segment of the light paths that a scene's integrator asks for."""
+"""Depth, Russian roulette and emitter visibility of the light paths that a scene's integrator asks for."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from unrender.core.errors import InputError
 from unrender.io import bounded_files, scene_files
 
 DEFAULT_DEPTH = 6
-"""Segments of the longest path where neither the user nor the scene gives a number."""
+"""Default maximum path length in segments, if neither the user nor the scene gives one."""
 LONGEST_DEPTH = 64
-"""Segments of the longest path where the scene's integrator has no limit."""
+"""Maximum path length in segments for a scene whose integrator has no limit."""
 _ROULETTE = 5
 
 _OF_SURFACES = ("PathIntegrator", "DirectIntegrator", "PRBIntegrator", "BasicPRBIntegrator")
@@ -31,7 +31,7 @@ _SAME = (
     "VolumetricMisPathIntegrator",
     "PRBVolpathIntegrator",
 )
-"""Integrators of the same light paths."""
+"""Integrators whose light paths equal those of this package."""
 _DIRECT = ("DirectIntegrator", "DirectProjectiveIntegrator")
 _NESTING = ("AOVIntegrator", "MomentIntegrator")
 _UNLIMITED = 2**31
@@ -43,9 +43,9 @@ class LightPaths:
     """Settings of the light paths.
 
     Attributes:
-        max_depth: longest path in segments, >= 1.
-        rr_depth: the depth from which roulette may end a path, >= 1.
-        hide_emitters: whether emitters are left out where the camera sees them.
+        max_depth: maximum path length in segments, >= 1.
+        rr_depth: depth from which Russian roulette may terminate a path, >= 1.
+        hide_emitters: whether emitters are invisible to camera rays.
         notices: one line for each setting of the scene that is not used.
     """
 
@@ -56,52 +56,52 @@ class LightPaths:
 
     @classmethod
     def of(cls, scene: mi.Scene, source: Path | dict, volumetric: bool, max_depth: int | None) -> LightPaths:
-        """The settings of a scene.
+        """Return the settings of a scene.
 
         Args:
-            scene: as loaded.
-            source: what was loaded.
+            scene: the loaded scene.
+            source: what the scene was loaded from.
             volumetric: whether it has participating media.
-            max_depth: in segments; None for the number of the scene's integrator.
+            max_depth: in segments; None for the value of the scene's integrator.
 
-        Raises `InputError` where emitters are hidden beside media.
+        Raises `InputError` if emitters are hidden in a scene with media.
         """
         integrator = scene.integrator()
         if integrator is None:
             return cls(max_depth or DEFAULT_DEPTH)
         kind, text = _light_transport(integrator)
-        given, own = max_depth, _depth(kind, text)
+        requested, own = max_depth, _depth(kind, text)
         if max_depth is None:
             max_depth = min(own or DEFAULT_DEPTH, LONGEST_DEPTH if own == _UNLIMITED else _UNLIMITED)
         hidden = bool(getattr(integrator, "hide_emitters", False)) or any(map(_is_true, _hidden(source)))
         if hidden and volumetric:
-            raise InputError("the scene's hide_emitters does not go with participating media here: leave it out")
-        notices = _notices(kind, own, given, max_depth, volumetric)
+            raise InputError("hide_emitters is not supported with participating media; leave it out")
+        notices = _notices(kind, own, requested, max_depth, volumetric)
         return cls(max_depth, max(1, _number("rr_depth", text) or _ROULETTE), hidden, notices)
 
 
-def _notices(kind: str, own: int | None, given: int | None, max_depth: int, volumetric: bool) -> tuple[str, ...]:
+def _notices(kind: str, own: int | None, requested: int | None, max_depth: int, volumetric: bool) -> tuple[str, ...]:
     depth = "" if own is None else f", max_depth {'unlimited' if own == _UNLIMITED else own}"
     if kind not in _SAME:
-        reason = "as max_depth says" if given is not None else "give max_depth for another number"
+        reason = "as max_depth says" if requested is not None else "give max_depth for another number"
         return (f"the scene's integrator ({kind}{depth}) is not used: paths have up to {max_depth} segments, {reason}",)
-    found = []
-    if given is not None and own != given:
-        found.append(
+    notices = []
+    if requested is not None and own != requested:
+        notices.append(
             f"the scene's integrator ({kind}{depth}) is not used: paths have up to {max_depth} segments, as max_depth says"
         )
-    if given is None and own == _UNLIMITED:
-        found.append(
+    if requested is None and own == _UNLIMITED:
+        notices.append(
             f"the scene's integrator ({kind}) has no limit of depth: paths have up to {max_depth} segments; "
             "give max_depth for another number"
         )
     if volumetric and kind in _OF_SURFACES:
-        found.append(f"the scene's integrator ({kind}) ignores participating media, which are rendered here")
-    return tuple(found)
+        notices.append(f"the scene's integrator ({kind}) ignores participating media, which are rendered here")
+    return tuple(notices)
 
 
 def _light_transport(integrator: Any) -> tuple[str, str]:
-    """The class and the description of what traces paths, in what is wrapped around it where that is so."""
+    """Return the class name and the description of the integrator that traces paths, unwrapped from a nesting integrator."""
     text = str(integrator)
     if type(integrator).__name__ in _NESTING or integrator.class_name() in _NESTING:
         _, _, inner = text.partition("integrators = [")
@@ -110,7 +110,7 @@ def _light_transport(integrator: Any) -> tuple[str, str]:
 
 
 def _depth(kind: str, text: str) -> int | None:
-    """Segments of the longest path; `_UNLIMITED` where there is no limit, None where it is not told."""
+    """Return the maximum path length in segments: `_UNLIMITED` without a limit, None if it is unknown."""
     if kind in _DIRECT:
         return 2
     depth = _number("max_depth", text)
@@ -123,7 +123,7 @@ def _number(name: str, text: str) -> int | None:
 
 
 def _hidden(source: Path | dict) -> Iterator[Any]:
-    """The values of `hide_emitters` in a description. Mitsuba's integrators do not tell theirs."""
+    """Yield the values of `hide_emitters` in a description. Mitsuba's integrators do not expose theirs."""
     if isinstance(source, Mapping):
         for key, value in source.items():
             if key == "hide_emitters":

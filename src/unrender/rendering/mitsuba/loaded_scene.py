@@ -1,7 +1,7 @@
-"""A scene in memory, which of its parameters were set, and the leaves of the derivative graph that they are.
+"""A loaded scene, the values that its parameters were set to, and their leaves of the derivative graph.
 
-A call through a pointer sees all objects of its kind in the process, whichever scene they belong to. So recorded kernels must be handed
-every loaded scene, and forward differentiation must find no other one attached: the registry of this module knows them all.
+A virtual call sees all objects of its kind in the process, whichever scene they belong to. Recorded kernels therefore need every loaded
+scene as an input, and forward differentiation needs all other scenes detached. The registry of this module tracks them.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from unrender.rendering.renderer import ReplacedMesh
 
 
 class _Registry:
-    """All loaded scenes of this process, held weakly, in the order of loading.
+    """Weak references to all loaded scenes of this process, in the order of loading.
 
     Attributes:
-        any_died: whether one died since the last `collect`: its Mitsuba objects may live on in reference cycles.
+        any_died: whether one died since the last `collect`. Its Mitsuba objects may still live in reference cycles.
         any_tangents: whether any has ever had tangents.
         any_new: whether one was loaded since the last `share_addresses`.
     """
@@ -66,7 +66,7 @@ class _Registry:
         return [scene for reference in list(self._scenes.values()) if (scene := reference()) is not None]
 
     def collect(self) -> None:
-        """Free what dead scenes have left, which calls through pointers would still see."""
+        """Free the objects of dead scenes, which virtual calls would still see."""
         if self.any_died:
             gc.collect()
             self.any_died = False
@@ -76,22 +76,23 @@ _registry = _Registry()
 
 
 def loaded_scenes() -> list[LoadedScene]:
-    """All of this process, in the order of loading."""
+    """Return all loaded scenes of this process, in the order of loading."""
     return _registry.scenes()
 
 
 def detach_all() -> None:
-    """Keep the values of all scenes, and cut them from the derivative graph, if any has ever had tangents."""
+    """Detach all scenes from the derivative graph, if any has ever had tangents. Their values do not change."""
     if _registry.any_tangents:
         for scene in loaded_scenes():
             scene.detach()
 
 
 def share_addresses(others: Sequence[mi.Scene] = ()) -> None:
-    """Have scenes that were loaded since the last call, and `others`, share what they would share after the first replay of a recording.
+    """Make scenes loaded since the last call, and `others`, share the variables that they would share after the first replay of a
+    recording.
 
-    On a CPU, each scene holds the addresses of Embree's functions in variables of its own. A replay takes equal addresses for one variable
-    and hands that to all scenes, which is another input to every recording: all would be recorded anew in the midst of a run.
+    On a CPU, each scene holds the addresses of Embree's functions in its own variables. A replay merges equal addresses into one
+    variable and assigns it to all scenes. This changes the input of every recording, so all would be recorded again during a run.
     """
     scenes = [*(loaded.scene for loaded in loaded_scenes()), *others]
     if (others or _registry.any_new) and len(scenes) > 1:
@@ -106,39 +107,45 @@ def _nothing() -> None:
 
 
 _OF_MITSUBA = re.compile(r"\[\w+\.(h|cpp):\d+\]")
-"""Where a plugin threw: its errors begin so, those of Dr.Jit, such as that there is no memory left, do not."""
+"""Prefix of exceptions that a Mitsuba plugin throws. Dr.Jit's errors, such as out of memory, do not have it."""
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """What a parameter was set to: a reference of its own to the value's memory, whether as a leaf, and whether a new leaf must
-    replace it at the next setting, since its tangents were carried on."""
+    """A value that a parameter was set to.
+
+    Attributes:
+        value: the value, with its own reference to the memory.
+        attached: whether it was set as a leaf of the derivative graph.
+        spent: whether the next setting must replace the leaf, since its tangents were propagated.
+    """
 
     value: mi.TensorXf
     attached: bool
     spent: bool = False
 
     def is_of(self, value: mi.TensorXf, attached: bool) -> bool:
-        """Whether nothing would change: the same memory, which nobody can have written to since it is referenced here."""
+        """Return whether setting `value` would change nothing: it has the same memory, which cannot be overwritten while it is
+        referenced here."""
         same = self.value.array.index == value.array.index and self.value.shape == value.shape
         return same and self.attached == attached and not self.spent
 
 
 class LoadedScene:
-    """One load of a scene description. Owns what changes in it; but of a scene that the user has loaded, others may change it too.
+    """One load of a scene description. It owns its state, except for a scene object that the user has loaded and may change as well.
 
     Args:
         description: what to load.
-        moving: ids of shapes that move; the spheres among them become meshes.
-        replaced: {id of a shape: what its mesh is to be}.
+        moving: ids of shapes that move; spheres among them become meshes.
+        replaced: {id of a shape: its new mesh}.
 
     Attributes:
-        scene: as Mitsuba has it.
-        source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps that it holds.
+        scene: the `mitsuba.Scene`.
+        source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps.
         equal: names of objects that are equal (`equal_objects`).
-        meshed: ids of spheres that have become meshes.
-        readers: which slots read the parameters' values.
-        parameters: of that scene. Write to them through `set_parameters` alone.
+        meshed: ids of spheres that became meshes.
+        readers: slots that read the parameters' values.
+        parameters: parameters of the scene. Write to them through `set_parameters` only.
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
     """
 
@@ -155,10 +162,10 @@ class LoadedScene:
             self.scene, self.meshed = meshed(self.scene, moving)
         replace_meshes(self.scene, replaced or {})
         self.graph = ObjectGraph(self.scene)
-        if why := refusal(self.scene, self.graph.nodes):
+        if reason := refusal(self.scene, self.graph.nodes):
             del self.scene, self.graph
-            gc.collect()  # what lives on would be called from other scenes' kernels
-            raise InputError(f"scene: {why}")
+            gc.collect()  # remaining objects would be called from other scenes' kernels
+            raise InputError(f"scene: {reason}")
         self.readers = SlotReaders(self.graph.slots)
         _make_distributions(self.scene)
         self.parameters: mi.SceneParameters = self.graph.parameters()
@@ -172,15 +179,15 @@ class LoadedScene:
         self._own |= self.poses.loaded()
         self._settings: dict[str, _Setting] = {}
         self._posed: dict[str, Any] = {}
-        self._held: dict[str, Any] = {}  # as the scene has them after an update; a texture keeps a copy
+        self._held: dict[str, Any] = {}  # the scene's own arrays after an update, since a texture stores a copy
         _registry.add(self)
 
     def value(self, key: str) -> mi.TensorXf:
-        """The scene's own value of a parameter, as loaded."""
+        """Return the scene's own value of a parameter, as loaded."""
         return to_tensor(self._own[key] if key in self._own else self.parameters[key])
 
     def share_values(self, other: LoadedScene) -> None:
-        """Keep the large arrays that another load of the description has as its own values in place of equal ones."""
+        """Replace own large arrays by equal ones of another load of the description, to save memory."""
         for key, value in self._own.items():
             known = other._own.get(key)
             if (
@@ -193,24 +200,24 @@ class LoadedScene:
                 self._own[key] = known
 
     def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Of the parameters that are set."""
+        """Return the shapes of the parameters that are set."""
         return tuple(tuple(setting.value.shape) for setting in self._settings.values())
 
     def set_parameters(self, values: Tree, attached: AbstractSet[str] = frozenset()) -> None:
-        """Give these parameters these values and all others the scene's own. Nothing happens where that is so already.
+        """Set these parameters to these values and all others to the scene's own. Nothing happens if this is already the case.
 
         Args:
             values: {key: `mi.TensorXf`}.
-            attached: those that are leaves of the derivative graph.
+            attached: keys of the parameters that are leaves of the derivative graph.
         """
         unset = [key for key in self._settings if key not in values]
         self._restore(unset)
         changed = [key for key, value in values.items() if not self._is_set(key, value, key in attached)]
-        # Where others change the scene between two passes, leaves are made anew within the backward pass of an operation of theirs:
-        # then all of them, since Dr.Jit (1.5) loses the gradients of leaves of which some were made within it and some before.
+        # If the user changes a shared scene between two passes, leaves are created within the backward pass of a custom operation.
+        # Then all are created: Dr.Jit 1.5 loses gradients if some leaves were created within it and some before.
         for key in values if self._shared and attached and changed else changed:
             value = values[key]
-            # What the scene holds already, Mitsuba would not set again: a copy.
+            # Mitsuba ignores an assignment of the array that the scene already holds, so assign a copy.
             leaf = from_tensor(value if key in changed else _copy(value), self._own[key])
             self.leaves.pop(key, None)
             if key in attached:
@@ -225,7 +232,7 @@ class LoadedScene:
         if plain:
             self._update(plain)
             self._hold({key: self.leaves.get(key, self._settings[key].value) for key in plain})
-        # Where one pose of a target is unset, the target was put back, and its other poses are written again.
+        # Unsetting one pose of a target restores the target, so its other poses have to be written again.
         if self._posed and any(key in self.poses for key in (*changed, *unset)):
             self.poses.write(self.parameters, self._posed)
         if changed and self._shared:
@@ -233,7 +240,7 @@ class LoadedScene:
             self._held = {key: _reference(dr.detach(self.parameters[key])) for key in held}
 
     def _update(self, changed: Sequence[str]) -> None:
-        """Have the scene take what was written. Raises `InputError` where a plugin of Mitsuba's refuses it."""
+        """Propagate the written values in the scene. Raise `InputError` if a Mitsuba plugin refuses them."""
         try:
             with _without_warnings():
                 self.parameters.update()
@@ -241,10 +248,10 @@ class LoadedScene:
         except RuntimeError as error:
             if not _OF_MITSUBA.search(str(error)):
                 raise
-            for key in changed:  # what the scene holds now is not what it shows
+            for key in changed:  # the scene's state is inconsistent with these values
                 self._settings[key] = replace(self._settings[key], spent=True)
             raise InputError(
-                f"{', '.join(changed)}: Mitsuba refuses the value, give it bounds: {reason_of(error, 200)}"
+                f"{', '.join(changed)}: Mitsuba refuses the value; give the parameter bounds: {reason_of(error, 200)}"
             ) from error
 
     def _notify(self, keys: Iterable[str]) -> None:
@@ -253,7 +260,7 @@ class LoadedScene:
             self.graph.notify_other_owners(node)
 
     def _is_set(self, key: str, value: mi.TensorXf, attached: bool) -> bool:
-        """Whether the parameter was set to this, and the scene still holds it."""
+        """Return whether the parameter was set to this value and the scene still holds it."""
         if key not in self._settings or not self._settings[key].is_of(value, attached):
             return False
         if not self._shared or key in self.poses:
@@ -274,7 +281,7 @@ class LoadedScene:
                 self.parameters[key] = _reference(self._own[key])
         self.parameters.update()
         self._notify(keys)
-        # A mesh whose vertices were set computes its normals anew, also where it was loaded with others.
+        # A mesh recomputes its normals when its vertices are set, even if it was loaded with other normals.
         written = [name for key in keys for name in self.poses.written(key)]
         normals = [name for name in map(normals_key, written) if name in self._own and name not in self._settings]
         for name in normals:
@@ -283,39 +290,43 @@ class LoadedScene:
             self.parameters.update()
 
     def _hold(self, values: Mapping[str, Any]) -> None:
-        """Have bitmaps and grids hold these values, which they were set to, themselves. They keep two copies: one with channels padded to a
-        power of two, which kernels read, and one as it was given, which they make anew from the padded one whenever somebody asks."""
+        """Make bitmaps and grids hold the arrays that they were set to, instead of copies.
+
+        Mitsuba stores two copies: one with channels padded to a power of two for kernels, and an unpadded one, which it recomputes from
+        the padded one at each access.
+        """
         if self._shared:
             return
         for key, value in values.items():
             held: Any = self.parameters[key]
             if dr.is_tensor_v(value) and dr.is_tensor_v(held) and _index(held) != _index(value):
                 self.parameters[key] = type(held)(value)
-        # Nothing has changed.
+        # The values are equal, so nothing needs an update.
         self.parameters.nodes_to_update.clear()
         self.parameters.update_candidates.clear()
 
     def detach(self) -> None:
-        """Keep the values, and cut them from the derivative graph."""
+        """Detach the parameters from the derivative graph. Their values do not change."""
         if self.leaves:
             self.set_parameters({key: setting.value for key, setting in self._settings.items()})
 
     def clear_gradients(self) -> None:
-        """Forget the gradients of all leaves."""
+        """Clear the gradients of all leaves."""
         for leaf in self.leaves.values():
             dr.clear_grad(leaf)
 
     def take_gradients(self) -> Tree:
-        """The gradients of all leaves, as tensors, evaluated. The leaves keep none: those of large arrays would wait for the next pass."""
-        found = {key: to_tensor(dr.grad(leaf)) for key, leaf in self.leaves.items()}
-        dr.eval(found)
+        """Return the gradients of all leaves as evaluated tensors, and clear them to free the memory of large arrays."""
+        gradients = {key: to_tensor(dr.grad(leaf)) for key, leaf in self.leaves.items()}
+        dr.eval(gradients)
         self.clear_gradients()
-        return found
+        return gradients
 
     def set_tangents(self, values: Tree, tangents: Tree, attached: AbstractSet[str]) -> None:
-        """Give these parameters these values, and carry the tangents of those `attached` to all that the scene computes from them.
+        """Set these parameters to these values, and propagate the tangents of those `attached` to everything that the scene computes
+        from them.
 
-        Afterwards what the scene holds has tangents, no way leads back to the leaves, and every other scene of the process is detached.
+        Afterwards the scene's state has tangents without edges to the leaves, and every other scene of the process is detached.
         """
         _registry.collect()
         _registry.any_tangents = True
@@ -339,9 +350,9 @@ class LoadedScene:
 
 
 def _make_distributions(scene: mi.Scene) -> None:
-    """Have lights with textures make the distributions of their texels, which they make at their first sample and keep up to date.
+    """Make textured emitters build the distributions of their texels, which they otherwise build at their first sample.
 
-    Made within a kernel that is recorded, they are none of its inputs, and Dr.Jit refuses to record it.
+    A distribution that is built within a recorded kernel is not one of its inputs, and Dr.Jit refuses to record the kernel.
     """
     somewhere = dr.zeros(mi.Interaction3f)
     for emitter in scene.emitters():
@@ -351,7 +362,7 @@ def _make_distributions(scene: mi.Scene) -> None:
 
 @contextlib.contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Mitsuba describes each mesh that is no manifold whenever its vertices are set; problems have a line for it."""
+    """Silence Mitsuba, which reports every non-manifold mesh whenever its vertices are set. Problems have their own notice for it."""
     before = mi.log_level()
     mi.set_log_level(mi.LogLevel.Error)
     try:
@@ -361,7 +372,7 @@ def _without_warnings() -> Iterator[None]:
 
 
 def _index(value: Any) -> tuple[int, ...]:
-    """The variables that an array is made of."""
+    """Return the indices of the Dr.Jit variables of an array."""
     value = dr.detach(value)
     if dr.is_tensor_v(value):
         return (value.array.index,)
@@ -377,12 +388,12 @@ def _is_array(value: Any) -> bool:
 
 
 def _copy(value: mi.TensorXf) -> mi.TensorXf:
-    """The same numbers in other memory."""
+    """Return the same values in different memory."""
     copied = mi.TensorXf(value.array * dr.opaque(mi.Float, 1), tuple(value.shape))
     dr.eval(copied)
     return copied
 
 
 def _reference(value: Any) -> Any:
-    """Another reference to the same memory."""
+    """Return another reference to the same memory."""
     return type(value)(value)

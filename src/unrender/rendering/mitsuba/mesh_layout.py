@@ -1,9 +1,9 @@
-"""The one place that knows how Mitsuba lays out a mesh.
+"""The only module that depends on Mitsuba's mesh layout.
 
-Up to Mitsuba 3.9 a mesh has flat arrays: `vertex_positions` (3 V,), `vertex_normals` (3 V,), `vertex_texcoords` (2 V,) and `faces` (3 F,).
-From 3.10 on it has tensors: `positions` (P, 3), `normals` (N, 3), `texcoords` (V, 2) and `faces` (F, 3), with maps from vertices to
-positions and normals, so that vertices on both sides of a seam share a position. In this package keys and values are those of 3.9:
-`parameters` and `traverse` translate both, and the functions below read what a mesh has.
+Up to Mitsuba 3.9 a mesh has flat arrays: `vertex_positions` (3 V,), `vertex_normals` (3 V,), `vertex_texcoords` (2 V,) and `faces` (3
+F,). From 3.10 on it has tensors: `positions` (P, 3), `normals` (N, 3), `texcoords` (V, 2) and `faces` (F, 3), with maps from vertices
+to positions and normals, so that vertices on both sides of a seam share a position. This package uses the keys and values of 3.9:
+`parameters` and `traverse` translate both, and the functions below read a mesh of either layout.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 _RENAMED = {"positions": POSITIONS, "normals": NORMALS, "texcoords": TEXCOORDS}
-"""{name from Mitsuba 3.10 on: name here}."""
+"""{name from Mitsuba 3.10 on: name in this package}."""
 
 
 def _has_tensors(mesh: Any) -> bool:
@@ -48,15 +48,15 @@ def _has_tensors(mesh: Any) -> bool:
 
 def traverse(node: Any) -> Any:
     """Return `mitsuba.traverse(node)` with the names and flat arrays of this package."""
-    found: Any = mi.traverse(node)
-    return parameters(found.properties, found.hierarchy)
+    params: Any = mi.traverse(node)
+    return parameters(params.properties, params.hierarchy)
 
 
 def parameters(properties: dict[str, Any], hierarchy: dict[Any, Any]) -> Any:
     """Return the `mitsuba.SceneParameters` of traversed objects, with the names and flat arrays of this package.
 
     Args:
-        properties, hierarchy: of `mitsuba.SceneParameters`.
+        properties, hierarchy: attributes of a `mitsuba.SceneParameters`.
     """
     named: dict[Any, set[str]] = {}
     for key, entry in properties.items():
@@ -67,7 +67,7 @@ def parameters(properties: dict[str, Any], hierarchy: dict[Any, Any]) -> Any:
 
 @cache
 def _flat(_variant: str) -> type:
-    """Return the class for the layout of Mitsuba 3.10: its base class exists only under a variant."""
+    """Return the class for the layout of Mitsuba 3.10. It is created per variant, since its base class depends on the variant."""
 
     class FlatMeshes(mi.SceneParameters):
         """Scene parameters in which the tensors of meshes are flat arrays."""
@@ -95,7 +95,7 @@ def _flat(_variant: str) -> type:
             super().__setitem__(key, value)
 
         def set_dirty(self, key: str) -> Any:
-            """Mark a parameter as changed, to the mesh by the mesh's own name."""
+            """Mark a parameter as changed, under the mesh's original name."""
             entry = super().set_dirty(key)
             if key in self.originals:
                 node = entry[2]
@@ -114,17 +114,17 @@ def _flat(_variant: str) -> type:
 
 
 def positions(mesh: Any) -> Any:
-    """Return the positions of a mesh, flat, `mi.Float` (3 P,), with their derivatives."""
+    """Return the positions of a mesh, flat, `mi.Float` (3 P,), attached to the derivative graph."""
     return mi.Float(mesh.positions().array if _has_tensors(mesh) else mesh.vertex_positions_buffer())
 
 
 def faces(mesh: Any) -> Any:
-    """Return the numbers of the positions that each triangle joins, flat, `mi.UInt32` (3 F,)."""
+    """Return the position indices of each triangle, flat, `mi.UInt32` (3 F,)."""
     return mi.UInt32(mesh.geometric_faces().array if _has_tensors(mesh) else mesh.faces_buffer())
 
 
 def at_vertices(mesh: Any, points: np.ndarray) -> np.ndarray:
-    """Return the position of each vertex, (V, 3), for positions (P, 3): vertices on both sides of a seam may share one."""
+    """Return the position of each vertex, (V, 3), from positions (P, 3). Vertices on both sides of a seam may share one."""
     index = np.array(mesh.position_index()) if _has_tensors(mesh) else np.zeros(0, np.uint32)
     return points[index] if index.size else points
 
@@ -162,21 +162,21 @@ def build(
     """Return a new mesh with smooth normals.
 
     Args:
-        name: for messages. The id is left to the scene's description: two objects may hold meshes of one name.
+        name: name for messages. The id is set by the scene's description, since two objects may hold meshes of one name.
         points: (V, 3).
-        triangles: (F, 3), numbers of vertices.
+        triangles: vertex indices, (F, 3).
         normals: (V, 3); None for those that Mitsuba computes.
         texcoords: (V, 2); None for none.
-        bsdf: `mitsuba.BSDF`; None for Mitsuba's own.
+        bsdf: `mitsuba.BSDF`; None for Mitsuba's default.
     """
-    given = {
+    arrays = {
         POSITIONS: np.ascontiguousarray(points, np.float32),
         NORMALS: None if normals is None else np.ascontiguousarray(normals, np.float32),
         TEXCOORDS: None if texcoords is None else np.ascontiguousarray(texcoords, np.float32),
     }
     corners = np.ascontiguousarray(triangles, np.uint32)
     if _has_tensors(mi.Mesh):
-        tensors = {new: mi.TensorXf(given[old]) for new, old in _RENAMED.items() if given[old] is not None}
+        tensors = {new: mi.TensorXf(arrays[old]) for new, old in _RENAMED.items() if arrays[old] is not None}
         mesh: Any = mi.Mesh(name, faces=mi.TensorXu(corners), **tensors)  # pyright: ignore[reportCallIssue]
         if bsdf is not None:
             mesh.set_bsdf(bsdf)
@@ -188,15 +188,15 @@ def build(
         mesh = mi.Mesh(
             name, len(points), len(corners), properties, has_vertex_normals=True, has_vertex_texcoords=textured
         )
-        _fill(mesh, {FACES: corners, POSITIONS: given[POSITIONS], TEXCOORDS: given[TEXCOORDS]})
-        # In a second update: Mitsuba computes normals anew whenever positions change.
-        _fill(mesh, {NORMALS: given[NORMALS]})
+        _fill(mesh, {FACES: corners, POSITIONS: arrays[POSITIONS], TEXCOORDS: arrays[TEXCOORDS]})
+        # Normals need a second update: Mitsuba recomputes them whenever positions change.
+        _fill(mesh, {NORMALS: arrays[NORMALS]})
     return mesh
 
 
 def _fill(mesh: Any, values: Mapping[str, np.ndarray | None]) -> None:
-    found: Any = mi.traverse(mesh)
+    params: Any = mi.traverse(mesh)
     for name, value in values.items():
         if value is not None:
-            found[name] = (mi.UInt32 if name == FACES else mi.Float)(value.ravel())
-    found.update()
+            params[name] = (mi.UInt32 if name == FACES else mi.Float)(value.ravel())
+    params.update()

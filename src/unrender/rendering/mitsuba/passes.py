@@ -1,6 +1,6 @@
-"""The launches that answer a sample request, one class each: which scene is traced, with which tables, and what for.
+"""Kernel launches that serve a sample request, one class each: the traced scene, its tables, and the result.
 
-A pass makes the function that is recorded. Its arguments after the first seven are the pass's own, see `trace`.
+A pass builds the function that is recorded. Its arguments after the first seven belong to the pass, see `trace`.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
 Rays = list[tuple[Any, Any]]
-"""(`mi.Ray3f`, `mi.Spectrum`): camera rays and their weights, of each state that is traced."""
+"""(`mi.Ray3f`, `mi.Spectrum`): camera rays and their weights, for each traced state."""
 
 
 @dataclass(frozen=True)
 class LaunchSize:
-    """What a kernel is compiled for.
+    """Constants that a kernel is compiled for.
 
     Attributes:
-        sensor: its index; of no account where each pixel has its own.
+        sensor: index of the sensor; ignored if each pixel has its own.
         spp: samples per pixel.
-        pixels: how many.
-        hiding: whether emitters are left out where the camera sees them.
+        pixels: number of pixels.
+        hiding: whether emitters are invisible to camera rays.
     """
 
     sensor: int
@@ -45,37 +45,37 @@ class Pass(ABC):
 
     previous: bool = False  # whether the previous scene is traced
     pair: ClassVar[bool] = False  # whether both states share the paths
-    needs_tangents: ClassVar[bool] = False  # whether what the scene holds has tangents, which are an input
+    needs_tangents: ClassVar[bool] = False  # whether the scene's state has tangents, which are an input
 
     def scene(self, pair: ScenePair) -> Any:
-        """What is handed to the kernel as the scene."""
+        """Return the scene argument of the kernel."""
         return pair.loaded(self.previous).scene
 
     def states(self, pair: ScenePair) -> tuple[mi.Scene, ...]:
-        """The scenes that camera rays are made for."""
+        """Return the scenes whose sensors generate camera rays."""
         return (pair.loaded(self.previous).scene,)
 
     def numbers(self, sampler: mi.Sampler, size: LaunchSize, positions: mi.UInt32 | None) -> Any:
-        """Where the random numbers come from, yet to be seeded."""
-        # A sampler that is seeded already would die, and free memory, while the next kernel is recorded: clone one.
+        """Return the unseeded sampler."""
+        # Clone the sampler: a seeded one would be destroyed, and free memory, while the next kernel is recorded.
         return sampler.clone() if positions is None else film.sampler_at(positions, size.spp, size.pixels)
 
     def camera_rays(
         self, pair: ScenePair, sampler: mi.Sampler, size: LaunchSize, seeds: Any, pixels: Any, films: Any
     ) -> Rays:
-        """The camera rays that `function` takes, made outside of it. Arguments: see `function`."""
+        """Return the camera rays that `function` accepts, generated outside of it. For the arguments, see `function`."""
         seed, positions = seeds
-        found = []
+        result = []
         with dr.suspend_grad():
             for scene in self.states(pair):
                 numbers = self.numbers(sampler, size, positions)
                 samples = _camera_samples(scene, numbers, size, seed, pixels, films)
                 ray, weight = film.rays(samples, scene if size.hiding else None)
-                found.append((mi.Ray3f(ray), weight))
-        return found
+                result.append((mi.Ray3f(ray), weight))
+        return result
 
     def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
-        """The tables that the kernel looks up; `sensor`: None where each pixel has its own."""
+        """Return the tables that the kernel looks up. `sensor` is None if each pixel has its own."""
         tables = self._surface_tables(pair, delta)
         if pair.volumetric:
             tables = {**tables, **pair.media(self.previous, sensor), **pair.majorants(self.previous, self.pair)}
@@ -87,14 +87,15 @@ class Pass(ABC):
     def function(
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
-        """What is recorded: of the scene, all loaded scenes, tables, the seed with each pixel's position or None, pixels or None, the
-        films (None for one sensor with a box filter), `camera_rays` or None to make them, and the pass's own arrays.
+        """Return the function to record.
 
-        With `posed`, what is handed as the scene is its `scenes()` and its `numbers()` of one pose, raveled.
+        Its arguments are the scene, all loaded scenes, the tables, (the seed, each pixel's position or None), pixels or None, the films
+        (None for one sensor with a box filter), `camera_rays` or None to generate them, and the pass's own arrays. With `posed`, the
+        scene argument consists of its `scenes()` and its raveled `numbers()` of one pose.
         """
 
         def launch(scene, loaded, tables, seeds, pixels, films, rays, *own):
-            del loaded  # read through pointers, if at all
+            del loaded  # accessed by virtual calls only
             assembly = None
             if posed is not None:
                 scenes, numbers_of_pose = scene
@@ -103,10 +104,10 @@ class Pass(ABC):
             seed, positions = seeds
             numbers = self.numbers(sampler, size, positions)
             with dr.suspend_grad():
-                # Also where the rays are given: paths go on with the numbers after these.
+                # Required even for precomputed rays, since it advances the sampler to the paths' numbers.
                 samples = _camera_samples(scene, numbers, size, seed, pixels, films)
-                made = film.rays(samples, scene if size.hiding else None) if rays is None else rays[0]
-                ray, ray_weight = mi.Ray3f(made[0]) if rays else made[0], made[1]
+                generated = film.rays(samples, scene if size.hiding else None) if rays is None else rays[0]
+                ray, ray_weight = mi.Ray3f(generated[0]) if rays else generated[0], generated[1]
                 if assembly is not None:
                     ray = _posed_rays(assembly, ray, size, films)
                 if films is not None and films.which is not None and "camera" in tables:
@@ -122,15 +123,15 @@ class Pass(ABC):
         """Trace the camera rays.
 
         Args:
-            paths: those that begin on the rays.
-            size: what the kernel is compiled for.
+            paths: paths that begin on the rays.
+            size: constants that the kernel is compiled for.
             own: the pass's own arrays.
         """
 
 
 @dataclass(frozen=True)
 class ImagePass(Pass):
-    """One state's radiance per lane."""
+    """Radiance of one state per lane."""
 
     previous: bool = False
 
@@ -138,13 +139,13 @@ class ImagePass(Pass):
         return {}
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """The radiance of each lane."""
+        """Return the radiance of each lane."""
         return paths.radiance()[0]
 
 
 @dataclass(frozen=True)
 class ImagePairPass(Pass):
-    """Both states' radiance per lane, on the current state's paths."""
+    """Radiance of both states per lane, on the current state's paths."""
 
     pair: ClassVar[bool] = True
 
@@ -152,17 +153,17 @@ class ImagePairPass(Pass):
         return {**pair.tables(), "delta": delta}
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """The radiance of each lane, of the current and of the previous state."""
+        """Return the radiance of each lane for the current and the previous state."""
         return paths.radiance()
 
 
 @dataclass(frozen=True)
 class MovedPairPass(Pass):
-    """Both states' radiance per lane where shapes move, on related paths.
+    """Radiance of both states per lane on related paths, for moving shapes.
 
     Attributes:
         moving: ids of the meshes that move.
-        tracer: what traces both.
+        tracer: tracer of related paths.
         still_sensors: whether both states have the same sensors.
     """
 
@@ -171,61 +172,61 @@ class MovedPairPass(Pass):
     still_sensors: bool
 
     def scene(self, pair: ScenePair) -> Any:
-        """Both."""
+        """Return both scenes."""
         return pair.current, pair.previous
 
     def states(self, pair: ScenePair) -> tuple[mi.Scene, ...]:
-        """Both, or one where both have the same sensors."""
+        """Return both scenes, or one if both have the same sensors."""
         return (pair.current,) if self.still_sensors else (pair.current, pair.previous)
 
     def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
-        """See `MovedPair.sample`."""
+        """Return the tables of `MovedPair.sample`."""
         return pair.moved_tables(self.moving)
 
     def function(
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
-        """See `Pass.function`. Each state has the rays of its own sensors; the kernel is its own."""
+        """Return the function to record. Each state has the rays of its own sensors, and `tracer` replaces the kernel."""
         del kernel, posed
 
         def launch(scenes, loaded, tables, seeds, pixels, films, rays):
             del loaded
             seed, positions = seeds
             with dr.suspend_grad():
-                made: list[tuple[Any, Any]] = []
-                for state, scene in enumerate(scenes[: 1 if self.still_sensors else 2]):  # equal numbers
+                generated: list[tuple[Any, Any]] = []
+                for state, scene in enumerate(scenes[: 1 if self.still_sensors else 2]):  # equal random numbers
                     numbers: Any = self.numbers(sampler, size, positions)
                     samples = _camera_samples(scene, numbers, size, seed, pixels, films)
-                    made.append(film.rays(samples) if rays is None else rays[state])
+                    generated.append(film.rays(samples) if rays is None else rays[state])
                 choices = film.independent(numbers, size.pixels * size.spp)
-                found = self.tracer.sample(scenes, tables, numbers, choices, (made[0][0], made[-1][0]))
-                return dropped_together(found[0] * made[0][1], found[1] * made[-1][1])
+                radiance = self.tracer.sample(scenes, tables, numbers, choices, (generated[0][0], generated[-1][0]))
+                return dropped_together(radiance[0] * generated[0][1], radiance[1] * generated[-1][1])
 
         return launch
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Never called: `function` traces both."""
+        """Raise `NotImplementedError`: `function` traces both states."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class AdjointPass(Pass):
-    """One state's path replay backward: accumulates the gradients of its leaves."""
+    """Backward path replay of one state, which accumulates the gradients of its leaves."""
 
     previous: bool = False
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> None:
-        """`own`: the radiance that the primal pass returned, and the film's weights."""
+        """Replay the paths backward. `own`: radiance of the primal pass, and the film's weights."""
         radiance, weights = own
         paths.backward((film.film_adjoint(weights, size.spp, size.pixels), radiance))
 
 
 @dataclass(frozen=True)
 class AdjointPairPass(Pass):
-    """Both states' path replay backward, on the current state's paths.
+    """Backward path replay of both states, on the current state's paths.
 
     Attributes:
-        both: whether the previous state's leaves get gradients, too.
+        both: whether the previous state's leaves accumulate gradients as well.
     """
 
     both: bool = True
@@ -235,7 +236,8 @@ class AdjointPairPass(Pass):
         return {**pair.tables(), "delta": delta}
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> None:
-        """`own`: as for `AdjointPass`, of the current and then of the previous state, whose weights are left out unless `both`."""
+        """Replay the paths backward. `own`: radiance and weights of the current, then of the previous state, without its weights unless
+        `both`."""
         radiance, weights, radianceₚ, *rest = own
         δL = film.film_adjoint(weights, size.spp, size.pixels)
         δLₚ = film.film_adjoint(rest[0], size.spp, size.pixels) if self.both else None
@@ -244,56 +246,62 @@ class AdjointPairPass(Pass):
 
 @dataclass(frozen=True)
 class TangentPass(Pass):
-    """Path replay forward: the squared derivative of each lane's radiance along the tangents, of each channel or of their sum by the
-    weights `combined`."""
+    """Forward path replay: the squared derivative of each lane's radiance along the tangents.
+
+    Attributes:
+        combined: channel weights of a sum that is squared in place of each channel; None to square each channel.
+    """
 
     combined: tuple[float, ...] | None = None
     needs_tangents: ClassVar[bool] = True
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """`own`: the radiance that the primal pass returned."""
+        """Return the squared derivative of each lane. `own`: radiance of the primal pass."""
         (radiance,) = own
-        found = paths.forward(radiance)
-        return dr.square(found if self.combined is None else mi.Spectrum(dr.dot(mi.Spectrum(*self.combined), found)))
+        derivative = paths.forward(radiance)
+        return dr.square(
+            derivative if self.combined is None else mi.Spectrum(dr.dot(mi.Spectrum(*self.combined), derivative))
+        )
 
 
 @dataclass(frozen=True)
 class ConnectionsPass(Pass):
-    """Path replay forward: what the connections of each lane's path to emitters tell.
+    """Forward path replay: values of the emitter-sampling connections of each lane's path.
 
     Attributes:
-        bounces: connections of a path at most.
+        bounces: maximum number of connections per path.
     """
 
     bounces: int
     needs_tangents: ClassVar[bool] = True
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """`own`: the radiance that the primal pass returned, and images' worth of weights, of the derivatives and of the radiance."""
-        radiance, *given = own
-        weights, noise = (film.film_adjoint(each, size.spp, size.pixels) for each in given)
+        """Return values and emitters of the connections. `own`: radiance of the primal pass, image weights of derivatives, and of
+        radiance."""
+        radiance, *image_weights = own
+        weights, noise = (film.film_adjoint(each, size.spp, size.pixels) for each in image_weights)
         return paths.connections(radiance, weights, noise, self.bounces)
 
 
 @dataclass(frozen=True)
 class VerticesPass(Pass):
-    """The number of vertices of each lane's path."""
+    """Number of vertices of each lane's path."""
 
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {}
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """As each channel of a spectrum, to be developed as one."""
+        """Return the number of vertices in each channel of a spectrum, to be developed like radiance."""
         return mi.Spectrum(paths.vertices())
 
 
 @dataclass(frozen=True, eq=False)
 class PosesPass(Pass):
-    """The radiance of many poses per lane, one image behind the other.
+    """Radiance of many poses per lane, as concatenated images.
 
     Attributes:
-        posed: the scene.
-        copies: how many poses.
+        posed: the posed scene.
+        copies: number of poses.
     """
 
     posed: PosedScene
@@ -306,21 +314,21 @@ class PosesPass(Pass):
         return hash((id(self.posed), self.copies))
 
     def scene(self, pair: ScenePair) -> Any:
-        """Its static scene and those of the posed shapes."""
+        """Return the static scene and those of the posed shapes."""
         return self.posed.scenes()
 
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {}
 
     def numbers(self, sampler: mi.Sampler, size: LaunchSize, positions: mi.UInt32 | None) -> Any:
-        """The same for every pose."""
+        """Return a sampler whose numbers are equal for every pose."""
         del sampler, positions
         return film.RepeatingSampler(size.pixels * size.spp)
 
     def function(
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
     ) -> Callable[..., Any]:
-        """See `Pass.function`; the pass's own array: of `PosedScene.numbers()`, raveled. `posed` is its own."""
+        """Return the function to record. The pass's own array is the raveled `PosedScene.numbers()`. It uses its own `posed`."""
         del posed
 
         def launch(scenes, loaded, tables, seeds, pixels, films, rays, numbers):
@@ -343,7 +351,7 @@ class PosesPass(Pass):
         return launch
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Never called: `function` traces all copies."""
+        """Raise `NotImplementedError`: `function` traces all copies."""
         raise NotImplementedError
 
 
@@ -364,13 +372,13 @@ def _samples_of_one(
 
 
 def _repeated(rays: tuple[mi.Ray3f, mi.Spectrum], lanes: int, copies: int) -> tuple[Any, Any]:
-    """The rays of one image, one image behind the other."""
+    """Return copies of the rays of one image, concatenated."""
     lane = dr.arange(mi.UInt32, copies * lanes) % lanes
     return dr.gather(mi.Ray3f, rays[0], lane), dr.gather(mi.Spectrum, rays[1], lane)
 
 
 def _posed_rays(assembly: Assembly, ray: Any, size: LaunchSize, films: film.Films | None) -> Any:
-    """The rays of posed sensors where these stand; all others as they are."""
+    """Transform the rays of posed sensors to world space. Other rays do not change."""
     which = None if films is None else films.which
     for index, sensor in enumerate(assembly.static.sensors()):
         if sensor.id() not in assembly.poses or (which is None and index != size.sensor):
@@ -378,6 +386,6 @@ def _posed_rays(assembly: Assembly, ray: Any, size: LaunchSize, films: film.Film
         moved = assembly.poses[sensor.id()].ray_outside(ray)
         if which is None:
             return moved
-        mine = film.per_sample(which, size.spp, size.pixels) == index
-        ray.o, ray.d = dr.select(mine, moved.o, ray.o), dr.select(mine, moved.d, ray.d)
+        is_own = film.per_sample(which, size.spp, size.pixels) == index
+        ray.o, ray.d = dr.select(is_own, moved.o, ray.o), dr.select(is_own, moved.d, ray.d)
     return ray

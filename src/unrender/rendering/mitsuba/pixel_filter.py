@@ -1,11 +1,13 @@
 """Sampling of the films' reconstruction filters, pixel by pixel.
 
-Mitsuba's film divides Σ k L by Σ k over all samples within the filter's reach, where k is the filter's value. With many samples a pixel is
+Mitsuba's film divides Σ k L by Σ k over all samples within the filter's support, where k is the filter's value. In the limit of many
+samples a pixel is
 
-    I = ∫ k(x - c) L(x) dx / ∫ k(x - c) dx        over the crop window, or over the whole plane with `sample_border`
+    I = ∫ k(x - c) L(x) dx / ∫ k(x - c) dx        over the crop window, or over the full plane with `sample_border`
 
-for the pixel's centre c. Here the samples of a pixel have the density |k| / ∫ |k|, and the weight sign(k) ∫ |k| / ∫ k (filter importance
-sampling: M. Ernst, M. Stamminger, G. Greiner 2006). So every pixel has samples of its own, and their mean has the expectation I.
+for the pixel's centre c. Here the samples of a pixel have the density |k| / ∫ |k|, and the weight sign(k) ∫ |k| / ∫ k (filter
+importance sampling: M. Ernst, M. Stamminger, G. Greiner 2006). Every pixel therefore has its own samples, and their mean has the
+expectation I.
 """
 
 from __future__ import annotations
@@ -20,18 +22,18 @@ import mitsuba as mi
 import numpy as np
 
 _BINS = 4096
-"""Of equal probability, for each distance from the borders of the crop window."""
+"""Number of bins of equal probability, for each distance from the borders of the crop window."""
 _CELLS = 1 << 14
-"""In which a filter is tabulated."""
+"""Number of cells in which a filter is tabulated."""
 
 
 def is_box(film: Any) -> bool:
-    """Whether pixels are means over their square."""
+    """Return whether a pixel is the mean over its square."""
     return bool(film.rfilter().is_box_filter())
 
 
 def has_negative_lobes(film: Any) -> bool:
-    """Whether pixels may be below 0."""
+    """Return whether the filter has negative values, so that pixels may be negative."""
     rfilter = film.rfilter()
     radius = float(rfilter.radius())
     return bool((_values(rfilter, -radius, radius)[1] < 0).any())
@@ -41,7 +43,8 @@ _Kind = tuple[str, bytes, bool]
 
 
 def _kind(film: Any) -> _Kind:
-    """What decides a film's weights beside its size. Filters print rounded numbers."""
+    """Return everything that determines a film's filter weights, except its size. Printed filters are rounded, so sample values are
+    included."""
     rfilter = film.rfilter()
     places = np.linspace(0.0, rfilter.radius(), 17, dtype=np.float32)
     return str(rfilter), np.array(rfilter.eval(mi.Float(places))).tobytes(), bool(film.sample_border())
@@ -49,15 +52,15 @@ def _kind(film: Any) -> _Kind:
 
 @dataclass(frozen=True)
 class PixelFilters:
-    """Inverse distribution functions of the filters of several films, along one axis: filters of Mitsuba are products.
+    """Inverse cumulative distributions of several films' filters along one axis: filters of Mitsuba are separable.
 
-    The filter is cut off at the border of the crop window, so a pixel's distribution depends on its distance from both borders.
+    The filter is truncated at the border of the crop window, so a pixel's distribution depends on its distance from both borders.
 
     Attributes:
         nodes: `mi.Float`, offsets from the pixel's centre, `_BINS` + 1 for each distribution.
-        weights: `mi.Float`, the weight in each bin, `_BINS` for each distribution.
+        weights: `mi.Float`, weight of each bin, `_BINS` for each distribution.
         first: `mi.UInt32`, each film's first distribution.
-        reach: `mi.UInt32`, number of pixels beyond which a border is out of each film's reach.
+        reach: `mi.UInt32`, for each film the number of pixels beyond which a border does not truncate the filter.
     """
 
     nodes: Any
@@ -67,7 +70,7 @@ class PixelFilters:
 
     @classmethod
     def of(cls, sensors: Sequence[Any]) -> PixelFilters | None:
-        """Of a list of `mitsuba.Sensor`; None where all have box filters."""
+        """Return the filters of a list of `mitsuba.Sensor`; None if all are box filters."""
         films = [sensor.film() for sensor in sensors]
         if all(map(is_box, films)):
             return None
@@ -82,9 +85,9 @@ class PixelFilters:
             known[kind] = len(nodes), reach
             for below in range(reach + 1):
                 for above in range(reach + 1):
-                    found = _distribution(film.rfilter(), below, above, reach)
-                    nodes.append(found[0])
-                    weights.append(found[1])
+                    distribution = _distribution(film.rfilter(), below, above, reach)
+                    nodes.append(distribution[0])
+                    weights.append(distribution[1])
         each = [known[kind] for kind in kinds]
         return cls(
             mi.Float(np.concatenate(nodes).astype(np.float32)),
@@ -94,12 +97,12 @@ class PixelFilters:
         )
 
     def sample(self, u: Any, pixel: Any, count: Any, film: Any) -> tuple[Any, Any]:
-        """Offsets from the centres of pixels, and their weights.
+        """Return offsets from the centres of pixels, and their weights.
 
         Args:
             u: uniform in [0, 1).
             pixel: index of the pixel's row or column.
-            count: of all rows or columns.
+            count: number of rows or columns.
             film: `mi.UInt32`, index of the sensor.
         """
         first, reach = dr.gather(mi.UInt32, self.first, film), dr.gather(mi.UInt32, self.reach, film)
@@ -113,25 +116,26 @@ class PixelFilters:
 
 
 def _reach(film: Any) -> int:
-    """Number of pixels from a border beyond which it does not cut off the filter; 0 where samples lie beyond borders, too."""
+    """Return the number of pixels from a border beyond which it does not truncate the filter; 0 if the film samples its border."""
     return 0 if film.sample_border() else max(0, math.ceil(film.rfilter().radius() - 0.5))
 
 
 def _span(radius: float, below: int, above: int, reach: int) -> tuple[float, float]:
-    """Where the filter of a pixel is not cut off: `below` and `above` are its distances from the borders, at most `reach`."""
+    """Return the interval of a pixel's filter after truncation. `below` and `above` are its distances from the borders, at most
+    `reach`."""
     low = -radius if below >= reach else max(-radius, -below - 0.5)
     return low, radius if above >= reach else min(radius, above + 0.5)
 
 
 def _values(rfilter: Any, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    """The borders of equal cells, and the filter's values in their middles."""
+    """Return the borders of equal cells, and the filter's values at their centres."""
     borders = np.linspace(low, high, _CELLS + 1)
     middles = 0.5 * (borders[1:] + borders[:-1])
     return borders, np.array(rfilter.eval(mi.Float(middles.astype(np.float32))), np.float64)
 
 
 def _distribution(rfilter: Any, below: int, above: int, reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """The nodes and the bins' weights of one inverse distribution function."""
+    """Return the nodes and the bin weights of one inverse cumulative distribution."""
     borders, values = _values(rfilter, *_span(float(rfilter.radius()), below, above, reach))
     absolute = np.concatenate([[0.0], np.cumsum(np.abs(values))])
     signed = np.concatenate([[0.0], np.cumsum(values)])
@@ -142,65 +146,66 @@ def _distribution(rfilter: Any, below: int, above: int, reach: int) -> tuple[np.
 
 
 class FilterSlopes:
-    """Places where the filters of one film's pixels rise and fall, along one axis; none of a box filter, which rises at its border.
+    """Distributions of the increase and decrease of one film's pixel filters, along one axis. A box filter only changes at its border.
 
-    The derivative of a pixel's normalised filter, borders included, is a positive and a negative measure of equal mass.
+    The derivative of a pixel's normalised filter, including its truncation, is a positive and a negative measure of equal mass.
 
     Args:
         film: `mitsuba.Film`.
     """
 
-    # No dataclass: Dr.Jit would take it for state of its loops.
+    # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, film: Any):
         self._reach = _reach(film)
         each = range(self._reach + 1)
-        found = [_slopes(film.rfilter(), below, above, self._reach) for below in each for above in each]
-        rising, falling, masses = zip(*found, strict=True)
+        slopes = [_slopes(film.rfilter(), below, above, self._reach) for below in each for above in each]
+        rising, falling, masses = zip(*slopes, strict=True)
         self._rising = mi.Float(np.concatenate(rising).astype(np.float32))
         self._falling = mi.Float(np.concatenate(falling).astype(np.float32))
         self._masses = mi.Float(list(masses))
 
     def sample(self, u: Any, pixel: Any, count: Any) -> tuple[Any, Any, Any]:
-        """Where a filter rises and where it falls, from the pixel's centre, and the mass of each. Arguments: of `PixelFilters.sample`."""
+        """Return a sampled offset from the pixel's centre for the increase and one for the decrease, and their mass. See
+        `PixelFilters.sample`."""
         below, above = dr.minimum(pixel, self._reach), dr.minimum(count - 1 - pixel, self._reach)
         row = below * (self._reach + 1) + above
         place = u * _BINS
         bin_ = dr.minimum(mi.UInt32(place), _BINS - 1)
         node = row * (_BINS + 1) + bin_
-        found = [
+        offsets = [
             dr.lerp(dr.gather(mi.Float, nodes, node), dr.gather(mi.Float, nodes, node + 1), place - bin_)
             for nodes in (self._rising, self._falling)
         ]
-        return found[0], found[1], dr.gather(mi.Float, self._masses, row)
+        return offsets[0], offsets[1], dr.gather(mi.Float, self._masses, row)
 
 
 def _slopes(rfilter: Any, below: int, above: int, reach: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """The nodes of the rising and of the falling part, the latter from above, and the mass of each."""
+    """Return the nodes of the increase and, in descending order, of the decrease, and the mass of each."""
     low, high = _span(float(rfilter.radius()), below, above, reach)
     borders, middles = _values(rfilter, low, high)
     values = np.array(rfilter.eval(mi.Float(borders.astype(np.float32))), np.float64)
     changes = np.diff(np.concatenate([[0.0], values, [0.0]]))
     places = np.concatenate([[low], borders, [high]])
-    levels, found = np.linspace(0.0, 1.0, _BINS + 1), []
+    levels, nodes = np.linspace(0.0, 1.0, _BINS + 1), []
     for part in (np.maximum(changes, 0), np.maximum(-changes, 0)):
         reached = np.concatenate([[0.0], np.cumsum(part)])
-        found.append(np.interp(levels * reached[-1], reached, places))
+        nodes.append(np.interp(levels * reached[-1], reached, places))
     mass = float(np.maximum(changes, 0).sum() / (middles.mean() * (high - low)))
-    return found[0], found[1][::-1], mass
+    return nodes[0], nodes[1][::-1], mass
 
 
 _integrals: dict[_Kind, list[float]] = {}
-"""Of the filters of pixels, by their distances from the borders."""
+"""Cached integrals of pixel filters, by their distances from the borders."""
 
 
 class FilterStencil:
-    """The pixels of one film that a sample adds to, with the weights that the film gives it.
+    """Pixels of one film that a sample contributes to, with the weights of the film.
 
     Args:
         film: `mitsuba.Film`.
     """
 
-    # No dataclass: Dr.Jit would take it for state of its loops.
+    # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, film: Any):
         self._filter: Any = film.rfilter()
         self._box, self._reach = is_box(film), _reach(film)
@@ -215,14 +220,14 @@ class FilterStencil:
         self.margin = self._radius if film.sample_border() and not self._box else 0.0
 
     def _integral(self, below: int, above: int) -> float:
-        """Of the filter of a pixel at these distances from the borders."""
+        """Return the integral of the filter of a pixel at these distances from the borders."""
         if self._box:
             return 1.0
         low, high = _span(self._radius, below, above, self._reach)
         return float(_values(self._filter, low, high)[1].mean() * (high - low))
 
     def is_sampled(self, uv: Any) -> Any:
-        """Whether the film takes samples there; `uv` counts from 0 to 1 in the crop window."""
+        """Return whether the film takes samples at `uv`, which ranges from 0 to 1 in the crop window."""
         if not self.margin:
             return dr.all((uv >= 0) & (uv < 1))
         return dr.all(
@@ -230,11 +235,11 @@ class FilterStencil:
         )
 
     def add(self, position: Any, each: Callable[[Any, Any, Any], None]) -> None:
-        """Call `each` with the index, the weight and whether it is in the film, for each pixel that samples at `position` add to.
+        """Call `each` for each pixel that samples at `position` contribute to.
 
         Args:
             position: `mi.Point2f` in pixels.
-            each: takes `mi.UInt32`, `mi.Float` and `mi.Bool`.
+            each: function of the pixel's index (`mi.UInt32`), the weight (`mi.Float`) and whether the pixel is in the film (`mi.Bool`).
         """
         width, height = self._size
         if self._box:
@@ -248,13 +253,13 @@ class FilterStencil:
                 each(mi.UInt32(y * width + x), of_row * of_column, in_row & in_column)
 
     def _axis(self, position: Any, count: int) -> list[tuple[Any, Any, Any]]:
-        """Along one axis: index, weight, and whether it is in the film."""
-        first, found = mi.Int32(dr.ceil(position - 0.5 - self._radius)), []
+        """Return index, weight, and whether it is in the film, for the pixels along one axis."""
+        first, result = mi.Int32(dr.ceil(position - 0.5 - self._radius)), []
         for number in range(math.ceil(2 * self._radius)):
             index = first + number
             inside = (index >= 0) & (index < count)
             index = dr.clip(index, 0, count - 1)
             below, above = dr.minimum(index, self._reach), dr.minimum(count - 1 - index, self._reach)
             integral = dr.gather(mi.Float, self._integrals, mi.UInt32(below * (self._reach + 1) + above))
-            found.append((index, self._filter.eval(position - mi.Float(index) - 0.5) / integral, inside))
-        return found
+            result.append((index, self._filter.eval(position - mi.Float(index) - 0.5) / integral, inside))
+        return result

@@ -1,4 +1,4 @@
-"""What films store of their pixels, and a session of films that store luminance."""
+"""Pixel formats of films, and a session for films that store luminance."""
 
 from __future__ import annotations
 
@@ -20,36 +20,36 @@ from unrender.rendering.wrapper import SessionWrapper
 
 _COLOURS = {"y": "luminance", "ya": "luminance", "xyz": "xyz", "xyza": "xyz"}
 _WEIGHTS = (0.212671, 0.715160, 0.072169)
-"""Of red, green and blue in `mitsuba.luminance`."""
+"""Weights of red, green and blue in `mitsuba.luminance`."""
 
 
 def formats(sensors: Sequence[Any]) -> list[PictureFormat]:
-    """Of the sensors' films. Raises `InputError` where some store luminance and others colour."""
-    found = []
+    """Return the formats of the sensors' films. Raise `InputError` if some store luminance and others colour."""
+    result = []
     for sensor in sensors:
         match = re.search(r"pixel_format = (\w+)", str(sensor.film()))
         colour = _COLOURS.get(match[1] if match else "", "rgb")
-        found.append(PictureFormat(colour, has_negative_lobes(sensor.film())))  # pyright: ignore[reportArgumentType]
-    if len({form.colour == "luminance" for form in found}) > 1:
-        raise InputError("some films have the pixel_format luminance and others colours: give all films one of both")
-    return found
+        result.append(PictureFormat(colour, has_negative_lobes(sensor.film())))  # pyright: ignore[reportArgumentType]
+    if len({form.colour == "luminance" for form in result}) > 1:
+        raise InputError("some films have the pixel_format luminance and others store colour; give all films the same")
+    return result
 
 
 class LuminanceSession(SessionWrapper):
-    """A session whose images have their luminance in all three channels. See `RenderSession`.
+    """A session whose images have the luminance in all three channels.
 
     Args:
-        inner: renders RGB.
+        inner: session that renders RGB.
     """
 
     _inner: MitsubaSession | CachingSession
 
-    def _shown(self, found: Rendering, request: SampleRequest) -> Rendering:
-        previous = None if found.previous is None else _luminance(found.previous)
-        return replace(found, images=_luminance(found.images), previous=previous)
+    def _shown(self, rendering: Rendering, request: SampleRequest) -> Rendering:
+        previous = None if rendering.previous is None else _luminance(rendering.previous)
+        return replace(rendering, images=_luminance(rendering.images), previous=previous)
 
     def _weights(self, weights: mi.TensorXf) -> mi.TensorXf:
-        return _pulled_back(weights)
+        return _pull_back(weights)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         return _luminance(self._inner.image_batch(parameters, request))
@@ -59,17 +59,17 @@ class LuminanceSession(SessionWrapper):
 
 
 def _luminance(images: Any) -> mi.TensorXf:
-    """(..., 3), each channel the weighted sum of all."""
+    """Return (..., 3) whose channels are the weighted sum of all channels."""
     flat = images.array
     pixel = dr.arange(mi.UInt32, dr.width(flat)) // 3 * 3
-    found = mi.Float(0)
+    total = mi.Float(0)
     for channel, weight in enumerate(_WEIGHTS):
-        found += weight * dr.gather(mi.Float, flat, pixel + channel)
-    return mi.TensorXf(found, images.shape)
+        total += weight * dr.gather(mi.Float, flat, pixel + channel)
+    return mi.TensorXf(total, images.shape)
 
 
-def _pulled_back(weights: Any) -> mi.TensorXf:
-    """The transposed map, of derivatives by the luminances to derivatives by RGB."""
+def _pull_back(weights: Any) -> mi.TensorXf:
+    """Return derivatives by RGB for derivatives by the luminance channels: the transpose of `_luminance`."""
     flat = weights.array
     element = dr.arange(mi.UInt32, dr.width(flat))
     channel = element % 3

@@ -1,18 +1,18 @@
-"""Rigid poses of shapes, lights and sensors as parameters, a pose per lane.
+"""Rigid poses of shapes, lights and sensors as parameters, with one pose per lane.
 
-For every shape that carries no sensor, every sensor that no shape carries, and the emitters without a shape that `_LIGHTS` lists, the
-renderer offers parameters that Mitsuba does not have:
+For every shape that is not a sensor, every sensor without a shape, and the emitters without a shape that `_LIGHTS` lists, the renderer
+offers parameters that Mitsuba does not have:
 
-    <id>.translation    (3,)  in units of the world; 0 as loaded
+    <id>.translation    (3,)  in world units; 0 as loaded
     <id>.rotation       (3,)  rotation vector, axis times angle in radians; 0 as loaded
     <id>.scale          ()    factor, shapes only; 1 as loaded
 
-and each coordinate of the first two alone, `<id>.translation.x` and so on, (). A point x of the shape goes to
-c + translation + scale R (x - c), where c is the centre of the shape's bounding box, or where the sensor or light stands.
+and each coordinate of the first two alone, `<id>.translation.x` and so on, (). A point x of the shape moves to c + translation + scale
+R (x - c), where c is the centre of the shape's bounding box, or the position of the sensor or light.
 
-The geometry of shapes that emit nothing is never moved, and no acceleration structure rebuilt: a posed shape lives in a scene of its own,
-and rays are transformed into it. Since each ray may have its own transform, one launch renders any number of poses. Poses of lights are
-written into the scene instead (`rigid_motions.py`), where emitters are sampled.
+Shapes that do not emit are not moved, and no acceleration structure is rebuilt. A posed shape is in a scene of its own, and rays are
+transformed to its local space. Each ray may have its own transform, so one launch renders any number of poses. Poses of lights are
+written into the scene instead (`rigid_motions.py`), since the scene samples its emitters.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ _LIGHTS = {
     "EnvironmentMapEmitter": ("rotation",),
     "SunskyEmitter": ("rotation",),
 }
-"""{class of an emitter without a shape: what its pose consists of}."""
+"""{class of an emitter without a shape: parts of its pose}."""
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+")
 
 
 @dataclass(frozen=True)
 class PoseKey:
-    """What a key of this module stands for.
+    """Meaning of a pose parameter's key.
 
     Attributes:
         target: id of the shape, emitter or sensor.
@@ -76,16 +76,16 @@ class PoseKey:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the parameter."""
+        """Shape of the parameter."""
         return (3,) if self.axis is None and self.part != "scale" else ()
 
     def loaded(self) -> np.ndarray:
-        """The value at which nothing moves."""
+        """Return the value at which nothing moves."""
         return np.full(self.shape, 1.0 if self.part == "scale" else 0.0, np.float32)
 
 
 def keys(scene: Any) -> dict[str, PoseKey]:
-    """Return the pose parameters that a scene has, by key."""
+    """Return the pose parameters of a scene by key."""
     targets = [
         (shape.id(), (*_MOTIONS, "scale"), shape.is_emitter()) for shape in scene.shapes() if not shape.is_sensor()
     ]
@@ -93,16 +93,16 @@ def keys(scene: Any) -> dict[str, PoseKey]:
     targets += [(lamp.id(), _LIGHTS.get(lamp.class_name(), ()), True) for lamp in lamps]
     targets += [(sensor.id(), _MOTIONS, False) for sensor in scene.sensors() if sensor.get_shape() is None]
     counts = Counter(target for target, _, _ in targets)
-    found: dict[str, PoseKey] = {}
+    result: dict[str, PoseKey] = {}
     for target, parts, light in targets:
         if _NAMELESS.fullmatch(target) or counts[target] > 1:
             continue
         for part in parts:
             key = f"{target}.{part}"
-            found[key] = PoseKey(target, part, None, light)
+            result[key] = PoseKey(target, part, None, light)
             if part != "scale":
-                found |= {f"{key}.{name}": PoseKey(target, part, axis, light) for axis, name in enumerate(_AXES)}
-    return found
+                result |= {f"{key}.{name}": PoseKey(target, part, axis, light) for axis, name in enumerate(_AXES)}
+    return result
 
 
 def is_posable(emitter: Any) -> bool:
@@ -116,19 +116,24 @@ def is_bare(scene: Any, target: str) -> bool:
 
 
 def info(key: PoseKey, obstacle: str, sensor: int | None) -> ParameterInfo:
-    """What the renderer says of a pose parameter; `obstacle`: why path gradients do not serve, "" where they do;
-    `sensor`: index of the sensor that it moves, None where it moves a shape."""
+    """Return the description of a pose parameter.
+
+    Args:
+        key: meaning of its key.
+        obstacle: reason why path gradients do not support it; "" if they do.
+        sensor: index of the sensor that it moves; None if it does not move a sensor.
+    """
     viewpoint = sensor is not None
-    what = "light" if key.light else "sensor" if viewpoint else "shape"
-    why = f"it moves a {what} as a whole"
+    kind = "light" if key.light else "sensor" if viewpoint else "shape"
+    reason = f"it moves a {kind} rigidly"
     if obstacle:
-        why += f", and {obstacle}; SmoothedDerivatives has its derivative"
+        reason += f", and {obstacle}; use SmoothedDerivatives"
     low = 1e-3 if key.part == "scale" else None
     return ParameterInfo(
         key.shape,
         not obstacle,
         shares_paths=False,
-        reason=why,
+        reason=reason,
         lowest=low,
         rigid=True,
         light=key.light,
@@ -138,34 +143,34 @@ def info(key: PoseKey, obstacle: str, sensor: int | None) -> ParameterInfo:
 
 
 class Pose:
-    """A rigid motion and a uniform scale per lane: x to c + t + s R (x - c)."""
+    """A rigid motion with a uniform scale per lane: x moves to c + t + s R (x - c)."""
 
-    # No dataclass: Dr.Jit would take it for state of a loop.
+    # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, centre: Any, translation: Any, rotation: Any, scale: Any):
         self.centre, self.translation, self.scale = mi.Point3f(centre), mi.Vector3f(translation), mi.Float(scale)
         self.matrix = _rotation(mi.Vector3f(rotation))
         self.inverse = self.matrix.T
 
     def ray_inside(self, ray: Any) -> Any:
-        """The ray in the space of what is posed. Distances along it stay those of the world."""
+        """Transform a world ray to the local space of the posed object. Distances along the ray do not change."""
         local = mi.Ray3f(ray)
         local.o = self.centre + self.inverse @ (ray.o - self.centre - self.translation) / self.scale
         local.d = self.inverse @ ray.d / self.scale
         return local
 
     def ray_outside(self, ray: Any) -> Any:
-        """A posed sensor's ray in the world."""
+        """Transform a posed sensor's ray to world space."""
         moved = type(ray)(ray)
         moved.o = self.point(ray.o)
         moved.d = self.matrix @ ray.d
         return moved
 
     def point(self, p: Any) -> Any:
-        """Where a point goes."""
+        """Transform a point."""
         return self.centre + self.translation + self.scale * (self.matrix @ (p - self.centre))  # pyright: ignore[reportOperatorIssue]
 
     def transform(self) -> Any:
-        """As a matrix of homogeneous coordinates."""
+        """Return the pose as a matrix of homogeneous coordinates."""
         linear = self.scale * self.matrix
         shift = self.point(mi.Point3f(0))
         rows = [[*(linear[row, column] for column in range(3)), shift[row]] for row in range(3)]
@@ -173,10 +178,10 @@ class Pose:
 
 
 def _rotation(vector: Any) -> Any:
-    """The matrix of a rotation vector (Rodrigues)."""
+    """Return the matrix of a rotation vector (Rodrigues' formula)."""
     square = dr.squared_norm(vector)
     small = square < 1e-8
-    angle = dr.sqrt(dr.select(small, 1, square))  # the root has no derivative at 0
+    angle = dr.sqrt(dr.select(small, 1, square))  # the square root has no derivative at 0
     a = dr.select(small, 1 - square / 6, dr.sin(angle) / dr.select(small, 1, angle))
     b = dr.select(small, 0.5 - square / 24, (1 - dr.cos(angle)) / dr.select(small, 1, square))
     x, y, z = vector
@@ -185,17 +190,17 @@ def _rotation(vector: Any) -> Any:
 
 
 class PosedScene:
-    """A scene of which some shapes and sensors are posed: built once, then any poses.
+    """A scene with posed shapes and sensors, built once for any poses.
 
     Args:
-        scene: as loaded.
-        chosen: {key: what it stands for} of the parameters in use.
+        scene: the loaded scene.
+        chosen: {key: its meaning} of the parameters in use.
 
     Attributes:
-        static: what does not move, with all emitters and sensors.
+        static: scene without the posed shapes, with all emitters and sensors.
         parts: {id: a scene of that shape alone}.
 
-    Raises `InputError` where a coordinate is asked for twice.
+    Raises `InputError` if two parameters set the same coordinate.
     """
 
     def __init__(self, scene: Any, chosen: Mapping[str, PoseKey]):
@@ -207,18 +212,18 @@ class PosedScene:
         rest += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
         carried = {sensor.id(): sensor.get_shape() for sensor in scene.sensors()}
         carriers = [shape.id() for shape in carried.values() if shape is not None]
-        # In the order of the scene's sensors, since a request names one by its index: a shape brings the one that it carries.
+        # Keep the order of the sensors, since a request selects one by its index. A sensor of a shape is added by its shape.
         sensors = [sensor if carried[sensor.id()] is None else carried[sensor.id()] for sensor in scene.sensors()]
         self.static = _scene([*(item for item in rest if item.id() not in carriers), *sensors])
         self.parts = {name: _scene([shape]) for name, shape in posed.items()}
         self._centres = centres(scene, targets)
 
     def scenes(self) -> list[Any]:
-        """All scenes, to hand to frozen kernels."""
+        """Return all scenes, which are inputs of frozen kernels."""
         return [self.static, *self.parts.values()]
 
     def numbers(self, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The poses as one array, (7 per target, B), from {key: (B, *shape)} of all chosen keys."""
+        """Return the poses as one array, (7 per target, B), from {key: (B, *shape)} of all chosen keys."""
         count = len(next(iter(parameters.values())))
         rows = np.zeros((len(self._centres), 7, count), np.float32)
         rows[:, 6] = 1.0
@@ -228,12 +233,12 @@ class PosedScene:
         return rows.reshape(-1, count)
 
     def at(self, scenes: list[Any], numbers: Any, batch: Any) -> Assembly:
-        """The scene with each lane's poses.
+        """Return the scene with each lane's poses.
 
         Args:
-            scenes: of `scenes()`, as the frozen kernel was handed them.
-            numbers: of `numbers()`, raveled, on the device.
-            batch: which of the B poses, per lane.
+            scenes: `scenes()`, as an input of the frozen kernel.
+            numbers: `numbers()`, raveled, on the device.
+            batch: index of the lane's pose, per lane.
         """
         count = dr.width(numbers) // (7 * len(self._centres))
         poses = {}
@@ -245,14 +250,14 @@ class PosedScene:
 
 
 class Assembly:
-    """The static scene and the posed ones, intersected as one. Stands for a `mitsuba.Scene` where rays are traced."""
+    """The static scene and the posed ones, intersected as one. It replaces a `mitsuba.Scene` for ray tracing."""
 
-    # No dataclass: Dr.Jit would take it for state of a loop.
+    # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, static: Any, parts: list[tuple[Any, Pose]], poses: Mapping[str, Pose]):
         self.static, self.parts, self.poses = static, parts, poses
 
     def ray_intersect(self, ray: Any, ray_flags: Any, coherent: Any, active: Any) -> Any:
-        """See `mitsuba.Scene.ray_intersect`."""
+        """Return the nearest surface interaction, like `mitsuba.Scene.ray_intersect`."""
         nearest = self.static.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         nearest = dr.select(active, nearest, dr.zeros(mi.PreliminaryIntersection3f))
         nearest.t = dr.select(nearest.is_valid(), nearest.t, dr.inf)
@@ -261,9 +266,9 @@ class Assembly:
         for part, pose in self.parts:
             local = pose.ray_inside(ray)
             local.maxt = dr.minimum(ray.maxt, nearest.t)
-            found = part.ray_intersect_preliminary(local, coherent=coherent, active=active)
-            hit = active & found.is_valid() & (found.t < nearest.t)
-            nearest = dr.select(hit, found, nearest)
+            candidate = part.ray_intersect_preliminary(local, coherent=coherent, active=active)
+            hit = active & candidate.is_valid() & (candidate.t < nearest.t)
+            nearest = dr.select(hit, candidate, nearest)
             inside = dr.select(hit, local, inside)
             matrix = dr.select(hit, pose.matrix, matrix)
             scale = dr.select(hit, pose.scale, scale)
@@ -280,7 +285,7 @@ class Assembly:
         return si
 
     def ray_test(self, ray: Any, active: Any) -> Any:
-        """See `mitsuba.Scene.ray_test`."""
+        """Return whether a ray is occluded, like `mitsuba.Scene.ray_test`."""
         blocked = self.static.ray_test(ray, active)
         for part, pose in self.parts:
             blocked |= part.ray_test(pose.ray_inside(ray), active & ~blocked)
@@ -288,16 +293,16 @@ class Assembly:
 
 
 def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """{id of a shape or sensor: (4, 4)}: what stands before its `to_world` in these poses.
+    """Return {id of a shape or sensor: (4, 4)}, the matrix that multiplies its `to_world` from the left in these poses.
 
     Args:
-        scene: as loaded.
+        scene: the loaded scene.
         parameters: {key: value} of poses.
     """
     from scipy.spatial.transform import Rotation
 
     known = keys(scene)
-    found = {}
+    result = {}
     chosen = {key: known[key] for key in parameters}
     for target, centre in centres(scene, {key.target for key in chosen.values()}).items():
         numbers = np.array([0, 0, 0, 0, 0, 0, 1.0])
@@ -307,24 +312,24 @@ def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.n
         linear = numbers[6] * Rotation.from_rotvec(numbers[3:6]).as_matrix()
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = linear, centre + numbers[:3] - linear @ centre
-        found[target] = matrix
-    return found
+        result[target] = matrix
+    return result
 
 
 def centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
-    """Return what each of the targets turns about: shapes first, then emitters, then sensors."""
-    found = {shape.id(): _centre(shape.bbox()) for shape in scene.shapes() if shape.id() in targets}
+    """Return the centre of rotation of each target: shapes first, then emitters, then sensors."""
+    result = {shape.id(): _centre(shape.bbox()) for shape in scene.shapes() if shape.id() in targets}
     lamps = [emitter for emitter in scene.emitters() if emitter.get_shape() is None and emitter.id() in targets]
-    found |= {lamp.id(): _place(lamp) for lamp in lamps}
+    result |= {lamp.id(): _place(lamp) for lamp in lamps}
     for sensor in scene.sensors():
         if sensor.id() in targets:
             matrix = np.array(sensor.world_transform().matrix.numpy(), float).reshape(4, 4)
-            found[sensor.id()] = matrix[:3, 3].tolist()
-    return found
+            result[sensor.id()] = matrix[:3, 3].tolist()
+    return result
 
 
 def _place(emitter: Any) -> list[float]:
-    """Return where an emitter without a shape stands; the origin for light from afar."""
+    """Return the position of an emitter without a shape; the origin for a distant emitter."""
     parameters: Any = mi.traverse(emitter)
     if "position" in parameters:
         return np.array(parameters["position"], float).reshape(3).tolist()
@@ -334,22 +339,22 @@ def _place(emitter: Any) -> list[float]:
 
 
 def slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:
-    """{key: (target, first of the 7 numbers, how many)}."""
-    taken: dict[tuple[str, int], str] = {}
-    found: dict[str, tuple[str, int, int]] = {}
+    """Return {key: (target, index of its first of 7 numbers, count)}. Raise `InputError` if two keys set the same coordinate."""
+    owner: dict[tuple[str, int], str] = {}
+    result: dict[str, tuple[str, int, int]] = {}
     for name, key in chosen.items():
         first = {"translation": 0, "rotation": 3, "scale": 6}[key.part] + (key.axis or 0)
         size = int(np.prod(key.shape))
         for slot in range(first, first + size):
-            if other := taken.get((key.target, slot)):
-                raise InputError(f"parameter {name}: {other} stands for the same coordinate")
-            taken[key.target, slot] = name
-        found[name] = (key.target, first, size)
-    return found
+            if other := owner.get((key.target, slot)):
+                raise InputError(f"parameter {name}: {other} sets the same coordinate; leave out one of them")
+            owner[key.target, slot] = name
+        result[name] = (key.target, first, size)
+    return result
 
 
 def _scene(objects: list[Any]) -> Any:
-    """A scene of ready objects. Each keeps its id, which Mitsuba would take from the dictionary."""
+    """Return a scene of existing objects. Each keeps its id, which Mitsuba would otherwise take from the dictionary."""
     named = {"type": "scene"}
     for index, item in enumerate(objects):
         name = item.id()
