@@ -134,7 +134,7 @@ def test_a_weight_without_a_derivative_is_refused_by_name() -> None:
 
 def test_an_emitter_that_no_path_finds_is_refused_and_leaves_other_scenes_alone() -> None:
     """A living one would fail the calls of every other scene's emitters."""
-    assert "cannot find the light of a directionalarea emitter" in refusal(built("directionalarea"))
+    assert "cannot sample a directionalarea emitter" in refusal(built("directionalarea"))
     other = MitsubaRenderer(built("projector"), 3)
     assert np.isfinite(np.array(other.prepare([], None, False).image({}, SampleRequest(0, 4, 1)).images)).all()
 

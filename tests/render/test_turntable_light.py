@@ -122,7 +122,7 @@ def test_rotations_survive_the_plugin() -> None:
         ({"turns": "1 0 0"}, "four numbers"),
         ({"turns": "0 0 0 0"}, "four numbers"),
         ({"turns": "1 0 0 nan"}, "four numbers"),
-        ({"map": {"type": "point"}}, "light from afar"),
+        ({"map": {"type": "point"}}, "distant emitter"),
         ({"distance": 0.0}, "distance"),
     ],
 )

@@ -111,7 +111,7 @@ def test_hidden_emitters_beside_what_moves_are_refused() -> None:
         "lamp": {"type": "sphere", "emitter": {"type": "area"}},
     }
     made = ur.Problem(scene, [ur.Parameter("wall.translation")], [ur.View(np.zeros((4, 4, 3)))])
-    with pytest.raises(ur.InputError, match="hide_emitters does not go with what moves"):
+    with pytest.raises(ur.InputError, match="hide_emitters is not supported with moving objects"):
         ur.estimate(made, ur.PathGradient())
 
 

@@ -242,7 +242,7 @@ REFUSED = {
     "two sides": (
         {"type": "twosided", "a": metal(), "b": metal(0.2)},
         "ball.bsdf.brdf_0.alpha.value",
-        "one side of two",
+        "one of two different sides",
     ),
     "bumps": (
         {"type": "bumpmap", "t": texture(np.zeros((2, 2, 1))), "b": metal()},

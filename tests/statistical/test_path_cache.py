@@ -310,7 +310,7 @@ def turntable() -> dict[str, Any]:
 def test_a_light_that_another_holds_is_not_served() -> None:
     """Paths meet the outer light, so the inner one would never be looked up."""
     renderer = MitsubaRenderer(turntable, zoo.DEPTH)
-    with pytest.raises(InputError, match=r"sky\.map\.data: it lies under"):
+    with pytest.raises(InputError, match=r"sky\.map\.data: it is inside"):
         Lookups(renderer.pair, ["sky.map.data"])
     assert not isinstance(renderer.prepare(["sky.map.data", FLOOR], "path"), CachingSession)
     assert isinstance(renderer.prepare([FLOOR], "path"), CachingSession)

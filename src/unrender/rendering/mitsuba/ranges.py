@@ -1,4 +1,4 @@
-"""Which slots of a scene's plugins read a parameter's value, and the physical range that follows."""
+"""Physical ranges of parameters, from the plugin slots that read them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Range:
     """Physical range of the values that a slot reads.
 
     Attributes:
-        low: smallest value; None where there is none.
-        high: largest value; None where there is none.
-        unit: of the values; "1" for a pure number, "" where the slot is unknown.
+        low: smallest value; None for no limit.
+        high: largest value; None for no limit.
+        unit: unit of the values; "1" for a dimensionless number, "" for an unknown slot.
         singular: value between `low` and `high` at which images are singular; values stay on one side of it.
-        above: another parameter of the same object, whose value in the scene is a lower limit, "" for none.
-        below: another parameter of the same object, whose value in the scene is an upper limit, "" for none.
+        above: another parameter of the same object whose value in the scene is a lower limit; "" for none.
+        below: another parameter of the same object whose value in the scene is an upper limit; "" for none.
     """
 
     low: float | None = None
@@ -45,7 +45,7 @@ class Range:
         )
 
     def both(self, other: Range) -> Range:
-        """Return the range of values that serve both slots; this range where no value does."""
+        """Return the intersection of two ranges; this range if the intersection is empty."""
         lows, highs = ([x for x in ends if x is not None] for ends in ((self.low, other.low), (self.high, other.high)))
         low, high = max(lows, default=None), min(highs, default=None)
         if low is not None and high is not None and low >= high:
@@ -55,7 +55,7 @@ class Range:
 
 
 UNKNOWN = Range(unit="")
-"""Range of a slot without an entry, such as one of a plugin that is not Mitsuba's."""
+"""Range of a slot without an entry, such as a slot of a third-party plugin."""
 
 _SHARE = Range(0.0, 1.0)
 _ROUGHNESS = Range(0.02, 1.0)
@@ -111,7 +111,7 @@ KINDS: dict[str, dict[str, Range]] = {
         mesh_layout.TEXCOORDS: Range(unit="texture coordinates"),
     },
 }  # fmt: skip
-"""{kind of plugin: {slot: range}}, for slots that mean the same in all plugins of a kind."""
+"""{kind of plugin: {slot: range}}, for slots with the same meaning in all plugins of a kind."""
 
 _SKY = {
     "turbidity": Range(1.0, 10.0),
@@ -164,44 +164,47 @@ CLASSES: dict[str, dict[str, Range]] = {
     "EllipsoidsMesh": _ELLIPSOIDS,
     "SDFGrid": {"grid": Range(unit="scene units (signed distance)")},
 }
-"""{class of a plugin: {slot: range}}, before those of its kind."""
+"""{class of a plugin: {slot: range}}, which take precedence over those of its kind."""
 
 
-_CARRIED = ("value", "values", "data", "color0", "color1", "volume")
-"""Slots of textures and volumes whose values these hand on to the object that holds them."""
+_FORWARDED = ("value", "values", "data", "color0", "color1", "volume")
+"""Slots of textures and volumes whose values the holding object reads."""
 _ATTRIBUTE = re.compile(r'name = "(.*)",\s+scale = "(.*)"')
 _KINDS = ("BSDF", "Emitter", "Medium", "PhaseFunction", "Sensor", "Shape")
 
 
 class SlotReaders:
-    """The objects of a scene, and for each the slots of other objects that hold it.
+    """The objects of a scene, with the slots of other objects that hold each of them.
 
-    `mitsuba.traverse` visits an object once, under its own id where it has one. A range follows the slot instead, so every way to an object
-    counts: a texture that two BSDFs share gets the range that serves both.
+    `mitsuba.traverse` visits an object once, under its own id if it has one. A range depends on the slot instead, so every path to an
+    object counts: a texture shared by two BSDFs has the range that is valid for both.
+
+    Args:
+        holders: {object: its holders and their slots}.
     """
 
-    def __init__(self, found: Holders):
-        self._holders = found
+    def __init__(self, holders: Holders):
+        self._holders = holders
         self._attributes: dict[str, list[Any]] = {}
         for node in self._holders:
             if isinstance(node, mi.Texture) and (name := _attribute(node)[0]):
                 self._attributes.setdefault(name, []).append(node)
 
     def range_of(self, parameters: mi.SceneParameters, key: str) -> Range:
-        """Return the range of the parameter `key`; `UNKNOWN` where no slot that reads it is known."""
+        """Return the range of the parameter `key`; `UNKNOWN` if no known slot reads it."""
         node, leaf = parameters.properties[key][2], key.rpartition(".")[2]
-        found = self._of_slot(node, leaf)
-        low, high = found.low, found.high
-        for other, is_lower in ((found.above, True), (found.below, False)):
+        own = self._of_slot(node, leaf)
+        low, high = own.low, own.high
+        for other, is_lower in ((own.above, True), (own.below, False)):
             name = f"{key.rpartition('.')[0]}.{other}"
             if other and name in parameters:
                 value: Any = parameters[name]
                 limit = float(value[0])
                 low, high = (limit, high) if is_lower else (low, limit)
-        return replace(found, low=low, high=high)
+        return replace(own, low=low, high=high)
 
     def _of_slot(self, node: Any, slot: str) -> Range:
-        if isinstance(node, (mi.Texture, mi.Volume)) and slot in _CARRIED:
+        if isinstance(node, (mi.Texture, mi.Volume)) and slot in _FORWARDED:
             return self._of_readers(node)
         if (known := entry(node, slot)) is not None:
             return known
@@ -212,47 +215,47 @@ class SlotReaders:
         return UNKNOWN
 
     def _of_readers(self, node: Any) -> Range:
-        """Return the range that serves all slots that hold a texture or volume."""
-        found: Range | None = None
+        """Return the range that is valid for all slots that hold a texture or volume."""
+        result: Range | None = None
         for holder, slot in self._holders.get(node, []):
             if isinstance(holder, mi.Medium) and slot == "emission" and _has_harmonics(holder):
                 each = Range(unit="radiance")
             else:
                 each = self._of_slot(holder, slot)
-            found = each if found is None else found.both(each)
-        return found or UNKNOWN
+            result = each if result is None else result.both(each)
+        return result or UNKNOWN
 
     def _of_attribute(self, shape: Any, name: str) -> Range:
-        """Return the range of a shape's attribute: of the slots whose textures read it from this shape, divided by their scale."""
-        found: Range | None = None
+        """Return the range of a shape's attribute: that of the slots whose textures read it from this shape, divided by their scale."""
+        result: Range | None = None
         for texture in self._attributes.get(name, []):
             if shape not in self._shapes_of(texture):
                 continue
             each = self._of_readers(texture).scaled(_attribute(texture)[1])
-            found = each if found is None else found.both(each)
-        return found or UNKNOWN
+            result = each if result is None else result.both(each)
+        return result or UNKNOWN
 
     def _shapes_of(self, node: Any) -> set[Any]:
-        """Return the shapes that hold an object, directly or through others."""
-        found, seen, pending = set(), {node}, [node]
+        """Return the shapes that hold an object, directly or indirectly."""
+        shapes, seen, pending = set(), {node}, [node]
         while pending:
             for holder, _ in self._holders.get(pending.pop(), []):
                 if isinstance(holder, mi.Shape):
-                    found.add(holder)
+                    shapes.add(holder)
                 elif holder not in seen:
                     seen.add(holder)
                     pending.append(holder)
-        return found
+        return shapes
 
 
 def _attribute(texture: Any) -> tuple[str, float]:
-    """Return the attribute that a texture reads and its scale; "" where it reads none."""
+    """Return the mesh attribute that a texture reads and its scale; "" if it reads none."""
     match = _ATTRIBUTE.search(str(texture)) if class_name(texture) == "MeshAttribute" else None
     return ("", 1.0) if match is None else (match[1], float(match[2]))
 
 
 def entry(node: Any, slot: str) -> Range | None:
-    """Return what the table says of a slot of an object, None where it has no entry."""
+    """Return the table's range for a slot of an object; None without an entry."""
     own = CLASSES.get(class_name(node), {})
     if slot in own:
         return own[slot]

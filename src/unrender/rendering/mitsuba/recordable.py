@@ -1,7 +1,7 @@
-"""Which sensors a recorded kernel may hold.
+"""Sensors that a recorded kernel supports.
 
-A recording takes over what its objects hold through the members that their plugins name to Dr.Jit. Mitsuba's thin lens, orthographic and
-batch sensors do not name all of theirs: Dr.Jit refuses to record a kernel that samples their rays.
+A recording captures an object's state through the members that its plugin declares to Dr.Jit. Mitsuba's thin lens, orthographic and
+batch sensors do not declare all of theirs, so Dr.Jit refuses to record a kernel that samples their rays.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import drjit as dr
 import mitsuba as mi
 
 _COMPLETE = frozenset({"PerspectiveCamera", "DistantSensor", "DistantSensorImpl", "RadianceMeter", "IrradianceMeter"})
-"""Classes that name all members, in Mitsuba 3.9."""
+"""Sensor classes that declare all members in Mitsuba 3.9."""
 _LONGEST_GAP = 32
-"""Unused registry ids in a row after which no further sensor is looked for. Ids of objects that died are used again."""
+"""Number of consecutive unused registry ids that ends the search for sensors. Ids of dead objects are reused."""
 
 
 def are_recordable(sensor: Any, several: bool) -> bool:
-    """Whether a recording may hold a `mitsuba.Sensor` or, with `several`, all sensors of the process.
+    """Return whether a recording supports a `mitsuba.Sensor` or, with `several`, all sensors of the process.
 
-    A call through a pointer sees every sensor of the process, those of scenes that the caller has loaded too. False for plugins that are
-    not known.
+    A virtual call sees every sensor of the process, including those of scenes that the caller has loaded. Unknown plugins are not
+    supported.
     """
-    found = _registered() if several else [sensor]
-    return all(each.class_name() in _COMPLETE for each in found)
+    sensors = _registered() if several else [sensor]
+    return all(each.class_name() in _COMPLETE for each in sensors)
 
 
 def _registered() -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""What a session keeps of a rendering, and the samples that it drops."""
+"""State of a rendering that its adjoint needs, and dropped samples."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from unrender.rendering.renderer import SampleRequest, Space
 
 @dataclass(frozen=True)
 class Paths:
-    """What `adjoint` needs to walk the paths of a rendering again.
+    """State of a rendering that `adjoint` needs to replay its paths.
 
     Attributes:
-        request: the samples taken.
-        radiance: per lane.
-        radiance_previous: likewise of the previous state; None unless a pair was rendered.
-        space: where the pair shares its samples.
+        request: request of the rendering.
+        radiance: radiance per lane.
+        radiance_previous: radiance of the previous state; None unless a pair was rendered.
+        space: sample space of the pair.
         previous: parameters of the previous state; None unless a pair was rendered.
-        vertices: what `TracePass` returned, where paths are kept; else None.
-        keys: the parameters whose lookups the vertices number.
+        vertices: result of `TracePass` if paths are cached; else None.
+        keys: parameters whose lookups the vertices refer to.
     """
 
     request: SampleRequest
@@ -39,11 +39,10 @@ class Paths:
 
 
 class DroppedSamples:
-    """Samples whose radiance is not finite. They add nothing to an image or a gradient, and are counted.
+    """Samples whose radiance is not finite. They contribute nothing to an image or a gradient, and are counted.
 
     Args:
-        at_once: read each count at once. Otherwise it is read after the next launch, so that no launch waits for it.
-
+        at_once: read each count immediately. Otherwise it is read after the next launch, so that no launch waits for it.
     """
 
     def __init__(self, at_once: bool) -> None:
@@ -58,16 +57,16 @@ class DroppedSamples:
         return self._report.count
 
     def develop(self, radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> mi.TensorXf:
-        """Return the image that `film.develop` makes of the other samples, and count the dropped ones."""
+        """Return the image that `film.develop` makes of the finite samples, and count the dropped ones."""
         self.read()
         finite, lanes = is_finite(radiance), dr.width(radiance)
-        found = mi.Spectrum(dr.select(finite, radiance, 0))
+        finite_radiance = mi.Spectrum(dr.select(finite, radiance, 0))
         dropped = dr.count(~finite)
-        dr.eval(found, dropped)
+        dr.eval(finite_radiance, dropped)
         self._pending.append((dropped, lanes))
         if self._at_once:
             self.read()
-        return film.develop(found, spp, groups, shape)
+        return film.develop(finite_radiance, spp, groups, shape)
 
     def read(self) -> None:
         """Add up the counts of earlier launches."""

@@ -1,4 +1,4 @@
-"""Mitsuba's answer to the renderer port."""
+"""Implementation of the renderer protocol with Mitsuba."""
 
 from __future__ import annotations
 
@@ -40,26 +40,26 @@ from unrender.rendering.renderer import (
 
 
 class MitsubaRenderer:
-    """A Mitsuba scene, held twice (current and previous state), with path replay gradients.
+    """A Mitsuba scene, loaded twice (current and previous state), with path replay gradients.
 
     Args:
-        description: an XML file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`, of which there is one state
-            only: no pairs.
-        max_depth: longest path in segments, >= 1; None for that of the scene's integrator (`LightPaths`).
-        keys: parameters that will be asked for, if known. Spheres that these move become meshes, so that path gradients reach them.
-        replaced: {id of a shape: `ReplacedMesh`}, what its mesh is to be in place of the description's.
+        description: an XML file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`. The latter has one state only
+            and cannot render pairs.
+        max_depth: maximum path length in segments, >= 1; None for that of the scene's integrator (`LightPaths`).
+        keys: parameters that will be recovered, if known. Spheres that these move become meshes, so that they have path gradients.
+        replaced: {id of a shape: `ReplacedMesh`}, meshes that replace those of the description.
 
-    Parameters are `mi.TensorXf` of the shape that `parameters()` tells: a number is (), a colour (3,), a bitmap (H, W, C),
-    vertex positions (3 V,). Geometry moves through Mitsuba's `prb` kernel, whose gradient leaves out visibility; where meshes move, by
-    their vertices or as a whole (`poses.py`), `boundary_term.py` adds it. Of sensors, `camera_term.py` has the whole derivative. Poses of
-    shapes that are no meshes have no path gradient.
+    Parameters are `mi.TensorXf` of the shape that `parameters()` states: a number is (), a colour (3,), a bitmap (H, W, C), vertex
+    positions (3 V,). Moving geometry uses Mitsuba's `prb` kernel, whose gradient omits visibility. For meshes that move, by their
+    vertices or rigidly (`poses.py`), `boundary_term.py` adds it. `camera_term.py` has the full derivative by sensors. Poses of shapes
+    other than meshes have no path gradient.
 
     Attributes:
         light_paths: settings of the light paths.
-        max_depth: longest path in segments.
+        max_depth: maximum path length in segments.
         notices: one line for each setting of the scene that is not used.
 
-    Raises `InputError` where Mitsuba refuses the description.
+    Raises `InputError` if Mitsuba refuses the description.
     """
 
     def __init__(
@@ -77,15 +77,15 @@ class MitsubaRenderer:
         self.notices = (
             *self.light_paths.notices,
             *merge_notices(keys, self.pair.loaded().equal),
-            *(f"{name}: a sphere that moves is rendered as a mesh" for name in self.pair.loaded().meshed),
+            *(f"{name}: the moving sphere is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
         self._formats = formats(self.pair.current.sensors())
         self._poses = self._pose_keys()
         self._info: dict[str, ParameterInfo] = {**self.pair.info(), **lens_parameters(self.pair)}
         sensors = {sensor.id(): index for index, sensor in enumerate(self.pair.current.sensors())}
-        found = self._obstacles({pose.target for pose in self._poses.values()})
+        obstacles_of = self._obstacles({pose.target for pose in self._poses.values()})
         self._info |= {
-            key: poses.info(pose, found[pose.target] or self._translates(pose), sensors.get(pose.target))
+            key: poses.info(pose, obstacles_of[pose.target] or self._translates(pose), sensors.get(pose.target))
             for key, pose in self._poses.items()
         }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})
@@ -97,42 +97,42 @@ class MitsubaRenderer:
         self._checked: set[tuple[tuple[str, ...], frozenset[str], Space | None]] = set()
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """Every parameter of the scene by its `mitsuba.traverse` key."""
+        """Return every parameter of the scene by its `mitsuba.traverse` key."""
         return self._info
 
     def values(self, keys: list[str]) -> Tree:
-        """The scene's own values, as loaded."""
+        """Return the scene's own values, as loaded."""
         return {
             key: self.array(self._poses[key].loaded()) if key in self._poses else self.pair.loaded().value(key)
             for key in keys
         }
 
     def resolutions(self) -> list[tuple[int, int]]:
-        """(height, width) of each sensor's film, after cropping."""
+        """Return (height, width) of each sensor's film, after cropping."""
         return self.pair.resolutions
 
     def formats(self) -> list[PictureFormat]:
         return self._formats
 
     def cameras(self) -> Mapping[int, Camera]:
-        found = {}
+        result = {}
         for index, sensor in enumerate(self.pair.current.sensors()):
             keys = f"{sensor.id()}.rotation", f"{sensor.id()}.translation"
             if keys[0] in self._poses:
                 place = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4, -1)[:3, 3, 0]
-                found[index] = Camera(*keys, place)
-        return found
+                result[index] = Camera(*keys, place)
+        return result
 
     def array(self, values: np.ndarray) -> mi.TensorXf:
-        """`mi.TensorXf` with these values, in memory of its own."""
+        """Return the values as `mi.TensorXf` in its own memory."""
         return tensor(values)
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> MitsubaSession | CachingSession | LuminanceSession:
-        """The session for these parameters: see `Renderer.prepare`. Sessions are kept, so that asking again costs nothing.
+        """Return the session for these parameters. Sessions are cached, so repeated calls are free.
 
-        Poses and other parameters that move geometry cannot be prepared together: the scenes that posed shapes live in are not rebuilt.
+        Poses and other parameters that move geometry cannot be prepared together, since the scenes of posed shapes are not rebuilt.
         """
         names, wanted = tuple(keys), differentiated(keys, derivatives)
         if (names, wanted, space) not in self._checked:
@@ -149,14 +149,14 @@ class MitsubaRenderer:
                 self.pair, rest, chosen, wanted, self.light_paths, self._sampler, self._differential_bsdf
             )
             session = self._caching(session, keys, wanted)
-            grey = self._formats[0].colour == "luminance"
-            self._sessions[names, wanted] = LuminanceSession(session) if grey else session
+            is_luminance = self._formats[0].colour == "luminance"
+            self._sessions[names, wanted] = LuminanceSession(session) if is_luminance else session
         return self._sessions[names, wanted]
 
     def _caching(
         self, session: MitsubaSession, keys: list[str], derivatives: AbstractSet[str]
     ) -> MitsubaSession | CachingSession:
-        """The session that keeps its paths where it can."""
+        """Return a session that caches its paths if the parameters allow it, else the session itself."""
         if self._differential_bsdf:
             return session
         try:
@@ -165,11 +165,10 @@ class MitsubaRenderer:
             return session
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
-        """See `Remeshable`."""
         return MitsubaRenderer(self.pair.description, self._given_depth, keys, self.pair.replaced | dict(meshes))
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
-        """See `DifferentialBsdfRenderer`. Of the same scenes."""
+        """Return a renderer of the same loaded scenes with differential BSDF sampling."""
         if self._differential_bsdf:
             return self
         if self._differential is None:
@@ -179,17 +178,16 @@ class MitsubaRenderer:
 
     def stock(self) -> StockSession:
         if self.pair.replaced:
-            raise InputError("method stock: a mesh has other triangles than the scene's own")
+            raise InputError("method stock: remeshing is not supported; use another method")
         if any(form.colour == "xyz" for form in self._formats):
-            raise InputError(
-                "method stock: a film has the pixel_format xyz, which it would compare with RGB: give it rgb"
-            )
+            raise InputError("method stock: the pixel_format xyz is not supported; set the film to rgb")
         if self._stock is None:
             self._stock = StockSession(self.pair.description, self.pair.moving, self.pair.volumetric, self.light_paths)
         return self._stock
 
     def _pose_keys(self) -> dict[str, poses.PoseKey]:
-        """Return the poses that the scene has: of lights alone beside media, which posed shapes in scenes of their own do not meet."""
+        """Return the poses of the scene. With media only lights have poses, since a posed shape in a scene of its own does not see the
+        media."""
         written, instances = self.pair.loaded().poses, has_instances(self.pair.current)
         return {
             key: pose
@@ -198,8 +196,11 @@ class MitsubaRenderer:
         }
 
     def _is_written(self, key: str, keys: Iterable[str]) -> bool:
-        """Return whether a pose is written into the scene: a light's always, and others beside a shape that emits light, with which the
-        scene's acceleration structure changes, and beside instances, which Mitsuba does not take into another scene."""
+        """Return whether a pose is written into the scene instead of transforming rays.
+
+        This holds for lights. It holds for other poses if an emitting shape moves too, which changes the scene's acceleration
+        structure, and in scenes with instances, which Mitsuba cannot add to another scene.
+        """
         scene = self.pair.loaded()
         if self._poses[key].light or has_instances(scene.scene):
             return True
@@ -207,28 +208,28 @@ class MitsubaRenderer:
         return lit and key in scene.poses
 
     def _check_targets(self, keys: list[str]) -> None:
-        """Raise `InputError` where two parameters place the same object."""
+        """Raise `InputError` if two parameters place the same object."""
         poses.slots({key: self._poses[key] for key in keys if key in self._poses})
         written = self.pair.loaded().poses
         for key in keys:
             if key in written and (other := next((name for name in written.written(key) if name in keys), "")):
-                raise InputError(f"parameter {key}: {other} places the same object; keep one of them")
+                raise InputError(f"parameter {key}: {other} places the same object; leave out one of them")
 
     def _translates(self, pose: poses.PoseKey) -> str:
-        """Why a pose has no derivative because it moves a sensor to another place, "" where that is not so."""
+        """Return the reason why the translation of a sensor has no derivative; "" for other poses or if it has one."""
         moves = pose.part == "translation" and any(sensor.id() == pose.target for sensor in self.pair.current.sensors())
         return translation_obstacle(self.pair) if moves else ""
 
     def _obstacles(self, targets: set[str]) -> dict[str, str]:
-        """{shape or sensor that moves: why it has no path gradient, "" where it has}."""
+        """Return {shape or sensor that moves: reason why it has no path gradient, "" if it has one}."""
         sensors = {sensor.id() for sensor in self.pair.current.sensors() if sensor.get_shape() is None}
-        lamps = {emitter.id() for emitter in self.pair.current.emitters() if emitter.get_shape() is None}
-        found = obstacles(self.pair, targets - sensors - lamps)
-        found |= {target: sensor_obstacle(self.pair, target) for target in targets & sensors}
-        return found | dict.fromkeys(targets & lamps, "path gradients do not follow it")
+        lights = {emitter.id() for emitter in self.pair.current.emitters() if emitter.get_shape() is None}
+        result = obstacles(self.pair, targets - sensors - lights)
+        result |= {target: sensor_obstacle(self.pair, target) for target in targets & sensors}
+        return result | dict.fromkeys(targets & lights, "path gradients do not support it")
 
-    def _carries(self, key: str) -> bool:
-        """Whether paths of two values of a parameter, which moves a mesh, can be related: see `MovedPair`."""
+    def _relates_paths(self, key: str) -> bool:
+        """Return whether paths of two values of a parameter that moves a mesh can be related, see `MovedPair`."""
         scene = self.pair.loaded()
         kinds = {shape.class_name() for shape in scene.scene.shapes()}
         if key in self._poses and self._poses[key].light:
@@ -241,31 +242,33 @@ class MitsubaRenderer:
         info = self._info[key]
         if derivatives and not info.differentiable and key in self._poses:
             raise InputError(
-                f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}: --method smoothed"
+                f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}; use --method smoothed"
             )
         if derivatives and not info.differentiable:
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}")
         target = moved_sensor(self.pair.loaded(), key) or moved_shape(self.pair.loaded(), key)
         if self.light_paths.hide_emitters and (target or key in self._poses):
-            raise InputError(f"parameter {key}: the scene's hide_emitters does not go with what moves: leave it out")
-        if derivatives and target and key not in self._poses and (why := self._obstacles({target})[target]):
-            raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {why}")
+            raise InputError(
+                f"parameter {key}: hide_emitters is not supported with moving objects; leave it out of the scene"
+            )
+        if derivatives and target and key not in self._poses and (obstacle := self._obstacles({target})[target]):
+            raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {obstacle}")
         if not info.perturbable:
             raise InputError(f"parameter {key}: it cannot be perturbed, since {info.reason}")
-        if space == "path" and not (info.shares_paths or (derivatives and self._carries(key))):
+        if space == "path" and not (info.shares_paths or (derivatives and self._relates_paths(key))):
             instead = ", --method plain or --method smoothed" if info.rigid else ""
             raise InputError(
-                f'parameter {key}: {info.reason}, which space="path" cannot carry; use space="primary"{instead}'
+                f'parameter {key}: {info.reason}, so space="path" cannot share its paths; use space="primary"{instead}'
             )
 
 
 class StockSession:
-    """A load of the scene for `mi.render` alone: its own film, with the reconstruction filter that the scene gives it.
+    """A load of the scene for `mi.render` alone, with the scene's own film and reconstruction filter.
 
     Args:
         description: what to load.
-        moving: ids of shapes that move; the spheres among them become meshes.
-        volumetric: whether there is a participating medium, which takes `prbvolpath` in place of `prb`.
+        moving: ids of shapes that move; spheres among them become meshes.
+        volumetric: whether there is a participating medium, which selects `prbvolpath` instead of `prb`.
         paths: settings of the light paths.
     """
 
@@ -285,7 +288,7 @@ class StockSession:
         self, parameters: Tree, sensor: int, spp: int, seeds: tuple[int, int], weigh: LossWeights
     ) -> tuple[mi.TensorXf, Tree]:
         scene = self._loaded
-        scene.detach()  # of leaves that were differentiated before, the derivative graph is gone
+        scene.detach()  # the derivative graph of leaves from an earlier step no longer exists
         scene.set_parameters(parameters, parameters.keys())
         image = mi.render(
             scene.scene,
@@ -297,12 +300,12 @@ class StockSession:
             seed_grad=mi.UInt32(seeds[1]),  # pyright: ignore[reportArgumentType]
         )
         channels = image.shape[2]
-        if channels in (2, 4):  # a film with alpha, which references have not
+        if channels in (2, 4):  # drop alpha, which references do not have
             image = image[:, :, : channels - 1]
-        if channels <= 2:  # of luminance, in all three channels
+        if channels <= 2:  # repeat luminance in all three channels
             image = image * dr.ones(mi.TensorXf, (1, 1, 3))
-        seen = mi.TensorXf(dr.detach(image))
-        dr.backward(dr.sum(image * weigh(seen), axis=None))
+        detached = mi.TensorXf(dr.detach(image))
+        dr.backward(dr.sum(image * weigh(detached), axis=None))
         gradient = scene.take_gradients()
-        dr.eval(seen)
-        return seen, gradient
+        dr.eval(detached)
+        return detached, gradient

@@ -1,4 +1,4 @@
-"""Rigid poses written into the scene: those of lights, and of all else where path gradients are taken through the keys of `poses.py`."""
+"""Rigid poses that are written into the scene: those of lights, and all poses with path gradients."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["RigidMotions"]
 
 
 class RigidMotions:
-    """The pose parameters of a loaded scene whose targets have vertices, a transformation or a position to write.
+    """Pose parameters of a loaded scene whose targets have vertices, a transformation or a position to write.
 
     Args:
-        scene: as loaded.
-        own: {key: value} of the parameters that Mitsuba has, as loaded. Kept, not copied.
+        scene: the loaded scene.
+        own: {key: value} of Mitsuba's parameters, as loaded; referenced, not copied.
     """
 
     def __init__(self, scene: Any, own: Mapping[str, Any]):
@@ -37,7 +37,7 @@ class RigidMotions:
         self._centres = poses.centres(scene, {pose.target for pose in self._keys.values()})
 
     def _written(self, target: str) -> str:
-        """Return the parameter of Mitsuba that places a target, "" where there is none."""
+        """Return Mitsuba's parameter that places a target; "" if there is none."""
         for name in (POSITIONS, "position"):
             if f"{target}.{name}" in self._own:
                 return f"{target}.{name}"
@@ -47,21 +47,21 @@ class RigidMotions:
         return key in self._keys
 
     def key(self, key: str) -> PoseKey:
-        """What a key stands for."""
+        """Return the meaning of a key."""
         return self._keys[key]
 
     def loaded(self) -> dict[str, Any]:
-        """{key: `mi.Float`}: the values at which nothing moves."""
+        """Return {key: `mi.Float`} of the values at which nothing moves."""
         return {key: mi.Float(pose.loaded().reshape(-1).tolist()) for key, pose in self._keys.items()}
 
     def written(self, key: str) -> list[str]:
-        """The parameters of Mitsuba that a parameter is written to: itself, where it is one of them."""
+        """Return Mitsuba's parameters that a parameter is written to: itself, unless it is a pose."""
         if key not in self._keys:
             return [key]
         return [self._written(self._keys[key].target)]
 
     def restore(self, parameters: mi.SceneParameters, key: str) -> None:
-        """Put what a pose has moved back to where it was loaded, without derivatives; the caller updates the scene."""
+        """Restore the target of a pose as loaded, without derivatives. The caller updates the scene."""
         target = self._keys[key].target
         (name,) = self.written(key)
         if name in self._own:
@@ -70,13 +70,13 @@ class RigidMotions:
             self._set_world(parameters, name, _copy(self._worlds[target]))
 
     def write(self, parameters: mi.SceneParameters, values: Mapping[str, Any]) -> None:
-        """Move the targets, with the derivatives of the poses if these are attached, and update the scene.
+        """Move the targets, with derivatives if the poses are attached, and update the scene.
 
         Args:
-            parameters: of the scene.
-            values: {key: `mi.Float`} of all the poses that are set.
+            parameters: parameters of the scene.
+            values: {key: `mi.Float`} of all poses that are set.
         """
-        turned: dict[str, Any] = {}
+        rotated: dict[str, Any] = {}
         for target, pose in self._poses(values).items():
             name = self._written(target)
             if name not in self._own:
@@ -88,22 +88,22 @@ class RigidMotions:
             parameters[name] = dr.ravel(pose.point(dr.unravel(mi.Point3f, self._own[name])))
             normals = f"{target}.{NORMALS}"
             if dr.width(self._own.get(normals, 0)) == dr.width(self._own[name]):
-                turned[normals] = dr.ravel(pose.matrix @ dr.unravel(mi.Vector3f, self._own[normals]))
+                rotated[normals] = dr.ravel(pose.matrix @ dr.unravel(mi.Vector3f, self._own[normals]))
         parameters.update()
-        # In a second update: Mitsuba computes normals anew whenever positions change.
-        for name, value in turned.items():
+        # Normals need a second update: Mitsuba recomputes them whenever positions change.
+        for name, value in rotated.items():
             parameters[name] = value
-        if turned:
+        if rotated:
             parameters.update()
 
     def _set_world(self, parameters: mi.SceneParameters, name: str, transform: Any) -> None:
-        # Mitsuba would keep an equal matrix, and its derivatives with it: another one first.
+        # Mitsuba ignores an equal matrix and would keep its old derivatives, so assign a different one first.
         parameters[name] = mi.Transform4f().scale(-1)
         parameters[name] = transform
 
     def _poses(self, values: Mapping[str, Any]) -> dict[str, Pose]:
-        """{target: its pose}."""
-        found = {}
+        """Return {target: its pose}."""
+        result = {}
         chosen = {key: self._keys[key] for key in values}
         slots = poses.slots(chosen)
         for target in {pose.target for pose in chosen.values()}:
@@ -112,10 +112,10 @@ class RigidMotions:
                 if owner == target:
                     for k in range(size):
                         numbers[first + k] = dr.gather(mi.Float, values[key], k)
-            found[target] = Pose(self._centres[target], numbers[0:3], numbers[3:6], numbers[6])
-        return found
+            result[target] = Pose(self._centres[target], numbers[0:3], numbers[3:6], numbers[6])
+        return result
 
 
 def _copy(transform: Any) -> Any:
-    """Of its own: a sensor gives away the matrix that it goes on using."""
+    """Return a copy: a sensor returns a reference to the matrix that it uses."""
     return type(transform)(transform)

@@ -1,4 +1,4 @@
-"""The rough conductors whose roughness is unknown: which parameters these are, and how integrators know them."""
+"""Rough conductors with unknown roughness, which differential BSDF sampling supports, and their tables for the integrators."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ _ROLES = ("alpha", "alpha_u", "alpha_v", "roughness")
 
 
 class RoughLobes:
-    """The parameters that are the roughness of an isotropic rough conductor, bare or two-sided with the same on both sides: what
-    `DifferentialBsdf` serves. Others are differentiated like everything else.
+    """Roughness parameters that `DifferentialBsdf` supports: those of isotropic rough conductors, one-sided or two-sided with equal
+    sides.
+
+    Other parameters use standard BSDF sampling.
 
     Args:
         pair: both loads of the scene.
-        keys: the parameters with a derivative; None where nothing is sampled so.
+        keys: parameters with a derivative; None to disable differential sampling.
         geometric: whether parameters move shapes.
 
     Attributes:
-        differential: what samples them, None where nothing is sampled so.
-        tables: {"rough": by registry ids of the current scene's BSDFs the entry of `DISTRIBUTIONS`, 0 for others; the last entry is 0}, or
-            nothing.
+        differential: sampler of the BSDF derivatives; None if disabled.
+        tables: {"rough": entry of `DISTRIBUTIONS` by registry ids of the current scene's BSDFs, 0 for others and at the end}, or empty.
 
-    Raises `InputError` where none is served, with the reason for each roughness, and where other kernels trace the paths: in media, and
-    where shapes move.
+    Raises `InputError` if no parameter is supported, with the reason for each roughness, and in scenes that other kernels trace: with
+    media, or with moving shapes.
     """
 
     def __init__(self, pair: ScenePair, keys: Sequence[str] | None, geometric: bool):
@@ -42,8 +43,8 @@ class RoughLobes:
         if keys is None:
             return
         if pair.volumetric or geometric:
-            why = "the scene has media" if pair.volumetric else "a parameter moves shapes"
-            raise InputError(f"differential_bsdf: {why}, where roughness is not sampled so: leave it out")
+            reason_of_scene = "the scene has media" if pair.volumetric else "a parameter moves shapes"
+            raise InputError(f"differential_bsdf: {reason_of_scene}, which it does not support; leave it out")
         kinds, reasons = {}, []
         for key in keys:
             bsdf, kind, reason = _lobe(pair.current_parameters, key)
@@ -66,7 +67,8 @@ class RoughLobes:
 
 
 def _lobe(parameters: mi.SceneParameters, key: str) -> tuple[Any, str, str]:
-    """(the outermost BSDF, name of the distribution, "") of a roughness that is served; else (None, "", why), "" for others."""
+    """Return (outermost BSDF, name of the distribution, "") of a supported roughness; else (None, "", reason), with "" for other
+    parameters."""
     if key not in parameters.properties or not set(key.split(".")) & set(_ROLES):
         return None, "", ""
     node, chain = parameters.properties[key][2], []
@@ -80,11 +82,11 @@ def _lobe(parameters: mi.SceneParameters, key: str) -> tuple[Any, str, str]:
     if names[0] != "RoughConductor":
         return None, "", f"belongs to another BSDF ({names[0]})"
     if names[1:] not in ([], ["TwoSidedBRDF"]):
-        return None, "", f"lies under {names[1]}"
+        return None, "", f"is inside a {names[1]}"
     if "alpha" not in key.split("."):
         return None, "", "is anisotropic"
     if any(name.startswith("brdf_1.") for name in mi.traverse(bsdfs[-1]).keys()):  # noqa: SIM118 (iterating gives pairs)
-        return None, "", "lies on one side of two that differ"
+        return None, "", "belongs to one of two different sides"
     kind = re.search(r"distribution = (\w+)", str(bsdfs[0]))
     if kind is None or kind.group(1) not in DISTRIBUTIONS:
         return None, "", "has a distribution that is neither GGX nor Beckmann's"

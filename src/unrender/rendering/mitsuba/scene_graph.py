@@ -1,7 +1,7 @@
-"""The objects of a loaded scene and every place where each is used, children of shape groups and nested BSDFs included.
+"""Object graph of a loaded scene with every use of each object, including children of shape groups and nested BSDFs.
 
-`mitsuba.traverse` names an object by the first place that holds it. A shared object has several. Each of them decides how the object's
-parameters reach the picture, and each keeps values of its own that depend on them.
+`mitsuba.traverse` names an object by the first place that holds it. A shared object has several places. Each place determines how the
+object's parameters affect the image, and each holder caches values that depend on them.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "medium": "Medium", "shape": "Sh
 
 
 class ObjectGraph:
-    """The objects below a scene.
+    """All objects of a scene.
 
     Args:
         scene: a loaded scene.
 
     Attributes:
-        nodes: every object once. Two loads of a description have equal orders.
-        owners: {object: what holds it}, in the order of visits; nothing holds the scene.
-        slots: {object: (object that holds it, name of the slot)}, a pair for every way to it.
-        properties, hierarchy: of `mitsuba.SceneParameters`.
-        names: of the objects.
+        nodes: every object once. Two loads of a description have the same order.
+        owners: {object: its holders}, in the order of visits; the scene has none.
+        slots: {object: (object that holds it, name of the slot)}, one pair per path to it.
+        properties, hierarchy: attributes of `mitsuba.SceneParameters`.
+        names: names of the objects.
     """
 
     def __init__(self, scene: Any):
@@ -48,20 +48,21 @@ class ObjectGraph:
         self.nodes = list(self.owners)
 
     def parameters(self) -> mi.SceneParameters:
-        """Return what `mitsuba.traverse` returns. A texture of the scene itself has the name of its first use in a material or light."""
+        """Return the parameters like `mitsuba.traverse`. A texture that the scene itself holds has the name of its first use in a
+        material or light."""
         return mesh_layout.parameters(self.properties, self.hierarchy)
 
     def notify_other_owners(self, node: Any) -> None:
-        """Have every owner of a shared object that changed update itself. Mitsuba updates those of its first place alone."""
-        told, owner = set(), node
+        """Notify every owner of a shared object that changed. Mitsuba only notifies those along its first place."""
+        notified, owner = set(), node
         while owner is not None:
-            told.add(owner)
+            notified.add(owner)
             owner = self.hierarchy[owner][0]
         for chain in self.chains(node):
             for owner in chain[1:]:
-                if owner not in told and not isinstance(owner, (mi.Shape, mi.Scene, mi.Sensor)):
+                if owner not in notified and not isinstance(owner, (mi.Shape, mi.Scene, mi.Sensor)):
                     owner.parameters_changed([])
-                    told.add(owner)
+                    notified.add(owner)
 
     def of(self, kind: str) -> list[Any]:
         """Return the objects of a kind: "bsdf", "emitter", "medium" or "shape"."""
@@ -78,7 +79,7 @@ class ObjectGraph:
         ]
 
     def chains(self, node: Any, above: tuple[Any, ...] = ()) -> Iterator[list[Any]]:
-        """Yield every chain of objects from `node` up to the scene; `above` is what the caller passed on its way to `node`."""
+        """Yield every chain of objects from `node` up to the scene. `above` contains the nodes already visited."""
         owners = [owner for owner in self.owners.get(node, ()) if owner not in above]
         if not owners:
             yield [node]
@@ -96,42 +97,42 @@ class ObjectGraph:
             raise InputError(
                 "scene: two loads of the description have different objects; expected equal ones, or use --method plain"
             )
-        found = {}
+        result = {}
         for kind in _KINDS:
             source, target = object_ids(kind, self.of(kind)), object_ids(kind, other.of(kind))
             table = np.zeros(int(source.max(initial=0)) + 1, np.uint32)
             table[source] = target
-            found[kind] = mi.UInt32(table)
+            result[kind] = mi.UInt32(table)
         self.check_complete()
-        return found
+        return result
 
     def check_complete(self) -> None:
-        """Raise `InputError` for an object that a path can meet and that its owner's `traverse` does not show."""
+        """Raise `InputError` for an object that a path can meet but its owner's `traverse` does not show."""
         shown = {kind: set(self.of(kind)) for kind in _KINDS}
         shapes = [
             shape for shape in all_shapes(self._scene) if shape.class_name() != "Instance"
-        ]  # its children are hit, not it
+        ]  # rays hit its children instead
         for owner in (*shapes, *self._scene.emitters(), *self._scene.sensors()):
             for kind, item in _held(owner):
                 if item is not None and item not in shown[kind]:
                     name = owner.id() or owner.class_name()
                     raise InputError(
-                        f"scene: the {kind} of {name} ({item.class_name()}) is hidden from mitsuba.traverse, so its previous state cannot "
-                        "be found; announce it in the plugin's traverse(), or use --method plain"
+                        f"scene: the {kind} of {name} ({item.class_name()}) is hidden from mitsuba.traverse, so its previous state is "
+                        "unknown; declare it in the plugin's traverse(), or use --method plain"
                     )
 
 
 def _held(owner: Any) -> list[tuple[str, Any]]:
-    """What a path can reach from a shape, an emitter or a sensor by a pointer."""
+    """Return the objects that a path can access from a shape, an emitter or a sensor by a pointer."""
     if isinstance(owner, mi.Shape):
         media = [("medium", owner.interior_medium()), ("medium", owner.exterior_medium())]
         return [("shape", owner), ("bsdf", owner.bsdf()), ("emitter", owner.emitter()), *media]
-    found = [("medium", owner.get_medium())]
-    return [*found, ("emitter", owner)] if isinstance(owner, mi.Emitter) else found
+    medium = [("medium", owner.get_medium())]
+    return [*medium, ("emitter", owner)] if isinstance(owner, mi.Emitter) else medium
 
 
 def all_shapes(scene: Any) -> list[Any]:
-    """Return all shapes that have surfaces or media of their own: those of the scene, and the children of its shape groups behind them."""
+    """Return all shapes with their own surfaces or media: those of the scene, followed by the children of its shape groups."""
     shapes = scene.shapes()
     if not has_instances(scene):
         return shapes
@@ -141,7 +142,7 @@ def all_shapes(scene: Any) -> list[Any]:
 
 
 def has_instances(scene: Any) -> bool:
-    """Whether the scene has instances of shape groups."""
+    """Return whether the scene has instances of shape groups."""
     return any(shape.class_name() == "Instance" for shape in scene.shapes())
 
 
@@ -157,10 +158,10 @@ def object_ids(kind: str, items: Iterable[Any]) -> np.ndarray:
 
 @cache
 def _visitor(_variant: str) -> type:
-    """Return the visitor of a variant: its base class exists only under one."""
+    """Return the visitor class of a variant: its base class depends on the variant."""
 
     class Visitor(mi.TraversalCallback):
-        """Fills a graph with everything below a node, each object once, by the names that `mitsuba.traverse` gives."""
+        """Visitor that adds everything below a node to a graph, each object once, with the names of `mitsuba.traverse`."""
 
         def __init__(self, graph: ObjectGraph, node: Any, depth: int = 0, name: str | None = None, flags: int = 0):
             super().__init__()
@@ -175,27 +176,27 @@ def _visitor(_variant: str) -> type:
             self.deferred: list[tuple[str, Any, int]] = []
 
         def visit(self) -> None:
-            """Visit what the node holds. Textures of the scene, which keep no id, come last: by then, their users have named them."""
+            """Visit the node's members. Textures of the scene, which have no id, come last, since their users name them."""
             self.node.traverse(self)
-            for waiting in self.deferred:
-                self._enter(*waiting)
+            for arguments in self.deferred:
+                self._enter(*arguments)
 
         def put(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            """Take a value or an object."""
+            """Add a value or an object."""
             if isinstance(value, mi.Object):
                 self.put_object(name, value, flags)
             else:
                 self.put_value(name, value, flags, cpptype)
 
         def put_value(self, name: str, value: Any, flags: int, cpptype: Any = None) -> None:
-            """Take a value; one that is None, such as the `sigma_a` of a hair BSDF with pigments, is no parameter."""
+            """Add a value. None, such as the `sigma_a` of a hair BSDF with pigments, is not a parameter."""
             if (self.flags | flags) & mi.ParamFlags.NonDifferentiable:
                 flags &= ~mi.ParamFlags.Discontinuous
             if value is not None:
                 self.graph.properties[self._full(name)] = value, cpptype, self.node, self.flags | flags
 
         def put_object(self, name: str, value: Any, flags: int) -> None:
-            """Take an object, now or at the end."""
+            """Add an object, immediately or deferred."""
             if self.depth == 0 and isinstance(value, mi.Texture):
                 self.deferred.append((name, value, flags))
             elif value is not None:

@@ -1,4 +1,4 @@
-"""Loading a scene description, with errors in one line."""
+"""Loading of scene descriptions, with one-line errors."""
 
 from __future__ import annotations
 
@@ -25,31 +25,34 @@ from unrender.rendering.mitsuba.equal_objects import equal_objects
 from unrender.rendering.mitsuba.scene_graph import all_shapes
 
 SceneDescription = str | Path | dict | Callable[[], Any] | Any
-"""An XML file, a Mitsuba dictionary, or a function that returns one (called twice, so that ready-made objects such as
-meshes are made twice); or a loaded `mi.Scene`, of which there is one state only."""
+"""An XML file, a Mitsuba dictionary, a function that returns one, or a loaded `mi.Scene`, which has one state only.
+
+The function is called twice, so that ready-made objects such as meshes are created twice."""
 
 
 def load(description: SceneDescription) -> mi.Scene:
-    """One Mitsuba scene. Meshes are not merged, so that two loads have their shapes in the same order.
+    """Return a Mitsuba scene. Meshes are not merged, so two loads have their shapes in the same order.
 
-    Raises `InputError` in one line where the file is missing or Mitsuba refuses the description.
+    Raises `InputError` in one line if the file is missing or Mitsuba refuses the description.
     """
     return load_resolved(description)[0]
 
 
 def is_loaded(description: SceneDescription) -> bool:
-    """Whether it is a scene in memory, of any variant, and no description of one."""
+    """Return whether it is a loaded scene, of any variant, instead of a description."""
     return type(description).__module__.partition(".")[0] == "mitsuba" and type(description).__name__ == "Scene"
 
 
 def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict, tuple[tuple[str, ...], ...]]:
-    """As `load`, and what was loaded: the file's path, or the dictionary without data (`_outline`); nothing in it for a scene that was
-    loaded before. And the names of its `equal_objects`."""
+    """Return a Mitsuba scene, what it was loaded from, and its `equal_objects`.
+
+    The second item is the file's path, or the dictionary without data (`_outline`). It is empty for a scene that the user has loaded.
+    """
     variant.ensure()
     emissive.register()
     turntable_light.register()
     if is_loaded(description):
-        return _loaded_before(description), {}, ()
+        return _checked_scene(description), {}, ()
     if callable(description):
         description = description()
     name = str(description) if isinstance(description, (str, Path)) else "dictionary"
@@ -77,17 +80,17 @@ def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict,
 
 
 def _outline(description: dict[str, Any]) -> dict[str, Any]:
-    """A dictionary without the grids, bitmaps and arrays in memory that it hands to plugins: the scene has copies of them."""
-    found = {key: _outline(value) if isinstance(value, dict) else value for key, value in description.items()}
-    return {key: value for key, value in found.items() if not _is_data(value)}
+    """Return a dictionary without the grids, bitmaps and arrays that it passes to plugins: the scene has copies of them."""
+    nested = {key: _outline(value) if isinstance(value, dict) else value for key, value in description.items()}
+    return {key: value for key, value in nested.items() if not _is_data(value)}
 
 
 def _is_data(value: Any) -> bool:
-    large = isinstance(value, np.ndarray) and value.size > 16  # no transform
+    large = isinstance(value, np.ndarray) and value.size > 16  # larger than a transform
     return large or isinstance(value, (mi.VolumeGrid, mi.Bitmap)) or dr.is_tensor_v(value)
 
 
-def _loaded_before(scene: Any) -> mi.Scene:
+def _checked_scene(scene: Any) -> mi.Scene:
     if not isinstance(scene, mi.Scene):
         raise InputError(
             f"scene: it was loaded under another variant than {mi.variant()}; call unrender.use() before loading it"
@@ -97,55 +100,56 @@ def _loaded_before(scene: Any) -> mi.Scene:
 
 def _with_sensor(scene: mi.Scene) -> mi.Scene:
     if not scene.sensors():
-        raise InputError("scene: it has no sensor, and nothing can be rendered without one")
+        raise InputError("scene: it has no sensor; add one")
     return scene
 
 
 def _one_line(error: Exception) -> str:
-    if own := re.search(r"InputError: (.+)", str(error)):  # of a plugin of ours, under Mitsuba's traceback
+    if own := re.search(r"InputError: (.+)", str(error)):  # from a plugin of this package, within Mitsuba's traceback
         return own[1]
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return " ".join(lines)[:400] or type(error).__name__
 
 
 def media(scene: mi.Scene) -> list[mi.Medium]:
-    """All participating media of a scene, once for each place they are in, in an order that two loads share."""
+    """Return all participating media of a scene, once for each attachment, in an order that two loads share."""
     return [medium for _, medium in attached_media(scene)]
 
 
 MediumKey = tuple[str, str, int]
-"""The id of a shape or sensor; "interior", "exterior" or "medium"; how many of the same name came before, since shapes of an XML file may
-have no id."""
+"""(id of a shape or sensor, "interior", "exterior" or "medium", number of earlier entries of the same name).
+
+The number is needed since shapes of an XML file may have no id."""
 
 
 def attached_media(scene: mi.Scene) -> list[tuple[MediumKey, Any]]:
-    """All participating media of a scene, once for each shape side or sensor that has one, in an order that two loads share."""
+    """Return all participating media of a scene, once for each shape side or sensor that has one, in an order that two loads share."""
     shapes, sensors = all_shapes(scene), scene.sensors()
-    found = [
+    entries = [
         ((shape.id(), side), medium)
         for shape in shapes
         for side, medium in (("interior", shape.interior_medium()), ("exterior", shape.exterior_medium()))
     ]
-    found += [((sensor.id(), "medium"), sensor.get_medium()) for sensor in sensors]
-    return _numbered((owner, medium) for owner, medium in found if medium is not None)
+    entries += [((sensor.id(), "medium"), sensor.get_medium()) for sensor in sensors]
+    return _numbered((owner, medium) for owner, medium in entries if medium is not None)
 
 
 def _numbered(slots: Iterable[tuple[tuple[str, str], Any]]) -> list[tuple[MediumKey, Any]]:
     before: Counter[tuple[str, str]] = Counter()
-    found = []
-    for owner, held in slots:
-        found.append(((*owner, before[owner]), held))
+    result = []
+    for owner, medium in slots:
+        result.append(((*owner, before[owner]), medium))
         before[owner] += 1
-    return found
+    return result
 
 
 def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumKey, np.ndarray]:
-    """The affine map (4, 4) from [0, 1]³ to the world of each medium's extinction grid.
+    """Return the affine map (4, 4) from [0, 1]³ to the world of each medium's extinction grid.
+
+    Media and volumes that are ready-made objects are omitted.
 
     Args:
-        description: an XML file or a Mitsuba dictionary, of a scene that Mitsuba loads.
-
-    Media and volumes that are ready-made objects have none.
+        description: an XML file or a Mitsuba dictionary of a valid scene.
     """
     nodes: Any = parse(description).state.nodes
     top = list(_children(nodes, nodes[0]).values())
@@ -163,7 +167,7 @@ def extinction_transforms(description: Path | Mapping[str, Any]) -> dict[MediumK
 
 
 def _children(nodes: Any, node: Any) -> dict[str, Any]:
-    """The nodes that a node holds, by property."""
+    """Return the nodes that a node holds, by property."""
     props = node.props
     resolved = mi.Properties.Type.ResolvedReference
     return {name: nodes[props[name].index()] for name in props.keys() if props.type(name) == resolved}  # noqa: SIM118
@@ -180,7 +184,7 @@ def _transform(nodes: Any, medium: Any) -> np.ndarray | None:
     if props.get("use_grid_bbox", False) and "filename" in props:
         try:
             box = np.array(read_grid(props["filename"]).box).reshape(2, 3)
-        except InputError:  # found by Mitsuba on another path
+        except InputError:  # Mitsuba finds the file on another search path
             return None
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = np.diag(box[1] - box[0]), box[0]
@@ -190,8 +194,8 @@ def _transform(nodes: Any, medium: Any) -> np.ndarray | None:
 
 _RAW = re.compile(r"^\s*raw = (1|true)\b", re.MULTILINE)
 _ENVIRONMENT_COLUMNS = 1
-"""Columns that Mitsuba adds at each end of an environment map, and copies anew whenever its data change."""
-_KEPT = ("to_world", "face_normals", "flip_normals", "flip_tex_coords")
+"""Columns that Mitsuba adds at each end of an environment map, and recomputes whenever its data change."""
+_SHAPE_OPTIONS = ("to_world", "face_normals", "flip_normals", "flip_tex_coords")
 _INDEXED = "serialized"
 
 
@@ -199,8 +203,8 @@ def conversion(parameters: mi.SceneParameters, key: str, description: SceneDescr
     """Return how Mitsuba converts a file to the values of the parameter `key`.
 
     Args:
-        parameters: of the loaded scene.
-        key: of a parameter that is an array.
+        parameters: parameters of the loaded scene.
+        key: key of a parameter that is an array.
         description: what the scene was loaded from; its shapes place the vertices of mesh files.
     """
     value, node = parameters[key], parameters.properties[key][2]
@@ -214,37 +218,37 @@ def conversion(parameters: mi.SceneParameters, key: str, description: SceneDescr
 
 
 def read_vertices(description: SceneDescription, key: str, path: Path) -> np.ndarray:
-    """Return values at the vertices of a mesh file, as if the scene's shape named that file.
+    """Return values at the vertices of a mesh file, as if the scene's shape referenced that file.
 
-    Mitsuba loads the file: with the shape's transform, its own order of vertices, and the duplicates that it makes for normals and
+    Mitsuba loads the file with the shape's transform, its own order of vertices, and the duplicates that it makes for normals and
     texture coordinates.
 
     Args:
-        description: of the scene.
+        description: description of the scene.
         key: such as "block.vertex_positions".
-        path: of an .obj, .ply or .serialized file.
+        path: an .obj, .ply or .serialized file.
 
     Returns:
         (n V,) float32.
 
     Raises:
-        InputError: the file cannot be read or has no such values, or the scene does not tell how its shape is placed.
+        InputError: the file cannot be read or has no such values, or the scene does not state how its shape is placed.
     """
     if bounded_files.kind(path) != "file":
         raise InputError(f"{path}: {bounded_files.no_file(path)}")
     owner, _, name = key.rpartition(".")
-    given: Any = description() if callable(description) else description
-    if is_loaded(given):
+    resolved: Any = description() if callable(description) else description
+    if is_loaded(resolved):
         raise InputError(
-            f"{path}: a loaded scene does not tell how its shapes are placed; give the .xml file or an array"
+            f"{path}: a loaded scene does not expose the transforms of its shapes; give the .xml file or an array"
         )
-    parsed = loading.parse(Path(given) if isinstance(given, (str, Path)) else given)
+    parsed = loading.parse(Path(resolved) if isinstance(resolved, (str, Path)) else resolved)
     shape = next((node.props for node in parsed.state.nodes if node.props.id() == owner), None)
     if shape is None:
-        raise InputError(f"{path}: the scene's description has no shape of the name {owner}; give an array")
+        raise InputError(f"{path}: the scene's description has no shape named {owner}; give an array")
     plugin = path.suffix.lower().removeprefix(".")
     named: dict[str, Any] = {"type": plugin, "filename": str(path.resolve())}
-    named |= {option: shape[option] for option in _KEPT if option in shape}
+    named |= {option: shape[option] for option in _SHAPE_OPTIONS if option in shape}
     if plugin == _INDEXED and "shape_index" in shape:
         named["shape_index"] = shape["shape_index"]
     try:

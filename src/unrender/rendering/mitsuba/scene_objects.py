@@ -1,4 +1,4 @@
-"""The objects of a scene, the slots that hold them, and plugins that cannot be rendered here."""
+"""Objects of a scene with the slots that hold them, and plugins that cannot be rendered."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.renderer import ReplacedMesh
 
 Holders = Mapping[Any, list[tuple[Any, str]]]
-"""{object: (object that holds it, name of the slot)}, a pair for every way to it."""
+"""{object: (object that holds it, name of the slot)}, one pair per path to it."""
 
 _SPECTRAL_ONLY = {
     "RegularSpectrum": "regular",
@@ -22,29 +22,29 @@ _SPECTRAL_ONLY = {
     "BlackBodySpectrum": "blackbody",
     "TimedSunskyEmitter": "timed_sunsky",
 }
-"""{class: plugin} of what Mitsuba loads in RGB variants and cannot evaluate there."""
+"""{class: plugin} of plugins that Mitsuba loads in RGB variants but cannot evaluate there."""
 _PRIMITIVE_FIELD = "BasicVolumetricPrimitiveRadianceFieldIntegrator"
 
 
 def refusal(scene: Any, objects: Iterable[Any]) -> str:
-    """Return why a scene has a plugin that cannot be rendered, or not as its author means it; "" where it has none.
+    """Return the reason why a scene's plugin cannot be rendered as its author intends; "" if all can.
 
-    Nothing is raised here: an error would keep the scene alive, and calls through pointers reach all living objects.
+    This function does not raise: an exception would keep the scene alive, and virtual calls reach all living objects.
     """
     names = {class_name(node) for node in objects}
-    found = "" if str(mi.variant()).endswith("_spectral") else next(iter(names & _SPECTRAL_ONLY.keys()), "")
-    if found:
-        plugin = _SPECTRAL_ONLY[found]
+    spectral = "" if str(mi.variant()).endswith("_spectral") else next(iter(names & _SPECTRAL_ONLY.keys()), "")
+    if spectral:
+        plugin = _SPECTRAL_ONLY[spectral]
         instead = "a sunsky" if plugin == "timed_sunsky" else "an rgb colour"
         return f"Mitsuba cannot evaluate the plugin {plugin} in the variant {mi.variant()}; give {instead} in its place"
     if type(scene.integrator()).__name__ == _PRIMITIVE_FIELD:
         return (
-            "the integrator volprim_rf_basic renders ellipsoids as a radiance field, and paths see surfaces there; "
+            "the integrator volprim_rf_basic renders ellipsoids as a radiance field, but path tracing treats them as surfaces; "
             "give the field as a medium of type emissive"
         )
     if "DirectionalArea" in names:
         return (
-            "paths from the camera cannot find the light of a directionalarea emitter, so the picture would lack it; "
+            "camera paths cannot sample a directionalarea emitter, so the image would lack its light; "
             "give a directional, spot or projector emitter in its place"
         )
     return ""
@@ -52,9 +52,9 @@ def refusal(scene: Any, objects: Iterable[Any]) -> str:
 
 def children(node: Any) -> list[tuple[str, Any]]:
     """Return the objects that an object holds, with the names of their slots."""
-    found = _callback(mi.variant())()
-    node.traverse(found)
-    return found.objects
+    callback = _callback(mi.variant())()
+    node.traverse(callback)
+    return callback.objects
 
 
 def class_name(node: Any) -> str:
@@ -64,7 +64,7 @@ def class_name(node: Any) -> str:
 
 @cache
 def _callback(variant: str | None) -> Any:
-    del variant  # the base class is that of the variant that is set
+    del variant  # a cache key only: the base class belongs to the active variant
 
     class Children(mi.TraversalCallback):
         def __init__(self) -> None:
@@ -88,7 +88,7 @@ def _callback(variant: str | None) -> Any:
 
 
 def replace_meshes(scene: Any, meshes: Mapping[str, ReplacedMesh]) -> None:
-    """Give shapes of a scene, by their ids, other meshes. Raises `InputError` where a shape is none, or texture coordinates are missing."""
+    """Replace the meshes of a scene's shapes, by id. Raise `InputError` if a shape is not a mesh, or texture coordinates do not match."""
     if not meshes:
         return
     parameters = mesh_layout.traverse(scene)
@@ -96,7 +96,7 @@ def replace_meshes(scene: Any, meshes: Mapping[str, ReplacedMesh]) -> None:
     for name, mesh in meshes.items():
         shape = shapes.get(name)
         if shape is None or not shape.is_mesh():
-            raise InputError(f"{name}: no mesh of the scene")
+            raise InputError(f"{name}: the scene has no mesh of this id")
         if mesh_layout.has_texcoords(shape) != (mesh.uv is not None):
             raise InputError(f"{name}: texture coordinates are missing, or the mesh has none")
         parameters[f"{name}.{mesh_layout.FACES}"] = mi.UInt32(mesh.faces.ravel().astype(np.uint32))

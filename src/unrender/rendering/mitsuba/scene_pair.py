@@ -1,7 +1,7 @@
-"""One scene description, loaded twice: the *current* and the *previous* state, and the tables that lead from one to the other.
+"""A scene description loaded twice, as the *current* and the *previous* state, with tables that map objects of one to the other.
 
-Paths are traced in the current scene only. At a hit, the BSDF, emitter or shape of the previous state is found by a gather
-from pointer id to pointer id. No adapter plugin is needed, and every BSDF that Mitsuba can nest is served.
+Paths are traced in the current scene only. At a hit, a gather from pointer id to pointer id gives the BSDF, emitter or shape of the
+previous state. This needs no adapter plugin, and supports every BSDF that Mitsuba can nest.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, SampleReque
 __all__ = ["SINGLE", "ScenePair"]
 
 SINGLE = (
-    "scene: a loaded mi.Scene has one state, and comparing two (a control variate, meta-estimation) takes two; give what it "
-    "was loaded from, the .xml file or the dictionary, or take images.Plain()"
+    "scene: a loaded mi.Scene has one state, but a control variate or meta-estimation needs two; give the .xml file or "
+    "the dictionary instead, or use images.Plain()"
 )
-"""Why a scene that the user has loaded cannot be a pair."""
+"""Error message for a pair of states of a scene that the user has loaded."""
 
 
 class ScenePair:
@@ -64,11 +64,11 @@ class ScenePair:
 
     Args:
         description: what to load.
-        moving: ids of shapes that move; the spheres among them become meshes.
-        replaced: {id of a shape: what its mesh is to be}; not of a scene that the user has loaded.
+        moving: ids of shapes that move; spheres among them become meshes.
+        replaced: {id of a shape: its new mesh}; not for a scene that the user has loaded.
 
     Attributes:
-        single: whether there is one state only, since the scene was loaded by the user.
+        single: whether there is one state only, since the user has loaded the scene.
         volumetric: whether there is a participating medium.
         resolutions: (height, width) of each sensor's film, after cropping.
     """
@@ -82,7 +82,7 @@ class ScenePair:
         self.description, self.moving, self.replaced = description, moving, dict(replaced or {})
         self.single = is_loaded(description)
         if self.single and self.replaced:
-            raise InputError("a scene that was loaded before keeps its meshes: give the .xml file or the dictionary")
+            raise InputError("meshes of a loaded scene cannot be replaced; give the .xml file or the dictionary")
         self._current = LoadedScene(description, moving, self.replaced)
         self._previous: LoadedScene | None = None
         self.volumetric = bool(media(self.current))
@@ -101,7 +101,7 @@ class ScenePair:
         self._emitters: dict[bool, tuple[np.ndarray, dict[str, Any]]] = {}
 
     def loaded(self, previous: bool = False) -> LoadedScene:
-        """The first load or, with `previous`, the second one, which is made when first asked for."""
+        """Return the first load or, with `previous`, the second one, which is loaded on first use."""
         if not previous:
             return self._current
         if self.single:
@@ -112,37 +112,37 @@ class ScenePair:
         return self._previous
 
     def as_described(self) -> LoadedScene:
-        """The first load or, where spheres of it have become meshes, one in which they are spheres."""
+        """Return the first load, or a load with the original spheres if some of them became meshes."""
         return LoadedScene(self.description, replaced=self.replaced) if self._current.meshed else self._current
 
     @property
     def current(self) -> mi.Scene:
-        """The first load."""
+        """Scene of the first load."""
         return self._current.scene
 
     @property
     def previous(self) -> mi.Scene:
-        """The second load."""
+        """Scene of the second load."""
         return self.loaded(previous=True).scene
 
     @property
     def current_parameters(self) -> mi.SceneParameters:
-        """Of the first load."""
+        """Parameters of the first load."""
         return self._current.parameters
 
     @property
     def previous_parameters(self) -> mi.SceneParameters:
-        """Of the second load."""
+        """Parameters of the second load."""
         return self.loaded(previous=True).parameters
 
     def clear_gradients(self) -> None:
-        """Forget the gradients of all leaves of both scenes."""
+        """Clear the gradients of all leaves of both scenes."""
         self._current.clear_gradients()
         if self._previous is not None:
             self._previous.clear_gradients()
 
     def films(self, request: SampleRequest) -> film.Films | None:
-        """What the rays of a request need to know of the films; None where one sensor, with a box filter, has all pixels."""
+        """Return the film data that the rays of a request need; None if all pixels belong to one sensor with a box filter."""
         if self._films is None:
             self._films = film.Films.of(self.current.sensors())
         if request.sensors is None and is_box(self.current.sensors()[request.sensor].film()):
@@ -150,7 +150,7 @@ class ScenePair:
         return replace(self._films, which=request.sensors)
 
     def check_separate(self, keys: list[str]) -> None:
-        """Raise `InputError` where there are no two loads, or where they share the object that holds a parameter."""
+        """Raise `InputError` if there is one load only, or if both loads share the object that holds a parameter."""
         if self.single:
             raise InputError(SINGLE)
         for key in keys:
@@ -161,24 +161,24 @@ class ScenePair:
                 )
 
     def tables(self) -> dict[str, mi.UInt32]:
-        """Return the pointer tables {"bsdf" | "emitter" | "shape" | "medium": UInt32}, from registry ids of current to those of previous.
+        """Return pointer tables {"bsdf" | "emitter" | "shape" | "medium": UInt32} from registry ids of current to those of previous.
 
-        They hold every object of the scene: children of shape groups, nested BSDFs and media of both sides of a shape too.
+        They contain every object of the scene, including children of shape groups, nested BSDFs and media on both sides of a shape.
         """
         if self._tables is None:
             self._tables = self.loaded().graph.tables(self.loaded(previous=True).graph)
         return self._tables
 
     def emitter_tables(self, previous: bool, probabilities: np.ndarray) -> dict[str, Any]:
-        """See `emitter_tables.emitter_tables`; made anew where the probabilities are others than the last."""
+        """Return `emitter_tables.emitter_tables`, cached for the last probabilities."""
         known = self._emitters.get(previous)
         if known is None or not np.array_equal(known[0], probabilities):
-            found = emitter_tables(self.loaded(previous).scene, probabilities)
-            known = self._emitters[previous] = np.array(probabilities), found
+            tables = emitter_tables(self.loaded(previous).scene, probabilities)
+            known = self._emitters[previous] = np.array(probabilities), tables
         return known[1]
 
     def moved_tables(self, moving: AbstractSet[str]) -> dict[str, Any]:
-        """The tables of `MovedPair.sample`, for the values that both scenes hold now; `moving`: ids of the meshes that may move."""
+        """Return the tables of `MovedPair.sample` for the current values of both scenes. `moving`: ids of the meshes that may move."""
         meshes = [
             (now, before)
             for now, before in zip(self.current.shapes(), self.previous.shapes(), strict=True)
@@ -199,19 +199,22 @@ class ScenePair:
                 "triangles": mi.UInt32(triangles),
                 "emitters": self._emitter_bounds(moving),
             }
-        positions = [[dr.detach(mesh_layout.positions(of)) for of in states] for states in meshes]
-        # The same memory, which nobody can have written to since it is referenced here, has the same tables.
-        indices = [[of.index for of in states] for states in positions]
+        positions = [[dr.detach(mesh_layout.positions(mesh)) for mesh in states] for states in meshes]
+        # Identical memory has identical tables: it cannot be overwritten while it is referenced here.
+        indices = [[mesh.index for mesh in states] for states in positions]
         if self._moved_values is None or self._moved_values[0] != indices:
             with dr.suspend_grad():
                 ratios = [mesh_layout.areas(before) / mesh_layout.areas(now) for now, before in meshes]
-                found = {"area_ratios": dr.concat([mi.Float(1), *ratios]), "ellipsoids": bounding_ellipsoids(positions)}
-            dr.eval(found)
-            self._moved_values = indices, positions, found
+                values = {
+                    "area_ratios": dr.concat([mi.Float(1), *ratios]),
+                    "ellipsoids": bounding_ellipsoids(positions),
+                }
+            dr.eval(values)
+            self._moved_values = indices, positions, values
         return self._moved[frozenset(moving)] | self._moved_values[2]
 
     def _emitter_bounds(self, moving: AbstractSet[str]) -> mi.Float | None:
-        """About all that emits; None where there is an environment, or an emitter that moves."""
+        """Return bounding ellipsoids of all emitters; None with an environment, or if an emitter moves."""
         shapes = [emitter.get_shape() for emitter in self.current.emitters()]
         shapes = [shape for shape in shapes if shape is not None]
         if self.current.environment() is not None or any(shape.id() in moving for shape in shapes):
@@ -221,13 +224,13 @@ class ScenePair:
         return bounding_ellipsoids(corners) if corners else None
 
     def delta_table(self, all_traits: Sequence[ParameterTraits]) -> mi.UInt32:
-        """How perfectly specular lobes follow these parameters, one of the `DELTA_...` constants by the registry ids of the current
-        scene's BSDFs and, through the pointer tables, of the previous scene's."""
+        """Return how perfectly specular lobes depend on these parameters: one of the `DELTA_...` constants by registry id of the BSDFs
+        of the current and, through the pointer tables, of the previous scene."""
         changing = {bsdf: kind for traits in all_traits for bsdf, kind in traits.delta_lobes}
         numbers = object_ids("bsdf", changing)
         kinds = dict(zip(numbers.tolist(), changing.values(), strict=True))
         pointers = object_ids("bsdf", self.loaded().graph.of("bsdf"))
-        if kinds and not self.single:  # only then is the second load worth its while
+        if kinds and not self.single:  # avoids the second load otherwise
             previous = self.tables()["bsdf"].numpy()
             kinds |= {int(previous[number]): kind for number, kind in kinds.items()}
         table = np.zeros(max(int(pointers.max(initial=0)), *kinds, 0) + 1, np.uint32)
@@ -236,26 +239,25 @@ class ScenePair:
         return mi.UInt32(table)
 
     def media(self, previous: bool, sensor: int | None) -> dict[str, mi.UInt32]:
-        """Tables of one of the two scenes {"camera" | "emits": UInt32}: the registry id of the medium that a sensor stands in, 0 for none,
-        or of each sensor; by registry ids, 1 for media that emit."""
+        """Return tables of one scene: "camera", registry id of the medium around the sensor or around each sensor, 0 for none; and
+        "emits", 1 for media that emit, by registry id."""
         if (previous, sensor) not in self._media:
             scene = self.previous if previous else self.current
             if previous not in self._cameras:
                 self._cameras[previous] = [medium_id(medium) for medium in camera_media(scene, quiet=previous)]
             cameras = self._cameras[previous]
             camera = mi.UInt32(cameras) if sensor is None else dr.opaque(mi.UInt32, cameras[sensor])
-            found = {medium_id(medium): emissive.emits(medium) for medium in media(scene)}
-            emits = np.zeros(max(found, default=0) + 1, np.uint32)
-            for number, shines in found.items():
-                emits[number] = shines
+            emission = {medium_id(medium): emissive.emits(medium) for medium in media(scene)}
+            emits = np.zeros(max(emission, default=0) + 1, np.uint32)
+            for number, value in emission.items():
+                emits[number] = value
             tables = {"camera": camera, "emits": mi.UInt32(emits)}
             self._media[previous, sensor] = tables
         return self._media[previous, sensor]
 
     def majorants(self, previous: bool, both: bool) -> dict[str, mi.UInt32]:
-        """The majorant supergrids of one of the two scenes, by its registry ids, from the values that it holds now; of `both`,
-        bounds of both. {"frames" | "layout" | "every"} as in `MajorantSupergrids`, "majorants": its values; nothing where no medium
-        has such a grid."""
+        """Return the majorant supergrids of one scene for its current values, by its registry ids; with `both`, bounds of both scenes.
+        The keys are "frames", "layout" and "every" as in `MajorantSupergrids`, and "majorants", its values. Empty without such grids."""
         grids = self._grids(previous)
         if not grids:
             return {}
@@ -278,7 +280,7 @@ class ScenePair:
         return self._majorants[previous]
 
     def _check_media(self) -> None:
-        """Raise `InputError` where the scene itself gives a medium values that make no sense: Mitsuba takes them as they are."""
+        """Raise `InputError` for unphysical medium values in the scene, which Mitsuba does not check."""
         for key in self.current_parameters.keys():  # noqa: SIM118 (iterating gives pairs)
             if not self._traits(key).medium:
                 continue
@@ -299,23 +301,23 @@ class ScenePair:
 
     @property
     def radiance_field(self) -> bool:
-        """Whether all media emit, and more than nothing in every direction."""
+        """Whether all media emit in every direction."""
         return all(emissive.is_positive(medium) for medium in media(self.current))
 
     def parameter_traits(self, key: str) -> ParameterTraits:
-        """How the parameter `key` reaches the picture."""
+        """Return the traits of the parameter `key`."""
         traits = self._traits(key)
         if self.volumetric and traits.geometric:
             return replace(traits, reason=f"{traits.reason}, in a scene with media", replayable=False)
         if self.volumetric and any(kind == DELTA_MASK for _, kind in traits.delta_lobes):
-            # Connections to emitters pass masks, and their derivative would be needed there too.
+            # Emitter-sampling connections pass through masks, so their derivative would be needed there as well.
             return replace(traits, reason="it is the opacity of a mask in a scene with media", replayable=False)
         return traits
 
     def _traits(self, key: str) -> ParameterTraits:
         if key in self._current.poses:
             bare = is_bare(self.current, self._current.poses.key(key).target)
-            return ParameterTraits(True, "it moves an object as a whole", light=bare)
+            return ParameterTraits(True, "it moves an object rigidly", light=bare)
         return parameter_traits(self.current_parameters, key, self.loaded().graph)
 
     def physical_range(self, key: str) -> Range:
@@ -323,12 +325,12 @@ class ScenePair:
         return self._current.readers.range_of(self.current_parameters, key)
 
     def info(self) -> Mapping[str, ParameterInfo]:
-        """`ParameterInfo` of every parameter of the scene."""
-        found = {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
-        return {key: self._with_meaning(key, info) if info.perturbable else info for key, info in found.items()}
+        """Return `ParameterInfo` of every parameter of the scene."""
+        infos = {key: self._info(key) for key in self.current_parameters.keys()}  # noqa: SIM118 (iterating gives pairs)
+        return {key: self._with_meaning(key, info) if info.perturbable else info for key, info in infos.items()}
 
     def _with_meaning(self, key: str, info: ParameterInfo) -> ParameterInfo:
-        """`info` with what the values of the parameter stand for, and what a file becomes."""
+        """Return `info` with the role, brightness, linearity and file conversion of the parameter."""
         conversion = scene_loading.conversion(self.current_parameters, key, self.description)
         kinds = role(self.current_parameters, key, info.shape), brightness(self.current_parameters, key)
         form = is_nonlinear(self.current_parameters, key, info.singular)
@@ -340,25 +342,25 @@ class ScenePair:
         try:
             shape = native_shape(value)
         except TypeError:
-            why = transform_obstacle(self.current, self.current_parameters, key) if key.endswith("to_world") else ""
-            why = why or f"its type {type(value).__name__} has no derivatives"
-            return ParameterInfo((), False, False, why, perturbable=False)
+            reason = transform_obstacle(self.current, self.current_parameters, key) if key.endswith("to_world") else ""
+            reason = reason or f"its type {type(value).__name__} has no derivatives"
+            return ParameterInfo((), False, False, reason, perturbable=False)
         if re.match(r"object_\d{9,}\.", key):
-            why = "its object has no id in the XML, so its name changes; give it one"
-            return ParameterInfo(shape, False, False, why, perturbable=False)
+            reason = "its object has no id in the XML, so its name changes; give it one"
+            return ParameterInfo(shape, False, False, reason, perturbable=False)
         if isinstance(value, (int, float)):
-            why = "it is a plain number, which Mitsuba compiles into its kernels"
-            return ParameterInfo(shape, False, False, why, perturbable=False, compiled=True)
-        if why := "it holds no values" if 0 in shape else update_obstacle(self.current_parameters, key):
-            return ParameterInfo(shape, False, False, why, perturbable=False)
+            reason = "it is a plain number, which Mitsuba compiles into its kernels"
+            return ParameterInfo(shape, False, False, reason, perturbable=False, compiled=True)
+        if reason := "it holds no values" if 0 in shape else update_obstacle(self.current_parameters, key):
+            return ParameterInfo(shape, False, False, reason, perturbable=False)
         if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
-            why = "Mitsuba marks it as not differentiable"
+            reason = "Mitsuba marks it as not differentiable"
             if key.endswith(".data") and dr.is_tensor_v(value):
-                why += ': its texture is stored in 8 bits, load it with format="variant" or from a float file'
+                reason += '; its texture is stored with 8 bits: load it with format="variant" or from a float file'
             able = dr.is_float_v(value) and not flags & mi.ParamFlags.ReadOnly
             limits = self.physical_range(key)
             return ParameterInfo(
-                shape, False, False, why, limits.low, limits.high, perturbable=able, singular=limits.singular
+                shape, False, False, reason, limits.low, limits.high, perturbable=able, singular=limits.singular
             )
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
@@ -380,7 +382,7 @@ class ScenePair:
         )
 
     def _mesh(self, key: str) -> tuple[np.ndarray, np.ndarray]:
-        """The mesh at whose vertices a parameter has values, as loaded."""
+        """Return positions and faces of the mesh at whose vertices a parameter has values, as loaded."""
         owner, _, name = key.rpartition(".")
         mesh = self.current_parameters.properties[key][2]
         moved = name == mesh_layout.POSITIONS
@@ -391,7 +393,7 @@ class ScenePair:
         )
 
     def _resizable(self, key: str, shape: tuple[int, ...]) -> bool:
-        """Whether it is the data of a bitmap texture or a grid volume: these take another resolution when they are updated."""
+        """Return whether it is the data of a bitmap texture or a grid volume, which accept another resolution."""
         node = self.current_parameters.properties[key][2]
         axes = 4 if isinstance(node, mi.Volume) else 3 if isinstance(node, mi.Texture) else 0
         return key.endswith("data") and len(shape) == axes

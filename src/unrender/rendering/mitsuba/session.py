@@ -1,4 +1,4 @@
-"""Images and gradients of a Mitsuba scene, for a set of parameters announced before: recorded kernels, and how they are launched."""
+"""Images and gradients of a Mitsuba scene for a fixed set of parameters, by recorded kernels."""
 
 from __future__ import annotations
 
@@ -47,30 +47,30 @@ from unrender.rendering.mitsuba.tensors import is_broadcast, tensor
 from unrender.rendering.renderer import EmitterMoments, Rendering, SampleRequest, Space
 
 _LANES = 1 << 22
-"""Paths per launch of a batch: what fits a small machine's memory."""
+"""Maximum number of paths per launch of a batch, which fits a small machine's memory."""
 
 
 class MitsubaSession:
-    """Kernels for one set of parameters. Equal arguments give equal results, whatever other sessions do between two calls.
+    """Kernels for one set of parameters. Equal arguments give equal results, independent of other sessions.
 
-    What the two scenes hold when a call begins is of no account: each call sets them to its own parameters, and all others to the
-    scene's own values. Where they hold these already, nothing is done.
+    Each call sets both scenes to its own parameters, and all others to the scene's own values. Values that are already set are not set
+    again.
 
     Args:
         pair: both loads of the scene, which sessions share.
-        keys: the parameters, among them poses that are written into the scene.
-        poses: {key: what it stands for} of the poses by which rays are transformed.
-        derivatives: the parameters that are leaves of the derivative graph: for all of a session or never, since recorded kernels
-            would be recorded anew if that changed between the primal and the adjoint pass. The others change without a derivative.
+        keys: parameters, including poses that are written into the scene.
+        poses: {key: its meaning} of the poses that transform rays.
+        derivatives: parameters that are leaves of the derivative graph, fixed for the session: a change between the primal and the adjoint
+            pass would record kernels again. Other parameters change without a derivative.
         paths: settings of the light paths.
-        sampler: is cloned.
-        differential_bsdf: whether adjoints and tangents of one state sample roughness derivatives apart: see `RoughLobes`.
+        sampler: sampler that is cloned.
+        differential_bsdf: whether adjoints and tangents of one state use differential BSDF sampling of roughness, see `RoughLobes`.
 
     Attributes:
-        dropped: the samples that were not finite.
+        dropped: samples that were not finite.
 
-    Raises `InputError` where poses and other parameters that move geometry come together, or poses with a derivative and poses without:
-    the scenes that posed shapes live in are not rebuilt; and where `differential_bsdf` serves nothing.
+    Raises `InputError` for poses together with other parameters that move geometry, or poses with and without a derivative, since the
+    scenes of posed shapes are not rebuilt; and if `differential_bsdf` supports no parameter.
     """
 
     def __init__(
@@ -86,15 +86,17 @@ class MitsubaSession:
         traits = {key: pair.parameter_traits(key) for key in keys}
         scene = pair.loaded()
         cameras = [key for key in (*keys, *poses) if moved_sensor(scene, key)]
-        moving = next((key for key, of in traits.items() if of.geometric and not of.light and key not in cameras), None)
+        moving = next(
+            (key for key, trait in traits.items() if trait.geometric and not trait.light and key not in cameras), None
+        )
         if poses and moving is not None:
             raise InputError(
-                f"parameter {moving}: it moves geometry, which cannot go with the pose {next(iter(poses))}"
+                f"parameter {moving}: it moves geometry, which cannot be combined with the pose {next(iter(poses))}"
             )
         self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
         moved = {key: moved_shape(scene, key) for key in (*keys, *poses) if key not in cameras}
         moved |= {key: "" for key in keys if key in scene.poses and key not in derivatives}
-        # Of pairs: what moves, and what stands still.
+        # Moving shapes and fixed sensors of a pair.
         self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
         self._related = not any(shape.class_name() in ("Instance", "ShapeGroup") for shape in pair.current.shapes())
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
@@ -105,8 +107,8 @@ class MitsubaSession:
             cameras = [key for key in cameras if key in derivatives]
             if fixed and (other := next((key for key in everything if key in poses or key in cameras), None)):
                 raise InputError(
-                    f"parameter {other}: path gradients move it in the scene itself, which cannot go with the pose "
-                    f"{next(iter(fixed))} without a derivative; take perturbed renders for both"
+                    f"parameter {other}: path gradients move it in the scene itself, which cannot be combined with the pose "
+                    f"{next(iter(fixed))} without a derivative; use perturbed renders for both"
                 )
             shapes = {moved[key] for key in everything if key not in cameras} - {""}
             self._boundary = BoundaryTerm(pair, shapes, paths.max_depth) if shapes else None
@@ -115,7 +117,7 @@ class MitsubaSession:
             self._replays = len(cameras) < len(everything)
             keys = [*keys, *(key for key in poses if key in derivatives)]
         self._pair, self._keys, self._poses, self._attached = pair, keys, fixed, frozenset(derivatives)
-        if fixed:  # path gradients of an earlier session may have left shapes where it moved them
+        if fixed:  # restore shapes that an earlier session has moved
             scene.set_parameters({})
         self._posed = PosedScene(pair.current, fixed) if fixed else None
         if self._posed is not None:
@@ -123,9 +125,9 @@ class MitsubaSession:
         self._posed_previous: PosedScene | None = None
         self._at: dict[bool, mi.Float] = {}
         self._light, self._sampler = paths, sampler
-        self._traits = [of for key, of in traits.items() if key in derivatives]
-        # A recording would not see the numbers of a phase function, nor give their gradient when it is replayed.
-        self._recordable = not any(of.phase for of in traits.values())
+        self._traits = [trait for key, trait in traits.items() if key in derivatives]
+        # A recording does not capture the parameters of a phase function, and its replay gives no gradient by them.
+        self._recordable = not any(trait.phase for trait in traits.values())
         self._delta_table = pair.delta_table(self._traits)
         served = [key for key in keys if key in derivatives] if differential_bsdf and derivatives else None
         self._rough = RoughLobes(pair, served, self._geometric)
@@ -134,7 +136,7 @@ class MitsubaSession:
 
     @cached_property
     def _path_kernel(self) -> Kernel:
-        """The path tracer for these parameters' derivatives."""
+        """Path tracer for the derivatives of these parameters."""
         delta = any(traits.changes_delta for traits in self._traits)
         if not self._pair.volumetric:
             return PathPair(
@@ -161,13 +163,13 @@ class MitsubaSession:
 
     @cached_property
     def _unrelated_kernel(self) -> MovedPair:
-        """Of equal random numbers: nothing is carried along."""
+        """Tracer of pairs with equal random numbers and unrelated paths."""
         return MovedPair(self._light.max_depth, self._light.rr_depth, share=0.0, shared=self._only_meshes)
 
     # ------------------------------------------------------------------ rendering
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """Render. Unbiased."""
+        """Render an unbiased image of each group."""
         if self._posed is not None and not self._attached and request.groups == 1 and request.pixels is None:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
             return Rendering(self.image_batch(stacked, request), None, None)
@@ -177,9 +179,9 @@ class MitsubaSession:
         return Rendering(self.develop(radiance, request), None, Paths(request, radiance))
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
-        """Render many states with the same random numbers. See `RenderSession.image_batch`.
+        """Render many states with the same random numbers, see `RenderSession.image_batch`.
 
-        Where states differ by poses alone: one launch for as many as fit the memory. Otherwise one replay of the recorded kernel for each.
+        States that differ in poses only share launches of as many states as the memory allows. Otherwise each state is one replay.
         """
         count = len(next(iter(parameters.values())))
         shape = (*self._pair.resolutions[request.sensor], 3)
@@ -194,14 +196,14 @@ class MitsubaSession:
         return mi.TensorXf(flat, (count, *shape))
 
     def _batch(self, parameters: Tree, request: SampleRequest) -> mi.Float:
-        """The pixels of states that share all but their poses, one behind the other."""
+        """Return the concatenated pixels of states that share everything except their poses."""
         count = len(next(iter(parameters.values())))
         at = {key: tensor(values[0]) for key, values in parameters.items()}
         if self._posed is None or self._attached:
             self.set_parameters(at)
             radiance = self.run(ImagePass(), request)
         else:
-            detach_all()  # where scenes have tangents now and then, Dr.Jit would record many a step anew
+            detach_all()  # tangents that come and go would make Dr.Jit record kernels again
             self._pair.loaded().set_parameters({key: at[key] for key in self._keys if key in at})
             numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
             radiance = self.run(PosesPass(self._posed, count), request, tensor(numbers).array)
@@ -209,9 +211,9 @@ class MitsubaSession:
         return self.dropped.develop(radiance, request.spp, 1, (count, self.count(request), 3)).array
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """Render two states on the same paths or, with "primary", from the same random numbers. Both unbiased."""
+        """Render unbiased images of two states on the same paths or, with "primary", from the same random numbers."""
         self.set_parameters(current)
-        # A call through a pointer reaches both scenes' objects, and its adjoint would accumulate gradients in all that are attached.
+        # A virtual call reaches both scenes' objects, and its adjoint accumulates gradients in all that are attached.
         self.set_parameters(previous, previous=True, attach=request.both_gradients)
         if space == "primary" and not (self._geometric and self._related):
             radiance = self.run(ImagePass(), request)
@@ -229,9 +231,9 @@ class MitsubaSession:
     # ------------------------------------------------------------------ derivatives
 
     def adjoint(self, parameters: Tree, paths: Paths, weights: mi.TensorXf) -> Tree:
-        """Path replay: the gradient of mean over groups g of sum(weights[g] * images[g]). See `RenderSession.adjoint`."""
+        """Return the gradient of the mean over groups g of sum(weights[g] * images[g]) by path replay, see `RenderSession.adjoint`."""
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
-            # Where a pair collides in a medium depends on both states: so does its replay.
+            # The collisions of a pair in a medium depend on both states, and so does its replay.
             self.set_parameters(parameters)
             self.set_parameters(paths.previous, previous=True, attach=paths.request.both_gradients)
             self.run(AdjointPairPass(both=False), paths.request, paths.radiance, weights, paths.radiance_previous)
@@ -246,8 +248,8 @@ class MitsubaSession:
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Paths, weights: mi.TensorXf, weights_previous: mi.TensorXf
     ) -> tuple[Tree, Tree]:
-        """Path replay of both states of a pair: in path space on one set of paths, in one pass; in primary space, and where shapes move,
-        each on its own, from the same random numbers. See `RenderSession.adjoint_pair`."""
+        """Return the gradients of both states of a pair by path replay, see `RenderSession.adjoint_pair`. Path space takes one pass on
+        shared paths. Primary space, and moving shapes, take one pass per state with the same random numbers."""
         self.set_parameters(current)
         self.set_parameters(previous, previous=True)
         request = paths.request
@@ -255,7 +257,7 @@ class MitsubaSession:
             gradient = self.adjoint(current, Paths(request, paths.radiance), weights)
             if self._replays:
                 radiance = paths.radiance_previous
-                if paths.space == "path":  # of other paths than `prb` would replay
+                if paths.space == "path":  # the pair's paths differ from those that `prb` replays
                     radiance = self.run(ImagePass(previous=True), request)
                     dr.eval(radiance)
                 self.run(AdjointPass(previous=True), request, radiance, weights_previous)
@@ -275,7 +277,7 @@ class MitsubaSession:
         if not self._replays:
             raise InputError(no_tangents(parameters))
         if self._pair.volumetric and paths.previous is not None and paths.space == "path":
-            # Where a pair collides in a medium depends on both states: other paths, from the same random numbers.
+            # The collisions of a pair in a medium depend on both states, so trace one state with the same random numbers.
             paths = self.image(parameters, paths.request).paths
         rest = {key: value for key, value in parameters.items() if key not in self._poses}
         self._pair.loaded().set_tangents(rest, tangents, self._attached)
@@ -293,7 +295,7 @@ class MitsubaSession:
         moves = self._geometric or any((self._posed, self._camera, self._boundary))
         if len(own) > 1 and (moves or self._pair.volumetric):
             reason = "shapes or sensors move" if moves else "it has participating media"
-            raise InputError(f"a scene's emitters keep the probabilities that it gives them where {reason}")
+            raise InputError(f"custom emitter sampling is not supported if {reason}; leave out emitter selection")
         return own
 
     def emitter_moments(
@@ -303,26 +305,26 @@ class MitsubaSession:
         self._check_keys(parameters)
         scene.set_tangents(parameters, tangents, self._attached)
         task = ConnectionsPass(max(1, self._light.max_depth - 1))
-        found = self.run(task, paths.request, paths.radiance, weights, noise)
-        dr.eval(found)
-        return connection_moments(scene.scene, *found)
+        connections = self.run(task, paths.request, paths.radiance, weights, noise)
+        dr.eval(connections)
+        return connection_moments(scene.scene, *connections)
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         self.set_parameters(parameters)
         request = replace(request, groups=1)
-        found = self.run(VerticesPass(), request)
-        dr.eval(found)
-        return self.develop(found, request)[0]
+        counts = self.run(VerticesPass(), request)
+        dr.eval(counts)
+        return self.develop(counts, request)[0]
 
     def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
-        """Of the last adjoint pass, of the borders of what is visible where shapes move, and of moving sensors."""
+        """Return the gradients of the last adjoint pass plus the boundary term of moving shapes and the derivatives by sensors."""
         scene = self._pair.loaded(previous)
         for term in (self._boundary, self._camera):
             if term is not None:
                 term.accumulate(scene, request, weights)
-        found = scene.take_gradients()
+        gradients = scene.take_gradients()
         self.dropped.read()
-        return found
+        return gradients
 
     # ------------------------------------------------------------------ launches
 
@@ -333,15 +335,15 @@ class MitsubaSession:
         self._set_poses(parameters, previous)
 
     def _set_poses(self, parameters: Tree, previous: bool = False) -> None:
-        """Of the passes to come, in one of the two scenes."""
+        """Set the poses of the following passes in one of the two scenes."""
         if self._posed is None:
             return
         loaded = {key: pose.loaded() for key, pose in self._poses.items()}
-        given = {key: parameters[key].numpy() for key in self._poses if key in parameters}
-        self._at[previous] = tensor(self._posed.numbers({k: x[None] for k, x in (loaded | given).items()})).array
+        current = {key: parameters[key].numpy() for key in self._poses if key in parameters}
+        self._at[previous] = tensor(self._posed.numbers({k: x[None] for k, x in (loaded | current).items()})).array
 
     def _posed_scene(self, previous: bool) -> PosedScene | None:
-        """One of the two scenes with posed shapes; None where none is posed."""
+        """Return one of the two scenes with posed shapes; None without poses."""
         if self._posed is None or not previous:
             return self._posed
         if self._posed_previous is None:
@@ -365,12 +367,12 @@ class MitsubaSession:
         return self.dropped.develop(radiance, request.spp, request.groups, (*size, 3))
 
     def run(self, task: Pass, request: SampleRequest, *own: Any) -> Any:
-        """Launch the kernel for requests of this form: traced once, replayed at each step."""
+        """Launch the kernel of a pass for a request. It is traced once and replayed later."""
         pair = self._pair
         size = LaunchSize(request.sensor, request.spp, self.count(request), self._light.hide_emitters)
         several = request.sensors is not None
         outside = not are_recordable(pair.current.sensors()[request.sensor], several)
-        # Of its own for each resolution of a texture or grid: a recording would be tried on the others, and fail.
+        # Each resolution of a texture or grid needs its own recording, since a replay with another one would fail.
         shapes = pair.loaded().shapes()
         pixels = request.pixels is None, several, request.positions is None
         key = (task, size, request.groups, pixels, outside, shapes, request.emitters is None)
@@ -384,12 +386,15 @@ class MitsubaSession:
         tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         if request.emitters is not None and len(self.emitters()) > 1:
             tables |= pair.emitter_tables(task.previous, request.emitters)
-        seeds = dr.opaque(mi.UInt32, request.seed), request.positions  # a constant would record all kernels anew
+        seeds = (
+            dr.opaque(mi.UInt32, request.seed),
+            request.positions,
+        )  # opaque, since a constant would record each kernel again
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
-        before: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
+        prepare: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
         with naming(self._attached):
-            return self._functions[key](before, scene, scenes, tables, seeds, request.pixels, films, rays, *own)
+            return self._functions[key](prepare, scene, scenes, tables, seeds, request.pixels, films, rays, *own)
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel

@@ -1,4 +1,4 @@
-"""Spheres that move, as meshes: boundary derivatives are sampled on edges, which a sphere does not have."""
+"""Conversion of moving spheres to meshes: boundary derivatives are sampled on edges, which a sphere does not have."""
 
 from __future__ import annotations
 
@@ -15,31 +15,33 @@ from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 __all__ = ["meshed", "moving_targets"]
 
 _ROWS, _COLUMNS = 64, 128
-"""Of the mesh: its silhouette is within a 1700th of the radius of the sphere's."""
+"""Rows and columns of the mesh. Its silhouette deviates from the sphere's by less than 1/1700 of the radius."""
 _PARTS = ("translation", "rotation", "scale", mesh_layout.POSITIONS)
 
 
 def moving_targets(keys: Iterable[str]) -> frozenset[str]:
-    """The ids of the shapes or sensors that parameters of these names would move as a whole or vertex by vertex."""
-    found = set()
+    """Return the ids of the shapes or sensors that parameters of these names would move, rigidly or by vertices."""
+    targets = set()
     for key in keys:
         owner, _, name = key.rpartition(".")
         if name in ("x", "y", "z"):
             owner, _, name = owner.rpartition(".")
         if name in _PARTS:
-            found.add(owner)
-    return frozenset(found)
+            targets.add(owner)
+    return frozenset(targets)
 
 
 def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
-    """The scene with these of its spheres replaced by meshes, and their ids. Not those that are emitters or carry sensors or media, nor
-    mirrors and glass, whose facets would show, nor any of a scene in which a shape carries a sensor.
+    """Return the scene with these spheres replaced by meshes, and their ids.
 
-    The mesh has the sphere's texture coordinates, normals at its vertices, and their interpolations between.
+    Spheres are not replaced if they are emitters, sensors or boundaries of media, or if they are mirrors or glass, whose facets would
+    be visible. No sphere is replaced in a scene with a sensor that is a shape.
+
+    The mesh has the sphere's texture coordinates and vertex normals, which are interpolated linearly.
 
     Args:
         scene: `mi.Scene`.
-        ids: of shapes, some of which may be spheres.
+        ids: ids of shapes, including spheres.
     """
     spheres = [shape for shape in scene.shapes() if shape.class_name() == "Sphere" and shape.id() in ids]
     spheres = [
@@ -51,7 +53,7 @@ def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
         return scene, []
     replaced = [shape.id() for shape in spheres]
     objects = [_mesh(shape) if shape.id() in replaced else shape for shape in scene.shapes()]
-    # The scene holds the groups of its instances apart from its shapes.
+    # The shape groups of instances are not among the scene's shapes.
     objects += [group for group in ObjectGraph(scene).of("shape") if group.class_name().startswith("ShapeGroup")]
     objects += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
     described: dict[str, Any] = {"type": "scene"}
@@ -67,7 +69,7 @@ def _is_specular(bsdf: Any) -> bool:
 
 
 def _mesh(sphere: Any) -> Any:
-    """By rows of latitude, the seam's vertices twice."""
+    """Return a mesh of latitude rows, with duplicate vertices at the seam."""
     u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, _COLUMNS + 1), np.linspace(0, 1, _ROWS + 1)))
     turn, tilt = 2 * np.pi * (u % 1), np.pi * v
     normals = np.stack([np.cos(turn) * np.sin(tilt), np.sin(turn) * np.sin(tilt), np.cos(tilt)], -1)

@@ -1,4 +1,4 @@
-"""Mitsuba values and the tensors that stand for them: a number is (), a colour (3,), a bitmap (H, W, C), a grid (Z, Y, X, C)."""
+"""Conversion of Mitsuba values to tensors: a number is (), a colour (3,), a bitmap (H, W, C), a grid (Z, Y, X, C)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from unrender.core import arrays
 
 
 def tensor(values: np.ndarray) -> mi.TensorXf:
-    """A tensor with these values, in memory of its own."""
+    """Return a tensor of these values in its own memory."""
     return mi.TensorXf(arrays.owned(values, mi.Float), np.shape(values))
 
 
 def native_shape(value: Any) -> tuple[int, ...]:
-    """The shape of the tensor that stands for a Mitsuba value. Raises `TypeError` for what is no array."""
+    """Return the shape of the tensor for a Mitsuba value. Raise `TypeError` for a value that is not an array."""
     if isinstance(value, (int, float)):
         return ()
     if not dr.is_array_v(value) or dr.is_matrix_v(value) or dr.is_special_v(value):
@@ -32,7 +32,7 @@ def native_shape(value: Any) -> tuple[int, ...]:
 
 
 def to_tensor(value: Any) -> mi.TensorXf:
-    """The tensor (`mi.TensorXf`, detached) that stands for a Mitsuba value."""
+    """Return the tensor (`mi.TensorXf`, detached) for a Mitsuba value."""
     shape = native_shape(value)
     if isinstance(value, (int, float)):
         return mi.TensorXf(np.float32(value))  # pyright: ignore[reportArgumentType]
@@ -42,7 +42,7 @@ def to_tensor(value: Any) -> mi.TensorXf:
 
 
 def from_tensor(tensor: mi.TensorXf, like: Any) -> Any:
-    """The Mitsuba value of the type of `like` for a tensor; the inverse of `to_tensor`."""
+    """Return the Mitsuba value of the type of `like` for a tensor; the inverse of `to_tensor`."""
     if dr.is_tensor_v(like):
         return type(like)(tensor.array, tuple(tensor.shape))
     if dr.depth_v(like) == 1:
@@ -51,5 +51,5 @@ def from_tensor(tensor: mi.TensorXf, like: Any) -> Any:
 
 
 def is_broadcast(values: np.ndarray) -> bool:
-    """Whether all states of a batch share a value: see `RenderSession.image_batch`."""
+    """Return whether all states of a batch share a value, see `RenderSession.image_batch`."""
     return len(values) == 1 or np.asarray(values).strides[0] == 0

@@ -1,11 +1,11 @@
-"""Light from afar whose direction is another in each photograph: Mitsuba's plugin `turntable`.
+"""Distant light whose direction varies between photographs: the Mitsuba plugin `turntable`.
 
     {"type": "turntable", "turns": "w x y z, w x y z, ...", "map": an envmap, constant or directional}
 
-On a turntable the light stands still and the object turns. The scene's world is the object's, so it is the light that turns. A ray's time
-says how far: light of row i of `turns` (unit quaternions, from the map's axes to the world's) reaches rays of times i - 1/2 to i + 1/2.
-Sensors have i as `shutter_open` and `shutter_close`, which all integrators carry along, Mitsuba's own, too. Times outside of the table have
-its first or last row. `distance`, 10^6 where it is not given, is how far away the light is for shadows: larger than the scene.
+On a turntable the light is fixed and the object rotates. The scene's world frame is the object's, so the light rotates instead. A ray's
+time selects the rotation: row i of `turns` (unit quaternions, from the map's axes to the world's) applies to times from i - 1/2 to i +
+1/2. Sensors have i as `shutter_open` and `shutter_close`, which all integrators support, including Mitsuba's own. Times outside the
+table use its first or last row. `distance`, 10^6 by default, is the light's distance for shadow rays. It must exceed the scene's size.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ _FAR = 1e6
 
 
 def register() -> None:
-    """Make the plugin known to the variant that is set. Again does nothing."""
+    """Register the plugin with the active variant. Repeated calls do nothing."""
     _plugin(mi.variant())
 
 
 def is_turntable(emitter: Any) -> bool:
-    """Whether an emitter is such a one."""
+    """Return whether an emitter is of the `turntable` plugin."""
     return isinstance(emitter, _plugin(mi.variant()))
 
 
 def text(rotations: np.ndarray) -> str:
-    """Rotations (N, 3, 3), from the map's axes to the world's, as the plugin's `turns`."""
+    """Return rotations (N, 3, 3), from the map's axes to the world's, in the format of the plugin's `turns`."""
     from scipy.spatial.transform import Rotation
 
     quaternions = np.roll(Rotation.from_matrix(np.asarray(rotations, float)).as_quat(), 1, axis=-1)
@@ -44,32 +44,37 @@ def text(rotations: np.ndarray) -> str:
 
 
 def turns(emitter: Any) -> np.ndarray:
-    """The rotations of a live emitter, (N, 3, 3)."""
+    """Return the rotations of an emitter, (N, 3, 3)."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(np.roll(emitter.rows, -1, axis=-1)).as_matrix()
 
 
 def _rows(properties: Any) -> np.ndarray:
-    """(N, 4) unit quaternions."""
+    """Return the unit quaternions (N, 4) of the plugin's `turns`."""
     expected = f"emitter {PLUGIN}: {_TURNS}: expected 1 to {_MOST} rows of four numbers (w x y z), commas between them"
-    given = properties.get(_TURNS, "")
-    if not isinstance(given, str):
+    value = properties.get(_TURNS, "")
+    if not isinstance(value, str):
         raise InputError(expected)
     try:
-        found = np.array([[float(number) for number in row.split()] for row in given.split(",")], float)
+        quaternions = np.array([[float(number) for number in row.split()] for row in value.split(",")], float)
     except ValueError as error:
         raise InputError(expected) from error
-    if found.ndim != 2 or found.shape[1] != 4 or not 1 <= len(found) <= _MOST or not np.isfinite(found).all():
+    if (
+        quaternions.ndim != 2
+        or quaternions.shape[1] != 4
+        or not 1 <= len(quaternions) <= _MOST
+        or not np.isfinite(quaternions).all()
+    ):
         raise InputError(expected)
-    length = np.linalg.norm(found, axis=1, keepdims=True)
+    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
     if not (length > 1e-6).all():
         raise InputError(expected)
-    return found / length
+    return quaternions / length
 
 
 def _rotated(table: Any, rows: int, vector: Any, time: Any, back: bool) -> Any:
-    """A vector of the map's axes in the world's; `back`: of the world's in the map's. `table`: quaternions, `mi.Float` (4 * rows,)."""
+    """Rotate a vector from the map's axes to the world's or, with `back`, the inverse. `table`: quaternions, `mi.Float` (4 * rows,)."""
     row = mi.UInt32(dr.clip(dr.round(mi.Float(time)), 0, rows - 1))
     w, x, y, z = (dr.gather(mi.Float, table, 4 * row + k) for k in range(4))
     axis: Any = mi.Vector3f(x, y, z)
@@ -79,17 +84,17 @@ def _rotated(table: Any, rows: int, vector: Any, time: Any, back: bool) -> Any:
 
 @cache
 def _plugin(variant: str) -> type:
-    del variant  # the base class is that of the variant that is set
+    del variant  # a cache key only: the base class belongs to the active variant
 
     class TurntableLight(mi.Emitter):
-        """Directions are turned into the map's axes, and back."""
+        """The emitter: `map` evaluated with directions that are rotated to its axes."""
 
         def __init__(self, properties: Any):
             super().__init__(properties)
             self.map = properties.get(_MAP, None)
             if not isinstance(self.map, mi.Emitter) or not mi.has_flag(self.map.flags(), mi.EmitterFlags.Infinite):
                 raise InputError(
-                    f"emitter {PLUGIN}: {_MAP} must be light from afar, such as an envmap or a directional"
+                    f"emitter {PLUGIN}: {_MAP} must be a distant emitter, such as an envmap or a directional"
                 )
             self.rows = _rows(properties)
             self.m_flags = self.map.flags()

@@ -1,4 +1,4 @@
-"""Weights of pixels, as an adjoint pass has them, by view."""
+"""Pixel weights of an adjoint pass, split by view."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class ViewWeights:
     """Pixels of one sensor.
 
     Attributes:
-        sensor: its index.
-        image: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image; 0 at pixels that were not asked for.
-        pixels: `mi.UInt32`, flat indices of those that were; one may occur twice.
-        values: `mi.Float` (3 N,), the weights of these.
-        rows: `mi.UInt32`, where these are among all pixels of the request.
+        sensor: index of the sensor.
+        image: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image; 0 at pixels that were not requested.
+        pixels: `mi.UInt32`, flat indices of the requested pixels; one may occur twice.
+        values: `mi.Float` (3 N,), weights of these pixels.
+        rows: `mi.UInt32`, indices of these pixels in the request.
         spp: samples per pixel.
     """
 
@@ -35,18 +35,18 @@ class ViewWeights:
 
     @property
     def samples(self) -> int:
-        """Of all its pixels."""
+        """Number of samples of all its pixels."""
         return dr.width(self.pixels) * self.spp
 
 
 def views_of(
     request: SampleRequest, weights: mi.TensorXf, resolutions: Sequence[tuple[int, int]]
 ) -> Iterator[ViewWeights]:
-    """The views that a request has pixels of.
+    """Yield the views that a request has pixels of.
 
     Args:
-        request: of the rendering.
-        weights: of `RenderSession.adjoint`, of which the mean over groups is taken.
+        request: request of the rendering.
+        weights: weights of `RenderSession.adjoint`, which are averaged over groups.
         resolutions: (height, width) of each sensor's film.
     """
     groups = weights.shape[0]

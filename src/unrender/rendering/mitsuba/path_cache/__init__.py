@@ -1,1 +1,1 @@
-"""Paths that stay in memory, to be evaluated at other values of the parameters."""
+"""Cached paths, which are evaluated again at other parameter values."""

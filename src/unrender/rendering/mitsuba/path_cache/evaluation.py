@@ -1,4 +1,4 @@
-"""Radiance and gradients of paths in memory, at the values that the scene's lookups hold."""
+"""Radiance and gradients of cached paths at the current values of the scene's lookups."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from unrender.rendering.mitsuba.path_cache.lookups import Lookups
 from unrender.rendering.mitsuba.path_cache.tracing import SOURCES
 
 Vertices = Mapping[str, Any]
-"""What `TracePass` returns."""
+"""Result of `TracePass`."""
 Objects = tuple[list[Any], list[Any]]
-"""Textures and emitters that are looked up, of one state's scene."""
+"""Looked-up textures and emitters of one state's scene."""
 
 
 class Evaluation:
-    """The sum of products that kept paths carry.
+    """Evaluation of the sum of products that a cached path represents.
 
     Args:
-        lookups: what depends on parameters.
-        depth: longest path in segments.
+        lookups: textures and emitters that depend on parameters.
+        depth: maximum path length in segments.
     """
 
     def __init__(self, lookups: Lookups, depth: int):
         self._areas, self._depth = lookups.areas, depth
 
     def radiance(self, vertices: Vertices, states: Sequence[Objects]) -> tuple[mi.Spectrum, ...]:
-        """The radiance of each path in each state; not finite in all states where it is not in one."""
+        """Return the radiance of each path in each state. A path that is not finite in one state is not finite in all."""
         with dr.suspend_grad():
             return dropped_together(*(self._radiance(vertices, objects) for objects in states))
 
@@ -42,18 +42,18 @@ class Evaluation:
         """Accumulate the gradients of the leaves.
 
         Args:
-            vertices: the paths.
-            states: the objects of each state.
-            replay: of each state, the film's weights and the radiance that `radiance` returned.
+            vertices: cached paths.
+            states: objects of each state.
+            replay: for each state, the film's weights and the result of `radiance`.
             spp: samples per pixel.
-            pixels: how many pixels.
+            pixels: number of pixels.
         """
         finite = is_finite(*(radiance for _, radiance in replay))
         parts = [
             film.film_adjoint(weights, spp, pixels) * self._radiance(vertices, objects, finite)
             for (weights, _), objects in zip(replay, states, strict=True)
         ]
-        # Paths of one segment meet no surface that is looked up.
+        # Paths of one segment have no lookup, and therefore no gradient.
         dr.backward_from(total(parts), flags=dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
 
     def _radiance(self, vertices: Vertices, objects: Objects, finite: Any = True) -> mi.Spectrum:
@@ -72,27 +72,27 @@ class Evaluation:
         return mi.Spectrum(L)
 
     def _emission(self, vertices: Vertices, source: str, row: mi.UInt32, emitters: Sequence[Any]) -> mi.Color3f:
-        """e_r l_r of one of the sources."""
+        """Return e_r l_r of one of the sources."""
         number, place = (_read(vertices[f"{source}_{name}"], row) for name in ("emitter", "place"))
-        found = mi.Color3f(1)
+        light = mi.Color3f(1)
         for index, emitter in enumerate(emitters, 1):
             on = number == index
             si: Any = dr.zeros(mi.SurfaceInteraction3f)
             si.uv = mi.Point2f(place.x, place.y)
             si.wi = mi.Vector3f(0, 0, 1) if index <= self._areas else -mi.Vector3f(place)
-            found = dr.select(on, mi.Color3f(emitter.eval(si, on)), found)
-        return _read(vertices[source], row) * found
+            light = dr.select(on, mi.Color3f(emitter.eval(si, on)), light)
+        return _read(vertices[source], row) * light
 
 
 def _reflectance(vertices: Vertices, row: mi.UInt32, textures: Sequence[Any]) -> mi.Color3f:
-    """t of a vertex."""
+    """Return the reflectance t of a vertex."""
     si: Any = dr.zeros(mi.SurfaceInteraction3f)
     si.uv, number = _read(vertices["uv"], row), _read(vertices["surface"], row)
-    found = mi.Color3f(1)
+    value = mi.Color3f(1)
     for index, texture in enumerate(textures, 1):
         on = number == index
-        found = dr.select(on, mi.Color3f(texture.eval(si, on)), found)
-    return found
+        value = dr.select(on, mi.Color3f(texture.eval(si, on)), value)
+    return value
 
 
 def _read(values: Any, row: mi.UInt32) -> Any:

@@ -1,4 +1,4 @@
-"""A session that traces paths once: images of a pair, and every adjoint on its paths, are evaluated from memory."""
+"""A session that traces paths once, and evaluates images of a pair and all adjoints on its paths from memory."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from unrender.rendering.renderer import Rendering, SampleRequest, Space
 from unrender.rendering.wrapper import SessionWrapper
 
 _DEEPEST = 16
-"""Segments of the longest paths that are kept: kernels have a stage for each."""
+"""Maximum path length of cached paths in segments, since kernels have a stage for each."""
 _MOST_BYTES = 1 << 26
-"""Memory that the paths of one rendering may take. Larger renderings trace their adjoints."""
+"""Maximum memory of one rendering's paths in bytes. Larger renderings trace their adjoints."""
 _MOST_ALIVE = 1 << 29
-"""Memory that all paths of a session may take which are still in use, where a loop renders all views before their adjoints."""
+"""Maximum memory of all paths of a session that are in use, such as when a loop renders all views before their adjoints."""
 
 
 class CachingSession(SessionWrapper):
-    """A `MitsubaSession` whose paths are traced once and kept for their adjoints.
+    """A `MitsubaSession` whose paths are traced once and cached for their adjoints.
 
-    Neither rays nor densities depend on the parameters of `Lookups`. So a pair's previous image, and each adjoint, cost a tenth of a traced
-    one. Samples and results are the inner session's, but for rounding. Only gradients by reflectances that are exactly 0 differ: they
-    include the indirect light, which path replay leaves out.
+    Neither rays nor densities depend on the parameters of `Lookups`. A pair's previous image, and each adjoint, therefore cost a tenth
+    of a traced one. Samples and results equal the inner session's up to rounding. Only gradients by reflectances of exactly 0 differ:
+    they include indirect light, which path replay omits.
 
-    The inner session serves pairs that share random numbers alone, and renderings whose paths would take too much memory: more than
-    64 MB, or more than 512 MB with those of all renderings that are still in use.
+    The inner session renders pairs that only share random numbers, and renderings whose paths need too much memory: more than 64 MB, or
+    more than 512 MB together with all renderings in use.
 
     Args:
         pair: both loads of the scene.
-        inner: traces the paths, and whatever is not kept.
+        inner: session that traces the paths, and handles everything that is not cached.
         keys: all parameters of the session.
-        derivatives: those that have gradients.
+        derivatives: parameters that have gradients.
         paths: settings of the light paths.
 
-    Raises `InputError` for parameters that are not served (`Lookups`), and for paths of more than 16 segments.
+    Raises `InputError` for parameters that are not supported (`Lookups`), and for paths of more than 16 segments.
     """
 
     _inner: MitsubaSession
@@ -57,8 +57,8 @@ class CachingSession(SessionWrapper):
         self, pair: ScenePair, inner: MitsubaSession, keys: Sequence[str], derivatives: Sequence[str], paths: LightPaths
     ):
         if not derivatives or pair.single or paths.max_depth > _DEEPEST:
-            raise InputError("paths are not kept: no derivatives, one state, or too many segments")
-        self._keys = tuple(sorted(keys))  # Sessions of the same keys in another order number lookups alike.
+            raise InputError("paths are not cached: no derivatives, one state, or too many segments")
+        self._keys = tuple(sorted(keys))  # sorted, so that the numbers of lookups do not depend on the order
         lookups = Lookups(pair, self._keys)
         super().__init__(inner)
         self._pair, self._depth = pair, paths.max_depth
@@ -70,22 +70,22 @@ class CachingSession(SessionWrapper):
 
     @property
     def dropped(self) -> DroppedSamples:
-        """The samples that were not finite."""
+        """Samples that were not finite."""
         return self._inner.dropped
 
     def path_bytes(self, request: SampleRequest) -> int:
-        """Memory that the paths of a rendering take."""
+        """Return the memory of a rendering's paths in bytes."""
         return self._task.bytes_per_row * self._depth * self._inner.count(request) * request.spp
 
     def _fits(self, request: SampleRequest) -> bool:
-        """Whether the memory suffices to keep a rendering's paths."""
+        """Return whether the memory limits allow caching a rendering's paths."""
         alive = [paths for reference in self._alive if (paths := reference()) is not None]
         self._alive = [weakref.ref(paths) for paths in alive]
         size = self.path_bytes(request)
         return size <= _MOST_BYTES and size + sum(self.path_bytes(paths.request) for paths in alive) <= _MOST_ALIVE
 
-    def _kept(self, paths: Paths) -> Paths:
-        """Count the memory of the paths until nobody uses them."""
+    def _registered(self, paths: Paths) -> Paths:
+        """Register paths, whose memory counts as long as they are in use."""
         self._alive.append(weakref.ref(paths))
         return paths
 
@@ -98,27 +98,27 @@ class CachingSession(SessionWrapper):
         vertices = self._inner.run(self._task, request)
         (radiance,) = self._radiance(vertices, (False,), request)
         paths = Paths(request, radiance, vertices=vertices, keys=self._keys)
-        return Rendering(self._inner.develop(radiance, request), None, self._kept(paths))
+        return Rendering(self._inner.develop(radiance, request), None, self._registered(paths))
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
         if not self._fits(request):
             return self._inner.image_pair(current, previous, request, space)
         if space != "path":
-            # Of the current state, to the bit the image that it has alone.
-            found = self._inner.image_pair(current, previous, request, space)
-            return replace(found, images=self.image(current, request).images)
+            # The current image must equal, to the bit, the image that is rendered alone.
+            rendering = self._inner.image_pair(current, previous, request, space)
+            return replace(rendering, images=self.image(current, request).images)
         self._inner.set_parameters(current)
         self._inner.set_parameters(previous, previous=True, attach=request.both_gradients)
         vertices = self._inner.run(self._task, request)
         radiances = self._radiance(vertices, (False, True), request)
         images, before = (self._inner.develop(radiance, request) for radiance in radiances)
         paths = Paths(request, radiances[0], radiances[1], space, previous, vertices, self._keys)
-        return Rendering(images, before, self._kept(paths))
+        return Rendering(images, before, self._registered(paths))
 
     # ------------------------------------------------------------------ derivatives
 
     def adjoint(self, parameters: Tree, paths: Paths, weights: mi.TensorXf) -> Tree:
-        if not self._keeps(paths):
+        if not self._has_vertices(paths):
             return self._inner.adjoint(parameters, paths, weights)
         self._inner.set_parameters(parameters)
         self._backward(paths, {False: (weights, paths.radiance)})
@@ -127,7 +127,7 @@ class CachingSession(SessionWrapper):
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Paths, weights: mi.TensorXf, weights_previous: mi.TensorXf
     ) -> tuple[Tree, Tree]:
-        if not self._keeps(paths):
+        if not self._has_vertices(paths):
             return self._inner.adjoint_pair(current, previous, paths, weights, weights_previous)
         self._inner.set_parameters(current)
         self._inner.set_parameters(previous, previous=True)
@@ -142,8 +142,8 @@ class CachingSession(SessionWrapper):
 
     # ------------------------------------------------------------------ launches
 
-    def _keeps(self, paths: Paths) -> bool:
-        """Whether the vertices of the paths are in memory and have the numbers of this session's lookups."""
+    def _has_vertices(self, paths: Paths) -> bool:
+        """Return whether the vertices of the paths are in memory and refer to this session's lookups."""
         return paths.vertices is not None and paths.keys == self._keys
 
     def _radiance(
@@ -159,7 +159,7 @@ class CachingSession(SessionWrapper):
         request = paths.request
         spp, pixels = request.spp, self._inner.count(request)
 
-        evaluation = self._evaluation  # a recording that held the session would keep its scenes alive
+        evaluation = self._evaluation  # a reference to the session would keep its scenes alive
 
         def backward(vertices: Any, states: Any, replayed: Any) -> None:
             evaluation.backward(vertices, states, replayed, spp, pixels)
@@ -170,7 +170,7 @@ class CachingSession(SessionWrapper):
         self.dropped.read()
 
     def _function(self, kind: tuple[Any, ...], traced: Any) -> FrozenFunction:
-        # Of its own for each resolution of a texture, as in `MitsubaSession.run`.
+        # Each resolution of a texture needs its own recording, as in `MitsubaSession.run`.
         key = *kind, self._pair.loaded().shapes()
         if key not in self._functions:
             self._functions[key] = FrozenFunction(traced)

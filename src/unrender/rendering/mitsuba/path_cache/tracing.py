@@ -1,10 +1,11 @@
-"""Tracing of paths that are kept: what each vertex adds, without the factors that depend on the parameters.
+"""Tracing of cached paths: contribution of each vertex without the factors that depend on the parameters.
 
-With the lookup t_j at vertex j (1 where that is of no parameter), the lookup l_r at the emitter and fixed factors e_r, a path carries
+With the lookup t_j at vertex j (1 if it depends on no parameter), the lookup l_r at the emitter and fixed factors e_r, a path has the
+radiance
 
     L = Σ_r e_r l_r Π_{j < r} t_j.
 
-Row r holds the light that its segment r meets and the connection at its vertex r - 1, so row 0 is what the camera sees of emitters.
+Row r contains the emission that segment r hits and the emitter-sampling connection at vertex r - 1. Row 0 is directly visible emission.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from unrender.rendering.mitsuba.path_cache.lookups import Lookups
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 
 SOURCES = ("met", "connected")
-"""Kinds of light in a row, kept apart where emitters are looked up."""
+"""Kinds of emission in a row, stored separately if emitters are looked up."""
 
 _LIGHT, _LOOKED_UP, _SURFACE = 12, 12 + 4 + 12, 4 + 8
-"""Bytes of a row: of light, of light whose emitter is looked up, of a surface that is."""
+"""Bytes per row of fixed emission, of emission with an emitter lookup, and of a surface lookup."""
 
 
 @dataclass
 class _State:
-    """A path's loop state: see `PathState`. β includes the lookups at tracing and decides on roulette; W leaves them out."""
+    """Loop state of a path, see `PathState`. β includes the lookups at tracing and controls Russian roulette; W omits them."""
 
     ray: mi.Ray3f
     depth: UInt32
@@ -48,32 +49,32 @@ class _State:
 
 
 class _Record:
-    """Where vertices are written. No dataclass: Dr.Jit would take it for state of the loop."""
+    """Output arrays of vertices. This is not a dataclass, since Dr.Jit would treat a dataclass as loop state."""
 
     def __init__(self, arrays: dict[str, Any], lanes: int, weight: Any):
         self.arrays, self.lanes, self.weight = arrays, lanes, weight
 
 
 class TracePass(Pass):
-    """Paths to be kept: {name: flat array of `depth` rows, one behind the other}.
+    """Tracing of paths to cache: {name: flat array of `depth` concatenated rows}.
 
-    "surface" and "uv": the texture that vertex r looks up, counted from 1, 0 for none, and where. "light": e_r, of emitters that no
-    parameter changes. Otherwise e_r of both `SOURCES`, "met" and "connected", each with the emitter that is looked up, and with its
-    texture coordinates or the direction to it.
+    "surface" and "uv" are the index of the texture lookup at vertex r, from 1, 0 for none, and its texture coordinates. "light" is e_r
+    if no parameter changes an emitter. Otherwise e_r is stored for both `SOURCES`, "met" and "connected", each with the index of the
+    emitter lookup, and with its texture coordinates or the direction to it.
 
     Args:
-        lookups: what depends on parameters.
-        depth: longest path in segments.
-        rr_depth: depth from which roulette may end a path.
+        lookups: textures and emitters that depend on parameters.
+        depth: maximum path length in segments.
+        rr_depth: depth from which Russian roulette may terminate a path.
     """
 
     def __init__(self, lookups: Lookups, depth: int, rr_depth: int):
-        # No dataclass: Dr.Jit would take it for state of the loop below.
+        # This is not a dataclass, since Dr.Jit would treat a dataclass as state of the loop below.
         self.lookups, self.depth, self.rr_depth = lookups, depth, rr_depth
 
     @property
     def bytes_per_row(self) -> int:
-        """Memory of a path's row."""
+        """Memory of one row of a path in bytes."""
         of_lights = len(SOURCES) * _LOOKED_UP if self.lookups.emitters else _LIGHT
         return of_lights + (_SURFACE if self.lookups.textures else 0)
 
@@ -81,12 +82,12 @@ class TracePass(Pass):
         return self.lookups.tables
 
     def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """See the class."""
+        """Return the recorded vertices of the paths."""
         return paths.recorded(self._trace)
 
     def _trace(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: Any, weight: Any) -> dict[str, Any]:
         context = PathContext(dr.ADMode.Primal, scene, tables, (), False)
-        lanes = sampler.wavefront_size()  # rays of a sensor may all be the same one, of width 1
+        lanes = sampler.wavefront_size()  # a sensor's rays may all be equal, of width 1
         record = _Record(self._empty(lanes), lanes, mi.Color3f(weight))
         state = _State(
             ray=mi.Ray3f(dr.detach(ray)),
@@ -116,11 +117,11 @@ class TracePass(Pass):
 
     @dr.syntax
     def _loop(self, context: PathContext, record: _Record, state: _State, sampler: Any) -> None:
-        while dr.hint(state.active, max_iterations=self.depth, label="kept paths"):
+        while dr.hint(state.active, max_iterations=self.depth, label="cached paths"):
             state = self._bounce(context, record, state, sampler)
 
     def _bounce(self, context: PathContext, record: _Record, path: _State, sampler: Any) -> _State:
-        """One segment and the vertex at its end. Takes the random numbers of `PathPair`: the same seed has the same paths."""
+        """Trace one segment and the vertex at its end. It draws the random numbers of `PathPair`, so equal seeds give equal paths."""
         scene, tables, ctx = context.scene, context.tables, context.bsdf_ctx
         si = scene.ray_intersect(path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active)
         bsdf: Any = si.bsdf(path.ray)  # pyright: ignore[reportArgumentType]
@@ -182,7 +183,7 @@ class TracePass(Pass):
         sampler: Any,
         active: Bool,
     ) -> None:
-        """Write the connection of a vertex to an emitter."""
+        """Write the emitter-sampling connection of a vertex."""
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em)
         ds = connection.ds
@@ -191,7 +192,7 @@ class TracePass(Pass):
         number = self._number(context.tables, "cached_emitter", ds.emitter, connection.active)
         front = (number > self.lookups.areas) | (dr.dot(ds.d, ds.n) < 0)
         known = ds.emitter.eval_direction(si, ds, connection.active & (number == 0))
-        # A diffuse surface has the value t pdf, with the reflectance t.
+        # The BSDF value of a diffuse surface is t · pdf, with the reflectance t.
         light = path.W * connection.weight(pdf) * dr.select(surface == 0, f, pdf)
         light *= dr.select(number == 0, known, dr.select(front, 1, 0))
         place = dr.select(number > self.lookups.areas, ds.d, mi.Vector3f(ds.uv.x, ds.uv.y, 0))
@@ -205,7 +206,7 @@ class TracePass(Pass):
     def _write(
         self, record: _Record, source: str, row: UInt32, light: Spectrum, number: UInt32, place: Any, active: Bool
     ) -> None:
-        # The weight is negative in some lobes of a film's filter, where paths go on all the same.
+        # The weight is negative in some lobes of a film's filter, so it does not terminate paths.
         weighted = mi.Color3f(light) * record.weight
         if not self.lookups.emitters:
             dr.scatter_add(record.arrays["light"], weighted, row, active)
