@@ -57,7 +57,7 @@ def gradient(description: Any, key: str = KEY, request: SampleRequest | None = N
         ({"camera": {"type": "orthographic"}}, KEY, r"limited to perspective sensors; the scene has none"),
         ({"camera": {"type": "orthographic"}}, "thing.rotation", r"limited to perspective sensors"),
         ({"ball": {"type": "sphere", "radius": 0.1}}, "ball.translation", r"ball is not a mesh \(Sphere\)"),
-        ({"camera": {"type": "orthographic"}}, "camera.translation", "move perspective sensors only"),
+        ({"camera": {"type": "orthographic"}}, "camera.translation", "limited to perspective sensors"),
         ({"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}, KEY, "with media"),
         ({"thing": {"type": "cube", "emitter": {"type": "area"}}}, KEY, "do not support moving emitters"),
     ],

@@ -38,7 +38,7 @@ def sensor_obstacle(pair: ScenePair, target: str) -> str:
         return "path gradients of moving sensors do not support media"
     kind = next(sensor.class_name() for sensor in pair.current.sensors() if sensor.id() == target)
     if kind != "PerspectiveCamera":
-        return f"path gradients of sensors are limited to perspective sensors; {target} is a {kind}"
+        return f"path gradients of sensors are limited to perspective sensors; {target} is another ({kind})"
     return ""
 
 

@@ -127,7 +127,7 @@ def info(key: PoseKey, obstacle: str, sensor: int | None) -> ParameterInfo:
     kind = "light" if key.light else "sensor" if viewpoint else "shape"
     reason = f"it moves a {kind} rigidly"
     if obstacle:
-        reason += f", and {obstacle}; use SmoothedDerivatives"
+        reason += f", and {obstacle}; use --method smoothed (SmoothedDerivatives)"
     low = 1e-3 if key.part == "scale" else None
     return ParameterInfo(
         key.shape,

@@ -240,10 +240,6 @@ class MitsubaRenderer:
         if key not in self._info:
             raise InputError(f"parameter {key}: the scene has none of that name{did_you_mean(key, self._info)}")
         info = self._info[key]
-        if derivatives and not info.differentiable and key in self._poses:
-            raise InputError(
-                f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}; use --method smoothed"
-            )
         if derivatives and not info.differentiable:
             raise InputError(f"parameter {key}: it cannot be recovered by path gradients, since {info.reason}")
         target = moved_sensor(self.pair.loaded(), key) or moved_shape(self.pair.loaded(), key)

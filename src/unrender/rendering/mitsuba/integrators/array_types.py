@@ -1,7 +1,8 @@
-"""Names for the per-lane arrays in annotations.
+"""Annotations of per-lane arrays.
 
-Mitsuba's stubs take `mitsuba.Float` and the `drjit.auto.ad.Float` of its methods for two types, likewise the others, and know no products
-of a spectrum and a number. So to a type checker these are any type; to a reader, `mi.Float`, `mi.Bool`, `mi.UInt32` and `mi.Spectrum`.
+Mitsuba's stubs treat `mitsuba.Float` and the `drjit.auto.ad.Float` of its methods as different types, likewise the others, and do not
+declare the product of a spectrum and a number. A type checker therefore sees any type; a reader sees `mi.Float`, `mi.Bool`, `mi.UInt32`
+and `mi.Spectrum`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the path-replay kernels share: their interface, the adjoint of each state, and what a path reads but never changes.
+"""Common parts of the path-replay kernels: their interface, the adjoint of each state, and the constant inputs of a path.
 
 A kernel traces one state or, for a pair, the current and the previous state on the same paths (Nicolet et al. 2023, section 5 and
 appendix B). Quantities that differ between the states are lists with one entry per state, the current one first.
@@ -19,16 +19,16 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.pointer_tables import StatePointers
 
 KEEP = dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior
-"""Two passes go the way from what the scene makes of its parameters (such as padded texels) back to them: the first must not use it up."""
+"""Flags that keep the graph's edges: two passes traverse those from derived values, such as padded texels, to the parameters."""
 
 
 @dataclass
 class ReplayState:
-    """What replaying the paths of one state needs of its primal pass.
+    """Data of a state's primal pass that the replay of its paths needs.
 
     Attributes:
-        δL: adjoint radiance per lane; None in forward mode, and for the previous state of a pair where its gradient is not wanted.
-        radiance: per lane, as the primal pass returned it (`state_in` of Mitsuba's `prb`).
+        δL: adjoint radiance per lane; None in forward mode, and for the previous state of a pair if its gradient is not requested.
+        radiance: radiance per lane of the primal pass (`state_in` of Mitsuba's `prb`).
     """
 
     δL: Spectrum | None
@@ -54,16 +54,16 @@ class PathKernel(Protocol):
 
         Args:
             mode: `Primal`; `Backward` to replay the paths of a primal pass and back-propagate each state's `δL` into the parameters of
-                its scene (path replay, Vicini et al. 2021); `Forward` to replay them and carry the tangents of the parameters of
+                its scene (path replay, Vicini et al. 2021); `Forward` to replay them and propagate the tangents of the parameters of
                 `scene` forward (the current state only).
             scene: the current scene.
-            tables: of `ScenePair.tables()`, used with `pair`, and what the kernel at hand asks for beyond these.
+            tables: `ScenePair.tables()`, used with `pair`, and additional tables of the kernel.
             sampler: seeded; the same seed replays the same paths.
             ray: camera rays.
             replay: the current state and, with `pair`, the previous state; () with `Primal`.
             pair: whether the previous state is traced too.
-            geometry: what rays are intersected with in place of `scene` (`poses.Assembly`), or None.
-            active: lanes that are traced. A replay leaves out the samples that the primal pass dropped.
+            geometry: object that rays are intersected with instead of `scene` (`poses.Assembly`), or None.
+            active: lanes that are traced. A replay omits the samples that the primal pass dropped.
 
         Returns:
             radiance per lane of the current and, with `pair`, of the previous state, both unbiased; with `Forward` the derivative of the
@@ -79,21 +79,21 @@ class PathKernel(Protocol):
         ray: mi.RayDifferential3f,
         geometry: Any = None,
     ) -> Float:
-        """How many vertices each lane's path has, the camera's not counted: what it costs to trace. Arguments as for `sample`."""
+        """Return the number of vertices of each lane's path, without the camera's. For the arguments, see `sample`."""
         ...
 
 
 class PathContext:
-    """What a path reads and never changes. No dataclass: Dr.Jit would take it for state of its loops.
+    """Constant inputs of a path. This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
 
     Args:
-        mode, scene, tables, replay, pair, geometry: of `PathKernel.sample`.
-        connections: where a replay forward writes what connections to emitters add; None for nowhere.
+        mode, scene, tables, replay, pair, geometry: arguments of `PathKernel.sample`.
+        connections: record of emitter-sampling connections in a forward replay, or None.
 
     Attributes:
-        primal, forward: whether `mode` is that.
-        states: of each state, its objects.
-        bsdf_ctx, phase_ctx: all lobes, radiance.
+        primal, forward: whether `mode` is `Primal` or `Forward`.
+        states: pointers to the objects of each state.
+        bsdf_ctx, phase_ctx: contexts with all lobes, for radiance.
     """
 
     def __init__(
@@ -115,24 +115,24 @@ class PathContext:
 
     @property
     def state_count(self) -> int:
-        """1, or 2 for a pair."""
+        """Number of states: 1, or 2 for a pair."""
         return 2 if self.pair else 1
 
     def resume_grad(self) -> Any:
-        """Derivatives where paths are replayed, none in a primal pass."""
+        """Return a context that enables derivatives during a replay, but not in a primal pass."""
         return dr.resume_grad(when=not self.primal)
 
     def initial_radiance(self) -> list[Spectrum]:
-        """L of each state before the first vertex: none gathered yet or, to replay, all of it still ahead."""
+        """Return L of each state before the first vertex: 0 or, in a replay, the total radiance."""
         return [mi.Spectrum(0 if self.primal else self.replay[state].radiance) for state in range(self.state_count)]
 
     def accumulate(self, L: Sequence[Spectrum], *parts: Sequence[Spectrum]) -> list[Spectrum]:
-        """L of each state after a vertex that gave `parts`: more gathered or, in a replay, less still ahead."""
+        """Return L of each state after a vertex with the contributions `parts`: they are added or, in a replay, subtracted."""
         combine = operator.add if self.primal else operator.sub
         return [functools.reduce(combine, of_state) for of_state in zip(L, *parts, strict=True)]
 
     def adjoint_sum(self, contributions: Sequence[Spectrum]) -> Spectrum:
-        """Σ δL · contribution over the states whose gradient is wanted; the contribution itself in forward mode."""
+        """Return Σ δL · contribution over the states whose gradient is requested; the contribution itself in forward mode."""
         if self.forward:
             return contributions[0]
         pairs = zip(self.replay, contributions, strict=True)
@@ -140,16 +140,16 @@ class PathContext:
 
 
 class ConnectionRecord:
-    """What the connections of paths to emitters add: see `EmitterSession.emitter_moments`. No dataclass: Dr.Jit would take it for state
-    of its loops.
+    """Record of the emitter-sampling connections of paths, see `EmitterSession.emitter_moments`. This is not a dataclass, since Dr.Jit
+    would treat a dataclass as loop state.
 
     Args:
         weights, noise: w / S and n / S of the lanes.
-        bounces: connections of a path at most, >= 1.
+        bounces: maximum number of connections per path, >= 1.
 
     Attributes:
-        values: y of each lane's connections, (lanes * bounces,), 0 where there is none.
-        emitters: likewise the registry id of the emitter that was drawn.
+        values: y of each lane's connections, (lanes * bounces,), 0 without a connection.
+        emitters: registry ids of the sampled emitters, of the same shape.
     """
 
     def __init__(self, weights: Spectrum, noise: Spectrum, bounces: int):
@@ -160,7 +160,7 @@ class ConnectionRecord:
         dr.make_opaque(self.values, self.emitters)
 
     def write(self, depth: UInt32, emitter: UInt32, f: Spectrum, tangent: Spectrum, active: Bool) -> None:
-        """A connection of each lane that adds f, with a derivative along the tangents, at a vertex of that depth, counted from 0."""
+        """Record a connection of each lane that adds f, with its derivative along the tangents, at a vertex of the given depth, from 0."""
         value = dr.square(dr.sum(self._weights * tangent)) + dr.sum(dr.square(self._noise * f))
         index = dr.arange(mi.UInt32, self._lanes) * self._bounces + depth
         dr.scatter(self.values, value, index, active)
@@ -169,12 +169,12 @@ class ConnectionRecord:
 
 @dataclass
 class ScatteringVertex:
-    """The last vertex where a path scattered, for the MIS weight of emitters that its next segment meets. State of Dr.Jit loops.
+    """The last vertex where a path scattered, for the MIS weight of an emitter that its next segment hits. It is state of Dr.Jit loops.
 
     Attributes:
-        interaction: where.
-        pdf: solid angle density of the direction in which the path left.
-        delta: whether no emitter sample competes with that direction: perfectly specular lobes, and the camera.
+        interaction: position of the vertex.
+        pdf: solid angle density of the outgoing direction.
+        delta: whether emitter sampling cannot sample that direction: perfectly specular lobes, and the camera.
     """
 
     interaction: mi.Interaction3f
@@ -183,21 +183,22 @@ class ScatteringVertex:
 
 
 def total(parts: Sequence[Any]) -> Any:
-    """Their sum, in order."""
+    """Return the sum of the parts, in order."""
     return functools.reduce(operator.add, parts)
 
 
 def carries_light(spectra: Sequence[Spectrum]) -> Bool:
-    """Whether any channel of any state is above zero or no number, per lane: a broken path goes on, to be counted as such at its end."""
+    """Return whether any channel of any state is positive or NaN, per lane. A path with NaN continues, to be counted as dropped at its
+    end."""
     return ~(largest(spectra) <= 0)
 
 
 def largest(spectra: Sequence[Spectrum]) -> Float:
-    """The largest channel of all states, per lane."""
+    """Return the largest channel of all states, per lane."""
     return functools.reduce(dr.maximum, [dr.max(spectrum) for spectrum in spectra])
 
 
 def relative(value: Spectrum) -> Spectrum:
-    """value / detach(value), 0 where it is zero: one, with the derivative of the logarithm."""
+    """Return value / detach(value), 0 where it is zero: the value 1 with the derivative of the logarithm."""
     primal = dr.detach(value)
     return dr.select(primal != 0, value / primal, 0)

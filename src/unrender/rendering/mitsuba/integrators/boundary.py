@@ -1,21 +1,21 @@
-"""The part of a derivative that path replay leaves out: how the borders of what is visible move.
+"""Boundary term of a derivative, which path replay omits: the motion of visibility discontinuities.
 
 At an edge of a mesh, radiance jumps from L⁻ on one side to L⁺ on the other. An integral over directions at a point x_a changes by the
-jump times the speed at which the edge, seen from x_a, moves along its normal n (Li et al. 2018). With the edge point x_b, moving by v_b,
-x_a by v_a, and c the next point beyond x_b on a side, that side's part of the jump moves by
+jump times the speed of the edge along its normal n, as seen from x_a (Li et al. 2018). Let x_b be the edge point with velocity v_b, v_a
+the velocity of x_a, and c the next point beyond x_b on one side. The contribution of that side moves by
 
     n · (v_b − v_a |bc| / |ac|)
 
-where path replay holds c as it differentiates the integral over surfaces at x_a (|bc| / |ac| = 1 where there is none). Paths are
-built from the edge outwards (Zhang et al. 2020): edge point and direction are sampled, x_a and c are traced, x_a is connected with the
-sensor, at once or by way of further vertices.
+if path replay fixes c when it differentiates the integral over surfaces at x_a (|bc| / |ac| = 1 without a c). Paths are built from the
+edge outwards (Zhang et al. 2020): an edge point and a direction are sampled, x_a and c are traced, and x_a is connected to the sensor,
+directly or through further vertices.
 
-Three disjoint parts, each of its own sampling:
-    primary   x_a is the sensor: edges on the picture.
-    shadows   c is on an emitter: edges as seen from points on emitters, delta emitters among them.
-    indirect  all other light that the jump is made of: edges and directions, uniformly.
+There are three disjoint parts with different sampling:
+    primary   x_a is the sensor: edges in the image.
+    shadows   c is on an emitter: edges as seen from points on emitters, including delta emitters.
+    indirect  all other radiance of the jump: edges and directions, uniformly.
 
-Left out: what is seen of edges in perfect mirrors and through glass, where x_a cannot be connected.
+Edges seen through perfect mirrors and glass are omitted, since x_a cannot be connected there.
 """
 
 from __future__ import annotations
@@ -43,58 +43,55 @@ from unrender.rendering.mitsuba.integrators.boundary_sampling import (
 )
 
 _NEAR = 1e-3
-"""Share of a distance within which nothing occludes."""
+"""Relative margin at the end of a shadow ray within which occluders are ignored."""
 _EMITTER_POINTS, _PAIRS = 256, 1 << 20
-"""Points on all emitters from which shadows' edges are looked for, at most; and their pairs with edges, as far as that allows."""
+"""Maximum number of points on all emitters for shadow edges, and of pairs of a point with an edge."""
 
 
 class BoundaryIntegrator:
-    """Boundary derivatives of what a perspective sensor sees.
+    """Boundary derivatives of a perspective sensor's image.
 
     Args:
         table: the scene's edges.
-        max_depth: longest path in segments, >= 1.
+        max_depth: maximum path length in segments, >= 1.
     """
 
-    # No dataclass: Dr.Jit would take it for state of its loops.
+    # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, table: EdgeTable, max_depth: int):
         self._table, self._max_depth = table, max_depth
         self._radiance: Any = mi.load_dict({"type": "prb_projective", "max_depth": max_depth, "rr_depth": max_depth})
 
     def weighted_image(self, scene: Any, sensor: Any, weights: Any, seed: int, samples: int) -> Any:
-        """Σ weights · image, of which only the derivative is of use: attached to the meshes' positions. Unbiased.
+        """Return a value whose derivative equals the boundary term of Σ weights · image, attached to the meshes' positions. Unbiased.
 
         Args:
-            scene, sensor: of Mitsuba; the sensor is perspective.
+            scene, sensor: Mitsuba's scene, and a perspective sensor.
             weights: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image.
             seed: in [0, 2**32).
-            samples: of each of the three parts.
+            samples: number of samples of each of the three parts.
         """
         return self._collected(WeightedPicture(scene, sensor, weights, samples), seed)
 
     def tangent_image(self, scene: Any, sensor: Any, seed: int, samples: int) -> Any:
-        """The derivative of the image, `mi.TensorXf` (H, W, 3), along the tangents that the meshes' positions have; detached. Unbiased.
-
-        Args:
-            scene, sensor, seed, samples: of `weighted_image`.
-        """
+        """Return the boundary term of the image's derivative, `mi.TensorXf` (H, W, 3), along the tangents of the meshes' positions. It
+        is detached and unbiased. For the arguments, see `weighted_image`."""
         picture = TangentPicture(scene, sensor, samples)
         self._collected(picture, seed)
         return picture.image()
 
     def _collected(self, picture: Picture, seed: int) -> Any:
-        """What a picture collects of all three parts."""
+        """Collect all three parts in a picture, and return its sum."""
         scene = picture.scene
         with dr.resume_grad():
             positions = self._table.positions(scene)
         if self._table.moving == 0:
             return mi.Float(0)
-        found = self._primary(picture, positions, seed)
+        total = self._primary(picture, positions, seed)
         if self._max_depth >= 2 and len(scene.emitters()) > 0:
-            found += self._shadows(picture, positions, seed ^ 0x5BD1E995)
+            total += self._shadows(picture, positions, seed ^ 0x5BD1E995)
         if self._max_depth >= 3:
-            found += self._indirect(picture, positions, seed ^ 0x1B873593)
-        return found
+            total += self._indirect(picture, positions, seed ^ 0x1B873593)
+        return total
 
     # ------------------------------------------------------------------ edges on the picture
 
@@ -130,7 +127,7 @@ class BoundaryIntegrator:
             return picture.collect(jump, uv * picture.size, active, dr.dot(normal, moved))
 
     def _picture_jump(self, picture: Picture, uv: Any, normal: Any, distance: Any, active: Any, seed: int) -> Any:
-        """Radiance before an edge on the picture (against its normal) less radiance beyond it."""
+        """Return the radiance before an edge in the image (against its normal) minus the radiance beyond it."""
         count = picture.samples
         number = dr.arange(mi.UInt32, 2 * count)
         lane = number % count
@@ -218,7 +215,8 @@ class BoundaryIntegrator:
             return total
 
     def _both_sides(self, scene: Any, segment: BoundarySegment, eye: EyePath, seed: int) -> tuple[list[Any], list[Any]]:
-        """Reflected radiance that arrives at x_a from the inner and from the outer side of an edge, and from what distances."""
+        """Return the reflected radiance that arrives at x_a from the inner and the outer side of an edge, and the distances of both
+        hits."""
         count = dr.width(segment.point)
         number = dr.arange(mi.UInt32, 2 * count)
         lane = number % count
@@ -242,25 +240,25 @@ class BoundaryIntegrator:
         return radiance, [dr.gather(mi.Float, far, half) for half in halves]
 
     def _trace(self, scene: Any, ray: Any, si: Any, depth: Any, active: Any, seed: int, period: int) -> Any:
-        """The radiance along rays that meet `si`, of which `depth` segments came before; the same random numbers after `period` lanes."""
+        """Return the radiance along rays that hit `si` after `depth` segments. Lanes `period` apart share random numbers."""
         sampler = lane_sampler(seed, period, dr.width(ray.o))
         with dr.suspend_grad():
             return self._radiance.sample(dr.ADMode.Primal, scene, sampler, ray, depth, None, None, active, False, si)[0]
 
 
 def _facing(si: Any, ray: Any, distance: Any) -> Any:
-    """Interactions with the shading normal turned to the side that is seen, where they are about as far as an edge.
+    """Flip the shading normal of back-facing interactions that are about as far as an edge towards the viewer.
 
-    Interpolated normals look away from the viewer in the last triangles before a silhouette, which are then black. The inner border of
-    that rim jumps as the silhouette does, and moves with it: as if the one jump were the other's sum.
+    Interpolated normals point away from the viewer in the last triangles before a silhouette, which are black. The inner border of this
+    rim moves with the silhouette, so its jump is merged with the silhouette's.
     """
     cosine = dr.dot(si.sh_frame.n, ray.d)
-    turned = si.is_valid() & (cosine > -1e-4) & (dr.dot(si.n, ray.d) < 0)
-    turned &= dr.abs(si.t - distance) < 0.05 * distance
+    flipped = si.is_valid() & (cosine > -1e-4) & (dr.dot(si.n, ray.d) < 0)
+    flipped &= dr.abs(si.t - distance) < 0.05 * distance
     normal = dr.normalize(si.sh_frame.n - (cosine + 1e-4) * ray.d)
     frame = mi.Frame3f(normal)
-    si.sh_frame = dr.select(turned, frame, si.sh_frame)
-    si.wi = dr.select(turned, si.to_local(-ray.d), si.wi)
+    si.sh_frame = dr.select(flipped, frame, si.sh_frame)
+    si.wi = dr.select(flipped, si.to_local(-ray.d), si.wi)
     return si
 
 

@@ -1,4 +1,4 @@
-"""Paths through an edge of a mesh: the sensor's picture, the segment that touches the edge, and the way from it to the sensor."""
+"""Paths through an edge of a mesh: the sensor's picture, the segment through the edge, and the subpath to the sensor."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from unrender.rendering.mitsuba.edges import EdgePoints
 from unrender.rendering.mitsuba.pixel_filter import FilterStencil
 
 OFFSET = 1e-4
-"""To the two sides of an edge: of the picture's side or, in space, of 1 + the largest coordinate."""
+"""Offset to the two sides of an edge, relative to the picture's side or, in space, to 1 + the largest coordinate."""
 
 
 class Picture:
-    """A perspective sensor's film, which collects what `samples` boundary samples add to its pixels' derivatives."""
+    """A perspective sensor's film, which collects the contributions of `samples` boundary samples to its pixels' derivatives."""
 
     def __init__(self, scene: Any, sensor: Any, samples: int):
         size = sensor.film().crop_size()
@@ -24,18 +24,18 @@ class Picture:
         self.scene, self.sensor, self.samples = scene, sensor, samples
         self.width, self.height = int(size[0]), int(size[1])
         self.size = mi.Vector2f(self.width, self.height)
-        # Opaque: of a mini-batch's views the number differs from step to step, and kernels with it.
+        # Opaque, since the number of samples in a mini-batch varies between steps and would change the kernels.
         self.scale = dr.opaque(mi.Float, self.width * self.height / samples)
         self.time: Any = dr.opaque(mi.Float, float(sensor.shutter_open()))
         with dr.suspend_grad():
             matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(
                 sensor.world_transform().inverse().matrix
             )
-        # Of which the projection knows nothing: the film is cut elsewhere out of the plane.
+        # The projection matrix does not include the principal point offset, which shifts the film.
         offset = mi.traverse(sensor)
-        whole = mi.Vector2f(sensor.film().size())
+        full_size = mi.Vector2f(sensor.film().size())
         centre = [offset[f"principal_point_offset_{axis}"] for axis in "xy"]
-        self._shift = mi.Vector2f(*(dr.detach(mi.Float(c)) for c in centre)) * whole / self.size
+        self._shift = mi.Vector2f(*(dr.detach(mi.Float(c)) for c in centre)) * full_size / self.size
         self._rows = [mi.Vector4f(*(matrix[row, column] for column in range(4))) for row in range(4)]
 
     def _row(self, number: int, v: Any, last: float) -> Any:
@@ -43,36 +43,36 @@ class Picture:
         return row.x * v.x + row.y * v.y + row.z * v.z + row.w * last
 
     def project(self, point: Any) -> tuple[Any, Any]:
-        """Where points are on the film, from 0 to 1, and how far in front."""
+        """Return the positions of points on the film, from 0 to 1, and their depth along the viewing direction."""
         p = dr.detach(point)
         w = self._row(3, p, 1.0)
         uv = mi.Vector2f(self._row(0, p, 1.0), self._row(1, p, 1.0)) / w - self._shift
         return mi.Point2f(uv), w
 
     def project_motion(self, point: Any, uv: Any, motion: Any) -> Any:
-        """The motion on the film of points at `uv` that move in space."""
+        """Return the motion on the film of points at `uv` that move in space."""
         w = self._row(3, dr.detach(point), 1.0)
         x, y, change = (self._row(number, motion, 0.0) for number in (0, 1, 3))
         uv = uv + self._shift
         return mi.Vector2f(x - uv.x * change, y - uv.y * change) / w
 
     def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
-        """Take in samples whose part of their pixels' derivatives is value times the derivative of motion.
+        """Add samples, whose contribution to their pixels' derivatives is value times the derivative of motion.
 
         Args:
             value: `mi.Spectrum`, detached, over the density of the sample.
             position: on the film, in pixels.
-            active: whether it counts.
+            active: lanes that contribute.
             motion: `mi.Float`, attached to the meshes' positions.
 
         Returns:
-            `mi.Float` of width 1, attached to the positions where the picture is for backward mode; sums are over what is returned.
+            `mi.Float` of width 1, attached to the positions if the picture is for backward mode. Callers add the returned values.
         """
         raise NotImplementedError
 
 
 class WeightedPicture(Picture):
-    """Of which the weighted sum of all pixels is wanted, for backward mode.
+    """Picture for backward mode, which sums all pixels times their weights.
 
     Args:
         weights: `mi.TensorXf` (H, W, 3).
@@ -83,7 +83,7 @@ class WeightedPicture(Picture):
         self._weights = weights.array
 
     def weighted(self, value: Any, position: Any, active: Any) -> Any:
-        """Σ over pixels and channels of value times filter times weight, of samples at `position`, in pixels."""
+        """Return Σ over pixels and channels of value times filter times weight, for samples at `position` in pixels."""
         weights = mi.Color3f(0)
 
         def add(pixel: Any, factor: Any, inside: Any) -> None:
@@ -94,23 +94,23 @@ class WeightedPicture(Picture):
         return dr.dot(mi.Color3f(value), weights)
 
     def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
-        """See `Picture.collect`: the samples' part of Σ weights · image."""
+        """Return the samples' contribution to Σ weights · image."""
         with dr.suspend_grad():
             weighted = dr.select(active, self.weighted(value, position, active), 0)
         return self.scale * dr.sum(weighted * motion)
 
 
 class TangentPicture(Picture):
-    """Of which each pixel's derivative along the tangents of the meshes' positions is wanted: forward mode."""
+    """Picture for forward mode: each pixel's derivative along the tangents of the meshes' positions."""
 
     def __init__(self, scene: Any, sensor: Any, samples: int):
         super().__init__(scene, sensor, samples)
         self._sums = dr.zeros(mi.Float, self.width * self.height * 3)
 
     def collect(self, value: Any, position: Any, active: Any, motion: Any) -> Any:
-        """See `Picture.collect`: adds to `image`; returns 0."""
+        """Add the samples to `image`, and return 0."""
         if dr.grad_enabled(motion):
-            # Edges stay: the two sides of an edge share some.
+            # Keep the graph's edges, since the two sides of a mesh edge share some of them.
             dr.forward_to(motion, flags=dr.ADFlag.ClearInterior)
             speed = dr.grad(motion) * self.scale
             with dr.suspend_grad():
@@ -124,12 +124,12 @@ class TangentPicture(Picture):
         return mi.Float(0)
 
     def image(self) -> Any:
-        """`mi.TensorXf` (H, W, 3)."""
+        """Return the derivative of the image, `mi.TensorXf` (H, W, 3)."""
         return mi.TensorXf(self._sums, (self.height, self.width, 3))
 
 
 class BoundarySegment:
-    """A direction through an edge point; its normal points away from the first face. All detached."""
+    """A direction through an edge point, and the normal, which points away from the first face. All detached."""
 
     def __init__(self, edge: EdgePoints, point: Any, direction: Any):
         start, end = dr.detach(edge.start), dr.detach(edge.end)
@@ -146,26 +146,26 @@ class BoundarySegment:
         self.inside = mi.Point3f(point - shift * self.normal)
 
     def is_behind(self, origin: Any) -> Any:
-        """Whether a point lies on one of the edge's own faces: those are in the way, where both look away."""
-        from_edge, found = origin - self.point, mi.Bool(False)
+        """Return whether a point lies on one of the edge's own faces, which occlude the segment if both are back-facing."""
+        from_edge, behind = origin - self.point, mi.Bool(False)
         for third in (self._edge.third, self._edge.other_third):
             normal = dr.cross(self._along, third - self.point)
             height = dr.abs(dr.dot(normal, from_edge)) / dr.maximum(dr.norm(normal), 1e-20)
-            found |= height < 2 * self.shift
-        return found & (self._edge.crease | self._edge.always)
+            behind |= height < 2 * self.shift
+        return behind & (self._edge.crease | self._edge.always)
 
 
 class EyePath:
-    """From x_a, behind an edge point, to the sensor, with a random number of vertices between.
+    """Subpath from x_a, behind an edge point, to the sensor, with a random number of intermediate vertices.
 
     Attributes:
-        time: of the picture.
+        time: time of the picture.
         first: x_a, `mi.SurfaceInteraction3f`.
-        moved: x_a as a ray that comes from the sensor's side meets it; attached.
+        moved: x_a as hit by a ray from the sensor's side; attached.
         throughput: importance over density.
         position: on the film in pixels.
-        bounces: of it, and hence segments before x_a, less one.
-        active: whether it got there.
+        bounces: number of intermediate vertices; there are `bounces` + 1 segments before x_a.
+        active: whether it reaches the sensor.
     """
 
     def __init__(self, picture: Picture, segment: BoundarySegment, sampler: Any, most: int, active: Any):
@@ -206,13 +206,13 @@ class _Walk:
 
 
 def _walk(scene: Any, si: Any, sampler: Any, bounces: Any, most: int, active: Any) -> _Walk:
-    """Scatter importance at x_a and further vertices, `bounces` times."""
+    """Scatter importance at x_a and at further vertices, `bounces` times."""
     state = _Walk(si, mi.Spectrum(1), mi.Vector3f(0, 0, 1), mi.UInt32(0), active)
     if most <= 0:
         return state
     context = mi.BSDFContext(mi.TransportMode.Importance)
 
-    def going(state: _Walk, sampler: Any) -> Any:
+    def is_going(state: _Walk, sampler: Any) -> Any:
         return state.active & (state.made < bounces)
 
     def bounce(state: _Walk, sampler: Any) -> tuple[_Walk, Any]:
@@ -225,15 +225,15 @@ def _walk(scene: Any, si: Any, sampler: Any, bounces: Any, most: int, active: An
         active &= following.is_valid() & dr.any(β != 0)
         return _Walk(following, β, first, state.made + 1, active), sampler
 
-    found, _ = dr.while_loop((state, sampler), going, bounce, label="eye path")  # pyright: ignore[reportArgumentType, reportAssignmentType]
-    # Those that ended before they had made all bounces are inactive; the others stopped with `active` as it was.
-    found.active &= found.made == bounces
-    return found
+    result, _ = dr.while_loop((state, sampler), is_going, bounce, label="eye path")  # pyright: ignore[reportArgumentType, reportAssignmentType]
+    # Paths that ended before their last bounce are inactive. The others keep their flag.
+    result.active &= result.made == bounces
+    return result
 
 
 def _geometric_cosines(si: Any, wo: Any, direction: Any) -> Any:
-    """What makes a BSDF's value, times the cosine of the shading normal to where importance goes, the same of radiance (Veach 1997,
-    section 5.3)."""
+    """Return the correction of shading normals for importance, which makes a BSDF's value times cosine adjoint to that of radiance
+    (Veach 1997, section 5.3)."""
     incoming = dr.dot(si.n, si.to_world(si.wi))
     below = incoming * mi.Frame3f.cos_theta(wo)
     above = mi.Frame3f.cos_theta(si.wi) * dr.dot(si.n, direction)
@@ -241,7 +241,7 @@ def _geometric_cosines(si: Any, wo: Any, direction: Any) -> Any:
 
 
 def _geometric(sample: Any, most: int) -> tuple[Any, Any]:
-    """A number from 0 to `most` of which each is half as probable as the one before, the last two alike; and its probability."""
+    """Sample a number from 0 to `most` with probabilities that halve at each step, the last two equal. Return it with its probability."""
     number, probability, reached = mi.UInt32(0), mi.Float(1), mi.Float(0)
     if most <= 0:
         return number, probability

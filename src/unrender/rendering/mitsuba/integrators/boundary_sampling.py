@@ -1,4 +1,4 @@
-"""What boundary derivatives are sampled by: edges by weight, directions in which an edge is a silhouette, points on emitters."""
+"""Sampling of boundary derivatives: edges by weight, directions in which an edge is a silhouette, and points on emitters."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from unrender.rendering.mitsuba.edges import EdgePoints
 from unrender.rendering.mitsuba.film import RepeatingSampler
 
 _AREA, _POINT, _DISTANT = 0, 1, 2
-"""Kinds of emitters: with a surface, at a point, and those that only have a direction."""
+"""Kinds of emitters: area, point, and distant."""
 
 
 class WeightedChoice:
-    """A number by its weight; the probability is 0 where no weight is positive."""
+    """Discrete sampling of an index in proportion to its weight. The probability is 0 if no weight is positive."""
 
     def __init__(self, weights: Any):
         self._weights = dr.select(dr.isfinite(weights), weights, 0)
@@ -26,7 +26,7 @@ class WeightedChoice:
         self._total = dr.gather(mi.Float, self._sums, self._count - 1)
 
     def draw(self, sample: Any) -> tuple[Any, Any]:
-        """Numbers and their probabilities. `sample` is stratified over the lanes."""
+        """Return indices and their probabilities. `sample` is stratified over the lanes."""
         lanes = dr.width(sample)
         u = (dr.arange(mi.Float, lanes) + sample) / lanes * self._total
         index = dr.binary_search(0, self._count - 1, lambda i: dr.gather(mi.Float, self._sums, i) <= u)
@@ -35,7 +35,8 @@ class WeightedChoice:
 
 
 class SilhouetteWedge:
-    """Directions in which an edge is a silhouette: of all directions around it, 4 `angle`; all where shading jumps at it."""
+    """Directions in which an edge is a silhouette. Their solid angle is 4 `angle`; all directions if shading is discontinuous at the
+    edge."""
 
     def __init__(self, edge: EdgePoints):
         start, end = dr.detach(edge.start), dr.detach(edge.end)
@@ -48,7 +49,7 @@ class SilhouetteWedge:
         beyond = other - cosine * one
         size = dr.norm(beyond)
         beyond = dr.select(size > 1e-6, beyond / dr.maximum(size, 1e-20), dr.cross(self._tangent, one))
-        # From the second face's plane, away from the first.
+        # The wedge begins at the second face's plane, away from the first.
         self._begin = dr.select(everywhere, 0, dr.safe_acos(cosine))
         self._one, self._beyond = one, beyond
 
@@ -57,19 +58,19 @@ class SilhouetteWedge:
         return flat / dr.maximum(dr.norm(flat), 1e-20)
 
     def direction(self, first: Any, second: Any) -> Any:
-        """Uniform by solid angle."""
+        """Sample a direction, uniformly by solid angle."""
         cosine = 2 * first - 1
         sine = dr.safe_sqrt(1 - dr.square(cosine))
         doubled = 2 * second
-        turned = doubled >= 1
-        φ = self._begin + dr.select(turned, doubled - 1, doubled) * self.angle
+        flipped = doubled >= 1
+        φ = self._begin + dr.select(flipped, doubled - 1, doubled) * self.angle
         s, c = dr.sincos(φ)
         flat = c * self._one + s * self._beyond
-        return mi.Vector3f(cosine * self._tangent + sine * dr.select(turned, -flat, flat))
+        return mi.Vector3f(cosine * self._tangent + sine * dr.select(flipped, -flat, flat))
 
 
 def coplanar(edge: EdgePoints) -> Any:
-    """Whether two faces lie in one plane, and on two sides of the edge."""
+    """Return whether two faces lie in one plane, on opposite sides of the edge."""
     start = dr.detach(edge.start)
     a, b, c = dr.detach(edge.end) - start, edge.third - start, edge.other_third - start
     m, n = dr.cross(a, b), dr.cross(c, a)
@@ -103,7 +104,7 @@ class EmitterPoints:
         )
 
     def seen_from(self, point: Any, which: Any) -> tuple[Any, Any]:
-        """Direction and distance of a viewpoint."""
+        """Return direction and distance from a point to an emitter point."""
         p, _, d, kind = self._gather(which)
         towards = p - dr.detach(point)
         distance = dr.norm(towards)
@@ -114,16 +115,16 @@ class EmitterPoints:
         )
 
     def measure(self, point: Any, which: Any, distance: Any, direction: Any) -> Any:
-        """Solid angle at the point over the density of the viewpoint; relative radiance is left out."""
+        """Return the solid angle at the point over the density of the emitter point. Relative radiance is not included."""
         _, n, _, kind = self._gather(which)
         density = dr.gather(mi.Float, self._density, which) * self._each
         cosine = dr.maximum(-dr.dot(n, direction), 0)
         near = dr.select(kind == _AREA, cosine / dr.square(distance), 1)
-        # Directions to emitters at a point: their radiance falls with the distance by itself.
+        # The radiance of a point emitter includes the inverse square of the distance.
         return dr.select(density > 0, near / density, 0)
 
     def arriving(self, point: Any, which: Any, direction: Any, distance: Any, active: Any) -> Any:
-        """The radiance of the emitter at the viewpoint, times `measure`."""
+        """Return the radiance of the emitter at the emitter point, times `measure`."""
         p, n, _, kind = self._gather(which)
         ds = dr.zeros(mi.DirectionSample3f, dr.width(point))
         ds.p, ds.n, ds.d = dr.select(kind == _DISTANT, point + direction, p), n, direction
@@ -136,13 +137,13 @@ class EmitterPoints:
         return dr.select(active, value * self.measure(point, which, distance, direction), 0)
 
     def share(self, distance: Any, which: Any) -> Callable[[Any], Any]:
-        """|bc| / |ac| as a function of |ab|, for an emitter at `distance` |bc|."""
+        """Return |bc| / |ac| as a function of |ab|, for an emitter at `distance` |bc|."""
         far = dr.gather(mi.UInt32, self._kind, which) == _DISTANT
         return lambda near: dr.select(far, 1, distance / (near + distance))
 
 
 def _emitter_points(emitter: Any, seed: int, count: int, time: Any) -> tuple[Any, ...]:
-    """Points, normals, directions, texture coordinates, densities, kinds and the emitter, `count` lanes."""
+    """Return points, normals, directions, texture coordinates, densities, kinds and the emitter, `count` lanes."""
     sampler = lane_sampler(seed & 0xFFFFFFFF, count, count)
     sample = sampler.next_2d()
     it = dr.zeros(mi.Interaction3f, count)
@@ -152,7 +153,7 @@ def _emitter_points(emitter: Any, seed: int, count: int, time: Any) -> tuple[Any
     pointer = dr.repeat(mi.EmitterPtr(emitter), count)
 
     def spread(values: Any) -> list[Any]:
-        """Components of full width. Points may share one value, such as the normal of a flat shape."""
+        """Return the components at full width. Points may share one value, such as the normal of a flat shape."""
         return [component + zero for component in values]
 
     if shape is not None:

@@ -1,17 +1,17 @@
-"""How a picture changes as the sensor moves.
+"""Derivative of an image by the motion of its sensor.
 
-A point that the sensor sees is at P(x; θ) on the film, where θ are the sensor's pose and field of view. Where the picture f is followed
-along the flow v = ∂P/∂θ of what it shows, it changes only with the direction from which that is seen. So (Reynolds' transport theorem)
+A point x is at P(x; θ) on the film, where θ are the sensor's pose and field of view. Along the flow v = ∂P/∂θ of the visible points,
+the image f only changes with the direction of view. Reynolds' transport theorem therefore gives
 
     d/dθ ∫ k f du = ∫ f v·∇k du + ∫ k f div v du + ∫ k Df du + Σ over silhouettes ∫ k [f (v − s)·n] ds
 
-with the reconstruction filter k of the pixel (∇k lies on the pixel's border where that is a box), the divergence of the flow, the
-change Df of f at fixed points, and curves at which the flow jumps, which move by s and have f, v on either side. Shadows, textures and
-all else that light does on surfaces are part of f, and need no edges of their own. Where a sensor turns or zooms, the flow depends on u
-alone: Df and the silhouettes vanish, whatever the scene holds.
+with the reconstruction filter k of the pixel (∇k is on the pixel's border for a box filter), the divergence of the flow, and the change
+Df of f at fixed points. The silhouettes are curves where the flow is discontinuous. They move by s and have different f and v on both
+sides. Shadows and textures are part of f and need no edges. If a sensor rotates or zooms, the flow depends on u alone: Df and the
+silhouette term vanish in every scene.
 
-The radiance where a filter rises, where it falls, and within, is estimated with the same random numbers, so noise cancels between them.
-In flat mirrors the flow is that of the mirrored point's virtual image.
+The radiance where a filter increases, where it decreases, and inside, uses the same random numbers, so noise cancels between them. In
+flat mirrors the flow is that of the virtual image of the mirrored point.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from unrender.rendering.mitsuba.pixel_filter import FilterSlopes, PixelFilters, 
 from unrender.rendering.mitsuba.view_weights import ViewWeights
 
 _ARCS = 16
-"""That a curve is cut into, to be chosen by their lengths on the picture."""
+"""Number of pieces of a curve, which are sampled by their lengths in the image."""
 _SPHERE, _CIRCLE, _TOP, _LEFT, _RIGHT = range(5)
-"""Kinds of curves, in the coordinates of the shape: a unit sphere's silhouette, unit circles at z = 0 and z = 1, and the two lines at
-which a cylinder between them turns away."""
+"""Kinds of curves in local coordinates: silhouette of a unit sphere, unit circles at z = 0 and z = 1, and the two silhouette lines of the
+cylinder between them."""
 _CURVES = {"Sphere": (_SPHERE,), "Disk": (_CIRCLE,), "Cylinder": (_CIRCLE, _TOP, _LEFT, _RIGHT)}
 
 
 class SilhouetteCurves:
-    """The curves of a scene that does not move, in pieces.
+    """Silhouette curves of a scene that does not move, in pieces.
 
     Args:
-        scene: of Mitsuba.
+        scene: the Mitsuba scene.
         table: its edges.
 
     Attributes:
-        count: of pieces.
+        count: number of pieces.
     """
 
     def __init__(self, scene: Any, table: EdgeTable):
@@ -65,18 +65,19 @@ class SilhouetteCurves:
         self.count = table.count + _ARCS * len(kinds)
 
     def at(self, index: Any, u: Any, viewpoint: Any) -> tuple[Any, Any, Any]:
-        """Points of these pieces, from 0 to 1 along them, their derivatives by u, and whether what `viewpoint` sees may jump there."""
+        """Return points at u in [0, 1] along these pieces, their derivatives by u, and whether the view of `viewpoint` may be
+        discontinuous there."""
         viewpoint = mi.Point3f(viewpoint)
         if self._table.count == 0:
             return self._analytic(index, u, viewpoint)
         of_mesh = index < self._table.count
         edge = self._table.at(self._positions, dr.minimum(index, self._table.count - 1))
         point, along = dr.lerp(edge.start, edge.end, u), edge.end - edge.start
-        found = mi.Point3f(point), mi.Vector3f(along), edge.is_silhouette(viewpoint - 0.5 * (edge.start + edge.end))
+        result = mi.Point3f(point), mi.Vector3f(along), edge.is_silhouette(viewpoint - 0.5 * (edge.start + edge.end))
         if self.count > self._table.count:
             others = self._analytic(dr.select(of_mesh, 0, index - self._table.count), u, viewpoint)
-            found = tuple(dr.select(of_mesh, a, b) for a, b in zip(found, others, strict=True))
-        return found
+            result = tuple(dr.select(of_mesh, a, b) for a, b in zip(result, others, strict=True))
+        return result
 
     def _analytic(self, index: Any, u: Any, viewpoint: Any) -> tuple[Any, Any, Any]:
         curve = index // _ARCS
@@ -90,7 +91,7 @@ class SilhouetteCurves:
         point = mi.Vector3f(c, s, dr.select(kind == _TOP, 1.0, 0.0))
         along = mi.Vector3f(-s, c, 0) * dr.two_pi
         exists = mi.Bool(True)
-        # A sphere: the circle of the points x with x · v = 1.
+        # The silhouette of a sphere is the circle of points x with x · v = 1.
         distance = dr.norm(local)
         axis = local / dr.maximum(distance, 1e-20)
         frame = mi.Frame3f(axis)
@@ -99,11 +100,11 @@ class SilhouetteCurves:
         point = dr.select(sphere, axis / dr.maximum(distance, 1e-20) + size * (c * frame.s + s * frame.t), point)
         along = dr.select(sphere, size * dr.two_pi * (c * frame.t - s * frame.s), along)
         exists &= ~sphere | (distance > 1)
-        # A cylinder: the lines at the angles whose cosine from the viewpoint is 1 / distance.
+        # The silhouette lines of a cylinder are at angles from the viewpoint with cosine 1 / distance.
         flat = dr.sqrt(dr.square(local.x) + dr.square(local.y))
         line = (kind == _LEFT) | (kind == _RIGHT)
-        turned = dr.safe_acos(dr.rcp(dr.maximum(flat, 1e-20))) * dr.select(kind == _LEFT, -1.0, 1.0)
-        ls, lc = dr.sincos(dr.atan2(local.y, local.x) + turned)
+        angle = dr.safe_acos(dr.rcp(dr.maximum(flat, 1e-20))) * dr.select(kind == _LEFT, -1.0, 1.0)
+        ls, lc = dr.sincos(dr.atan2(local.y, local.x) + angle)
         point = dr.select(line, mi.Vector3f(lc, ls, t), point)
         along = dr.select(line, mi.Vector3f(0, 0, 1), along)
         exists &= ~line | (flat > 1)
@@ -111,34 +112,34 @@ class SilhouetteCurves:
 
 
 _POINTS = 5
-"""Of a sample: where its pixel's filter rises and falls along each coordinate (opposite borders of a box), and one within."""
+"""Points per sample: two per coordinate where the pixel's filter increases and decreases (opposite borders of a box), and one inside."""
 
 
 class _Seen:
-    """What a lane sees: its radiance, and the point, for each lane as homogeneous coordinates, with its derivatives by the film's two
-    coordinates along the surface. Detached."""
+    """Radiance of a lane's view ray, and its visible point in homogeneous coordinates with derivatives along the surface by both film
+    coordinates. Detached."""
 
     def __init__(self, L: Any, point: Any, across: tuple[Any, Any]):
         self.L, self.point, self.across = L, point, across
 
 
 class _Points:
-    """Places in pixels from a pixel's corner, and the derivatives and the value of the pixel's filter there, over their densities."""
+    """Positions relative to a pixel's corner, and the derivatives and the value of the pixel's filter there, over their densities."""
 
     def __init__(self, at: Any, slope: Any, within: Any):
         self.at, self.slope, self.within = at, slope, within
 
 
 class _FilmMap:
-    """Where points are on the film; attached to the sensor's parameters. Coordinates from 0 to 1."""
+    """Projection of points to the film, attached to the sensor's parameters. Film coordinates range from 0 to 1."""
 
     def __init__(self, sensor: Any):
         with dr.resume_grad():
             matrix = sensor.projection_transform().matrix @ sensor.world_transform().inverse().matrix
             offset, film = mi.traverse(sensor), sensor.film()
             centre = [mi.Float(offset[f"principal_point_offset_{axis}"]) for axis in "xy"]
-            whole, size = film.size(), film.crop_size()
-            self._shift = [centre[k] * dr.opaque(mi.Float, float(whole[k]) / float(size[k])) for k in range(2)]
+            full_size, size = film.size(), film.crop_size()
+            self._shift = [centre[k] * dr.opaque(mi.Float, float(full_size[k]) / float(size[k])) for k in range(2)]
             self._rows = [mi.Vector4f(*(matrix[row, column] for column in range(4))) for row in range(4)]
         with dr.suspend_grad():
             self.origin = dr.detach(sensor.world_transform()) @ mi.Point3f(0)
@@ -146,22 +147,22 @@ class _FilmMap:
             self._columns = [mi.Vector4f(*(inverse[row, column] for row in range(4))) for column in range(4)]
 
     def direction(self, uv: Any) -> tuple[Any, Any, Any]:
-        """Of the ray through `uv`, not of unit length, and its derivatives. Detached."""
+        """Return the unnormalised direction of the ray through `uv` and its derivatives by both coordinates. Detached."""
         x, y, _, one = self._columns
         near = (uv.x + dr.detach(self._shift[0])) * x + (uv.y + dr.detach(self._shift[1])) * y + one
-        found = [mi.Vector3f(v.x, v.y, v.z) / near.w for v in (near, x, y)]
-        return found[0] - mi.Vector3f(self.origin), found[1], found[2]
+        columns = [mi.Vector3f(v.x, v.y, v.z) / near.w for v in (near, x, y)]
+        return columns[0] - mi.Vector3f(self.origin), columns[1], columns[2]
 
     def place(self, point: Any) -> Any:
-        """Of homogeneous points."""
+        """Project homogeneous points."""
         w = dr.dot(self._rows[3], point)
         return mi.Vector2f(
             dr.dot(self._rows[0], point) / w - self._shift[0], dr.dot(self._rows[1], point) / w - self._shift[1]
         )
 
     def stretch(self, seen: _Seen) -> Any:
-        """The determinant of the map from the film as it is now to the film as the sensor moves, along what is seen: 1, with derivative
-        div v."""
+        """Return the Jacobian determinant of the map from the current film to the moved film, along the visible surface: 1, with
+        derivative div v."""
         w, (x, y) = dr.dot(self._rows[3], seen.point), (dr.dot(row, seen.point) for row in self._rows[:2])
         columns = []
         for across in seen.across:
@@ -172,15 +173,15 @@ class _FilmMap:
 
 
 class CameraMotion:
-    """Derivatives of what a perspective sensor sees by its own pose and field of view.
+    """Derivatives of a perspective sensor's image by its own pose and field of view.
 
     Args:
-        table: the scene's edges; None where the sensor stays in its place.
-        max_depth: longest path in segments, >= 1.
-        still: whether no shape moves, so that curves and mirrors need to be found once only.
+        table: the scene's edges; None if the sensor's position does not change.
+        max_depth: maximum path length in segments, >= 1.
+        still: whether no shape moves, so that curves and mirrors are computed only once.
     """
 
-    # No dataclass: Dr.Jit would take it for state of its loops.
+    # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, table: EdgeTable | None, max_depth: int, still: bool):
         self._table, self._max_depth, self._still = table, max_depth, still
         self._mirrors: Any = None
@@ -189,11 +190,12 @@ class CameraMotion:
         self._radiance: Any = mi.load_dict({"type": "prb_projective", "max_depth": max_depth, "rr_depth": max_depth})
 
     def weighted_image(self, scene: Any, sensor: Any, view: ViewWeights, seed: int) -> Any:
-        """Σ weights · image, of which only the derivative is of use: attached to the sensor's parameters. Unbiased, but for what curved
-        mirrors and glass show while the sensor's place changes.
+        """Return a value whose derivative equals that of Σ weights · image, attached to the sensor's parameters.
+
+        It is unbiased, except for the views through curved mirrors and glass if the sensor's position changes.
 
         Args:
-            scene, sensor: of Mitsuba; the sensor is perspective.
+            scene, sensor: Mitsuba's scene, and a perspective sensor.
             view: weights of the sensor's pixels.
             seed: in [0, 2**32).
         """
@@ -202,13 +204,13 @@ class CameraMotion:
             self._curves = SilhouetteCurves(scene, self._table) if self._table is not None else None
         film = _FilmMap(sensor)
         picture = WeightedPicture(scene, sensor, view.image, view.samples)
-        found = self._pixels(picture, film, view, seed)
+        total = self._pixels(picture, film, view, seed)
         if self._curves is not None:
             if self._curves.count:
-                found += self._silhouettes(self._curves, picture, film, seed ^ 0x5BD1E995)
+                total += self._silhouettes(self._curves, picture, film, seed ^ 0x5BD1E995)
             if self._max_depth >= 2 and is_glossy(scene):
-                found += self._directions(picture, view, seed ^ 0x1B873593)
-        return found
+                total += self._directions(picture, view, seed ^ 0x1B873593)
+        return total
 
     # ------------------------------------------------------------------ pixels and their borders
 
@@ -235,7 +237,7 @@ class CameraMotion:
             return total * dr.opaque(mi.Float, 1 / view.spp)
 
     def _points(self, picture: WeightedPicture, pixel: Any, kind: Any, u: Any) -> _Points:
-        """The five points of a sample: where the filter of its pixel rises and falls along x, likewise along y, and one within."""
+        """Return the five points of a sample: where its pixel's filter increases and decreases along x, along y, and one inside."""
         one = dr.select(kind == _POINTS - 1, 1.0, 0.0)
         signs = [dr.select(kind == axis * 2, 1.0, dr.select(kind == axis * 2 + 1, -1.0, 0.0)) for axis in range(2)]
         if is_box(picture.sensor.film()):
@@ -255,7 +257,7 @@ class CameraMotion:
         return _Points(mi.Vector2f(*places), mi.Vector2f(*slope), one * weights[0] * weights[1])
 
     def _look(self, picture: WeightedPicture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int) -> _Seen:
-        """What is seen at `uv`; lanes a period apart share random numbers."""
+        """Return the view through `uv`. Lanes `period` apart share random numbers."""
         sensor, scene = picture.sensor, picture.scene
         ray, weight = sensor.sample_ray(picture.time, 0.5, mi.Point2f(uv), mi.Point2f(0.5), active)
         si = scene.ray_intersect(ray, active)
@@ -281,7 +283,7 @@ class CameraMotion:
         return self._radiance.sample(dr.ADMode.Primal, scene, sampler, ray, depth, None, None, active, False, si)[0]
 
     def _directions(self, picture: WeightedPicture, view: ViewWeights, seed: int) -> Any:
-        """∫ Df du: what is seen at fixed points changes with the direction towards the sensor."""
+        """Return ∫ Df du: the change of radiance at fixed points with the direction to the sensor."""
         sensor, scene, count = picture.sensor, picture.scene, picture.samples
         with dr.suspend_grad():
             sampler = lane_sampler(seed, count, count)
@@ -303,7 +305,7 @@ class CameraMotion:
             return dr.sum(dr.dot(weight, lit)) * dr.opaque(mi.Float, 1 / view.spp)
 
     def _trace_on(self, scene: Any, ray: Any, si: Any, sampler: Any, active: Any) -> Any:
-        """The radiance along a path's second segment."""
+        """Return the radiance along a path's second segment."""
         return self._radiance.sample(
             dr.ADMode.Primal, scene, sampler, ray, mi.UInt32(1), None, None, active, False, si
         )[0]
@@ -331,7 +333,7 @@ class CameraMotion:
             active = (pmf > 0) & jumps & (length > 1e-12) & (depth > 0) & picture.stencil.is_sampled(uv)
             active &= self._mirrors.sees(scene, film.origin, real, point, mirror, active)
             factor = dr.select(active, length / pmf * picture.scale, 0)
-            # The two sides.
+            # Evaluate both sides of the curve with equal random numbers.
             number = dr.arange(mi.UInt32, 2 * count)
             lane = number % count
             sign = dr.select(number < count, -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Perfect mirrors with flat faces, behind which the virtual images of what they show stand still as the viewer moves."""
+"""Flat perfect mirrors, whose virtual images do not move with the viewer."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 __all__ = ["FlatMirrors", "MirroredView", "glossy_radiance", "is_glossy"]
 
 _NEAR = 1e-3
-"""Share of a distance within which nothing occludes."""
+"""Relative margin at the end of a shadow ray within which occluders are ignored."""
 _BOUNCES = 2
-"""Between flat mirrors, that are followed."""
+"""Maximum number of reflections by flat mirrors."""
 _PLANES = 12
-"""Of mirrors in whose image edges are looked for, at most."""
+"""Maximum number of mirror planes with virtual edges."""
 
 
 class FlatMirrors:
-    """The flat mirrors of a scene. False where there are none.
+    """The flat mirrors of a scene. False if there are none.
 
     Args:
-        scene: of Mitsuba.
+        scene: the Mitsuba scene.
 
     Attributes:
-        count: of views: without a mirror, number 0, and in each plane of a mirror.
+        count: number of views: index 0 without a mirror, and one for each mirror plane.
     """
 
-    # No dataclass: Dr.Jit would take it for state of its loops.
+    # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, scene: Any):
         planes: list[np.ndarray] = []
         for shape in scene.shapes():
@@ -53,14 +53,14 @@ class FlatMirrors:
         return mi.Vector3f(v[0:3]), v[3]
 
     def reflect(self, point: Any, number: Any, direction: bool = False) -> Any:
-        """Points, or directions, in the mirror of this number."""
+        """Reflect points, or directions, in the mirror of this index."""
         n, height = self._plane(number)
         v = mi.Vector3f(point)
         v -= 2 * (dr.dot(n, v) - (0 if direction else height)) * n
         return v if direction else mi.Point3f(v)
 
     def sees(self, scene: Any, origin: Any, real: Any, virtual: Any, number: Any, active: Any) -> Any:
-        """Whether the origin sees a point: by way of the mirror where there is one."""
+        """Return whether the origin sees a point, directly or by the mirror of this index."""
         n, height = self._plane(number)
         towards = mi.Vector3f(virtual - origin)
         ray = mi.Ray3f(origin, dr.normalize(towards))
@@ -78,25 +78,25 @@ class FlatMirrors:
 
 
 class MirroredView:
-    """What a ray meets, by way of flat mirrors: the surface, the ray and its length from the viewer, and the orientation of what is seen.
+    """View ray through flat mirrors: the surface it hits, the ray, its length from the viewer, and the orientation of the image.
 
     Attributes:
         si: `mi.SurfaceInteraction3f`.
-        ray: its last segment.
-        distance: of all segments.
-        depth: segments before the last.
+        ray: last segment.
+        distance: length of all segments.
+        depth: number of segments before the last.
         β: throughput.
         linear: `mi.Matrix3f`, from directions of the virtual image to those of the world.
     """
 
-    # No dataclass: Dr.Jit would take it for state of its loops.
+    # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
     def __init__(self, si: Any, ray: Any, distance: Any, max_depth: int):
         self.si, self.ray, self.distance = si, ray, distance
         self.depth, self.β, self.linear = mi.UInt32(0), mi.Spectrum(1), mi.Matrix3f(dr.identity(mi.Matrix3f))
         self._max_depth = max_depth
 
     def follow(self, scene: Any, active: Any) -> None:
-        """To the first surface that is no flat mirror, as far as that is within two bounces."""
+        """Follow the ray to the first surface other than a flat mirror, within two reflections."""
         for _ in range(_BOUNCES):
             si = self.si
             turns = active & si.is_valid() & _is_flat_mirror(si) & (self.depth + 1 < self._max_depth)
@@ -105,8 +105,8 @@ class MirroredView:
             ray = si.spawn_ray(si.to_world(bs.wo))
             n = mi.Vector3f(si.n)
             columns = [mi.Vector3f(*(self.linear[row, column] for row in range(3))) for column in range(3)]
-            turned = [v - 2 * dr.dot(n, v) * n for v in columns]
-            matrix = mi.Matrix3f(*(turned[column][row] for row in range(3) for column in range(3)))
+            mirrored = [v - 2 * dr.dot(n, v) * n for v in columns]
+            matrix = mi.Matrix3f(*(mirrored[column][row] for row in range(3) for column in range(3)))
             following = scene.ray_intersect(ray, turns)
             self.distance = dr.select(turns, self.distance + following.t, self.distance)
             self.linear = dr.select(turns, matrix, self.linear)
@@ -117,7 +117,7 @@ class MirroredView:
 
 
 def _reflects(flags: Any) -> Any:
-    """Whether a BSDF is a perfect mirror, and nothing besides."""
+    """Return whether a BSDF only has a perfect mirror lobe."""
     reflects = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
     others = [mi.BSDFFlags.Smooth, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null]
     for flag in others:
@@ -131,7 +131,7 @@ def _is_flat_mirror(si: Any) -> Any:
 
 
 def _planes(mesh: Any) -> list[np.ndarray]:
-    """Normal and height (4,) of the planes of a mesh's faces; none of one that is not made of a few flat sides."""
+    """Return normal and offset (4,) of the planes of a mesh's faces; empty if the mesh has many faces."""
     points = np.array(mesh_layout.positions(mesh), float).reshape(-1, 3)
     faces = np.array(mesh_layout.faces(mesh)).reshape(-1, 3).astype(np.int64)
     if len(faces) > 2 * _PLANES:
@@ -141,33 +141,35 @@ def _planes(mesh: Any) -> list[np.ndarray]:
     size = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = (normals / np.maximum(size, 1e-20))[size[:, 0] > 0]
     planes = np.c_[normals, (normals * a[size[:, 0] > 0]).sum(axis=1)]
-    # The two sides of a plane are one mirror: the largest component of its normal is positive.
+    # Both sides of a plane are one mirror, so make the largest component of its normal positive.
     largest = np.take_along_axis(normals, np.abs(normals).argmax(axis=1)[:, None], axis=1)
     return list(planes * np.where(largest < 0, -1.0, 1.0))
 
 
 def is_glossy(scene: Any) -> bool:
-    """Whether a BSDF of the scene has a glossy lobe: others that are no perfect mirrors reflect alike in all directions."""
+    """Return whether a BSDF of the scene has a glossy lobe. Other lobes, except perfect mirrors, do not depend on the direction of
+    view."""
     return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Glossy) for shape in scene.shapes())
 
 
 def glossy_radiance(
     scene: Any, si: Any, towards: Any, sampler: Any, trace: Callable[[Any, Any, Any, Any, Any], Any], active: Any
 ) -> Any:
-    """0, with the derivative of the reflected radiance by the direction of view attached, perfectly specular lobes left out: the radiance
-    less itself from where it is seen, so that derivatives by the material cancel, which path replay has.
+    """Return 0, with the derivative of the reflected radiance by the direction of view, without perfectly specular lobes.
+
+    The result is the radiance minus itself at the detached direction. Derivatives by the material, which path replay includes, cancel.
 
     Args:
-        scene: of Mitsuba.
-        si: where, detached.
-        towards: the direction of view in the frame of `si`, attached.
-        sampler: of the lanes.
-        trace: the radiance along a ray that meets an interaction: (scene, ray, interaction, sampler, active).
-        active: lanes that count.
+        scene: the Mitsuba scene.
+        si: detached interaction at the visible point.
+        towards: direction of view in the frame of `si`, attached.
+        sampler: sampler of the lanes.
+        trace: radiance along a ray that hits an interaction, a function of (scene, ray, interaction, sampler, active).
+        active: lanes that contribute.
     """
     context = mi.BSDFContext()
     with dr.suspend_grad():
-        bsdf, turned = si.bsdf(), mi.SurfaceInteraction3f(si)
+        bsdf, viewed = si.bsdf(), mi.SurfaceInteraction3f(si)
         ds, emitted = scene.sample_emitter_direction(si, sampler.next_2d(), True, active)
         to_emitter = si.to_local(ds.d)
         lit = active & (ds.pdf > 0)
@@ -180,13 +182,13 @@ def glossy_radiance(
         ray = si.spawn_ray(si.to_world(bs.wo))
         following = scene.ray_intersect(ray, smooth)
         arriving = trace(scene, ray, following, sampler, smooth)
-        seen = mi.DirectionSample3f(scene, following, si)
+        hit = mi.DirectionSample3f(scene, following, si)
         direct = following.emitter(scene, smooth).eval(following, smooth)
-        share = mis_weight(density, scene.pdf_emitter_direction(si, seen, smooth))
-        arriving += direct * (share - 1)
+        mis = mis_weight(density, scene.pdf_emitter_direction(si, hit, smooth))
+        arriving += direct * (mis - 1)
         arriving = dr.select(smooth, arriving / density, 0)
     with dr.resume_grad():
-        turned.wi = towards
-        from_emitter = bsdf.eval(context, turned, to_emitter, lit) - bsdf.eval(context, si, to_emitter, lit)
-        others = bsdf.eval(context, turned, bs.wo, smooth) - bsdf.eval(context, si, bs.wo, smooth)
+        viewed.wi = towards
+        from_emitter = bsdf.eval(context, viewed, to_emitter, lit) - bsdf.eval(context, si, to_emitter, lit)
+        others = bsdf.eval(context, viewed, bs.wo, smooth) - bsdf.eval(context, si, bs.wo, smooth)
         return from_emitter * emitted + others * arriving

@@ -328,7 +328,7 @@ class PathPair:
             return None
         (branch,) = path.branches
         lobe = self.differential.lobe(context, si, bsdf, active & ~branch.found)
-        path.branches = [branch.kept(BranchVertex(path.ray, path.depth, path.β[0], path.η, lobe.served))]
+        path.branches = [branch.or_else(BranchVertex(path.ray, path.depth, path.β[0], path.η, lobe.served))]
         return lobe
 
     def _follow_branches(self, context: PathContext, path: PathState, sampler: Any) -> None:
