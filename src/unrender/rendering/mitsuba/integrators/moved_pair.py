@@ -1,11 +1,10 @@
-"""Two states of a scene whose shapes move, on related paths.
+"""Paths of two states of a scene with moving shapes, related by reconnection shifts.
 
-Every connection of the previous state's path leads either to where its own random numbers lead (primary sample space), or to the
-point of the current state's path, carried along with the shape that it lies on: the same triangle, the same barycentric coordinates
-(a shift by reconnection, as in gradient-domain path tracing). Which of both is drawn, with a known probability, and the direction is
-weighted by the density of the mixture of both (one-sample MIS with the balance heuristic). So the shift needs no inverse: a carried
-point that is hidden in the previous state has no part in it, and where the current state's path could not have come, the density is
-that of the other technique alone.
+Each segment of the previous state's path leads to one of two points. One is the point that its own random numbers give (primary sample
+space). The other is the point of the current state's path, moved with its shape: same triangle, same barycentric coordinates (a
+reconnection shift, as in gradient-domain path tracing). The choice has a known probability, and the direction is weighted by the
+density of the mixture (one-sample MIS with the balance heuristic). The shift therefore needs no inverse: a moved point that is occluded
+in the previous state contributes 0, and where the current state's path cannot arrive, only the density of the other technique counts.
 
 Symbols as in `path.py`; a subscript (ₚ) is the previous state.
 """
@@ -31,37 +30,37 @@ from unrender.rendering.mitsuba.integrators.moved_vertices import (
     Vertex,
     emission,
     follow,
-    goes_on,
     is_clear,
     is_diffuse,
+    may_contribute,
     moves,
 )
 from unrender.rendering.mitsuba.integrators.pointer_tables import remap
 
 CARRIED_SHARE = 0.75
-"""Of the connections that may be carried along, the share that is: 1 would leave out what the current state's path cannot see."""
+"""Probability of a reconnection where it is possible. With 1, points that the current state's path cannot see would be missing."""
 
 
 class MovedPair:
-    """Path tracer of both states. The current state's paths are those of Mitsuba's `prb`, number for number, so that `PrbKernel` can
-    replay them. Both images are unbiased.
+    """Path tracer of both states. The current state's paths use the random numbers of Mitsuba's `prb`, so `PrbKernel` can replay them.
+    Both images are unbiased.
 
     Args:
-        max_depth: longest path in segments, >= 1.
-        rr_depth: the depth from which roulette may end a path; from there on nothing is carried along.
-        share: the probability of the carried connection, in [0, 1).
-        areas: whether the change of a triangle's area is part of the density. Without, the previous image is biased: for tests.
-        shared: whether rays that are the same in both states, and near nothing that moves, are traced for the current one alone. Not
-            where anything but meshes and sensors moves, which the bounds do not know.
+        max_depth: maximum path length in segments, >= 1.
+        rr_depth: depth from which Russian roulette may terminate a path; no reconnections from there on.
+        share: probability of a reconnection, in [0, 1).
+        areas: whether the density includes the change of a triangle's area. Without it, the previous image is biased: for tests.
+        shared: whether rays that are equal in both states, and far from moving shapes, are traced for the current state only. Set it to
+            False if anything but meshes and sensors moves, since the bounds only contain meshes.
 
-    Carried are connections between vertices with diffuse lobes only: where a lobe is narrow, a direction that is a little off is another.
-    The last segment is not: it can meet emitters only.
+    Reconnections join vertices with diffuse lobes only, since a narrow lobe is sensitive to small changes of direction. The last
+    segment is not reconnected, since only emission contributes there.
     """
 
     def __init__(
         self, max_depth: int, rr_depth: int = 5, share: float = CARRIED_SHARE, areas: bool = True, shared: bool = True
     ):
-        # No dataclass: Dr.Jit would take it for state of the loop below.
+        # This is not a dataclass, since Dr.Jit would treat a dataclass as state of the loop below.
         self.max_depth, self.rr_depth, self.share, self.areas, self.shared = max_depth, rr_depth, share, areas, shared
 
     def sample(
@@ -75,20 +74,20 @@ class MovedPair:
         """Trace one path of each state per lane. Call under `dr.suspend_grad()`.
 
         Args:
-            scenes: the current and the previous one.
-            tables: "shape" and "shape_back", from registry ids of the current scene's shapes to those of the previous one's, and back;
-                "triangles", of each of the current scene's shapes, where its triangles begin in "area_ratios", 0 for shapes
-                that stand still; "area_ratios", area in the previous over area in the current scene, 1 at 0; "ellipsoids", see
-                `BoundingEllipsoids`, about what moves in either state; "emitters", likewise about all that emits, or None
-                where that is everywhere or not known.
+            scenes: the current and the previous scene.
+            tables: "shape" and "shape_back", maps between registry ids of the current and the previous scene's shapes; "triangles",
+                for each of the current scene's shapes the index of its first triangle in "area_ratios", 0 for static shapes;
+                "area_ratios", area in the previous over area in the current scene, 1 at index 0; "ellipsoids", see
+                `BoundingEllipsoids`, around everything that moves in either state; "emitters", ellipsoids around all emitters, or
+                None if they are unbounded or unknown.
             sampler: seeded; both states use its numbers.
-            choices: numbers apart, for what is carried along.
+            choices: independent random numbers, which choose the reconnections.
             rays: camera rays of each state.
 
         Returns:
             radiance per lane of the current and of the previous state.
         """
-        (scene, sceneₚ), (ray, rayₚ) = scenes, (mi.Ray3f(of) for of in rays)
+        (scene, sceneₚ), (ray, rayₚ) = scenes, (mi.Ray3f(camera_ray) for camera_ray in rays)
         lights = None if tables["emitters"] is None else BoundingEllipsoids(tables["emitters"])
         tables = {**tables, "bounds": BoundingEllipsoids(tables["ellipsoids"]), "lights": lights}
         every = mi.Bool(True)
@@ -96,17 +95,17 @@ class MovedPair:
         clear = is_clear(tables, ray, pi)
         piₚ, same = follow(sceneₚ, tables, (ray, rayₚ), pi, clear, every, mi.Bool(self.shared), coherent=True)
         states = []
-        for state, of, hit in zip(scenes, (ray, rayₚ), (pi, piₚ), strict=True):
-            last, active = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every), goes_on(state, hit)
-            states.append(PathState(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), of, hit, last, active))
+        for state, camera_ray, hit in zip(scenes, (ray, rayₚ), (pi, piₚ), strict=True):
+            last, active = ScatteringVertex(dr.zeros(mi.Interaction3f), mi.Float(1), every), may_contribute(state, hit)
+            states.append(PathState(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), camera_ray, hit, last, active))
         path = PairState(mi.UInt32(0), states[0], states[1], same)
         if self.max_depth > 1:
             path = self._trace(scenes, tables, path, sampler, choices)
 
-        # Where the longest paths end, and those that meet nothing, there is nothing but what is emitted.
+        # Only emission contributes where paths of maximum length end, and where paths leave the scene.
         def end(path: PairState) -> tuple[Spectrum, Spectrum]:
             both = zip(scenes, (path.current, path.previous), self._meet(tables, path), strict=True)
-            now, before = (of.L + emission(scene, of, si) for scene, of, si in both)
+            now, before = (camera_ray.L + emission(scene, camera_ray, si) for scene, camera_ray, si in both)
             return now, before
 
         def over(path: PairState) -> tuple[Spectrum, Spectrum]:
@@ -129,7 +128,7 @@ class MovedPair:
     def _bounce(
         self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: PairState, sampler: Any, choices: Any
     ) -> PairState:
-        """The vertices that both paths have come to, and where they go on from there."""
+        """Process the current vertices of both paths, and sample their next segments."""
         scene, sceneₚ = scenes
         now, before = path.current, path.previous
         numbers = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
@@ -139,49 +138,50 @@ class MovedPair:
         self._connect(scenes, tables, path, near, nearₚ)
         out, outₚ = (self._scatter(of, numbers[1:]) for of in (near, nearₚ))
 
-        # ------------------ Which connections are carried ------------------
+        # ----------------------- Choice of reconnections -----------------------
         diffuse = is_diffuse(out.bsdf) & is_diffuse(outₚ.bsdf)
         able = out.active & outₚ.active & diffuse & (path.depth < self.rr_depth) & (path.depth + 2 < self.max_depth)
         share = dr.select(able, mi.Float(self.share), 0)
-        carried = choices.next_1d() < share if self._carries else mi.Bool(False)
+        carried = choices.next_1d() < share if self._reconnects else mi.Bool(False)
 
         # -------------------- Roulette, as in `prb` --------------------
         number = sampler.next_1d()
         nowβ = now.β * out.weight
         survives, nowβ = self._roulette(path.depth, nowβ, now.η * out.bs.eta, number)
-        going = out.active & survives
+        continues = out.active & survives
 
         # ----------------- The current path's next vertex -----------------
-        # Where it has ended, it may still tell the other where to go.
-        following = going | (carried & (out.bs.pdf > 0))
+        # A terminated path may still give the point of a reconnection.
+        following = continues | (carried & (out.bs.pdf > 0))
         pi = scene.ray_intersect_preliminary(
             out.ray, coherent=False, active=following & self._may_add(tables, path, out.ray)
         )
 
         # ----------------- The previous path's next vertex -----------------
-        way = self._continue(scenes, tables, (out, outₚ), pi, share, carried, path, following)
-        beforeβ = before.β * way.weight
-        survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * way.η, number)
+        step = self._continue(scenes, tables, (out, outₚ), pi, share, carried, path, following)
+        beforeβ = before.β * step.weight
+        survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * step.η, number)
 
         last = ScatteringVertex(mi.Interaction3f(out.si), out.bs.pdf, out.delta)
-        path.current = PathState(now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, going & goes_on(scene, pi))
-        last = ScatteringVertex(mi.Interaction3f(outₚ.si), way.pdf, way.delta)
+        path.current = PathState(
+            now.L, nowβ, now.η * out.bs.eta, out.ray, pi, last, continues & may_contribute(scene, pi)
+        )
+        last = ScatteringVertex(mi.Interaction3f(outₚ.si), step.pdf, step.delta)
         path.previous = PathState(
             before.L,
             beforeβ,
-            before.η * way.η,
-            way.ray,
-            way.pi,
+            before.η * step.η,
+            step.ray,
+            step.pi,
             last,
-            outₚ.active & survivesₚ & goes_on(sceneₚ, way.pi),
+            outₚ.active & survivesₚ & may_contribute(sceneₚ, step.pi),
         )
-        path.same = way.same
+        path.same = step.same
         path.depth += 1
         return path
 
     def _meet(self, tables: Mapping[str, Any], path: PairState) -> tuple[Any, Any]:
-        """The vertices that both paths have come to. Where they are one, the previous state's is the current one's, seen from where its
-        path comes from."""
+        """Return the current vertices of both paths. If they coincide, the previous state's is a copy with its own incident direction."""
         now, before = path.current, path.previous
         alone = before.active & ~path.same
         here = now.active | (before.active & path.same)
@@ -193,7 +193,7 @@ class MovedPair:
         return si, dr.select(path.same, one, own)
 
     def _gather(self, scene: Any, path: PathState, si: Any, number: Any) -> Vertex:
-        """What one state's path has come to, and a point of an emitter that it may be connected to."""
+        """Return a vertex of one state's path: its emission, and a point on an emitter for next-event estimation."""
         ctx, bsdf, Le = mi.BSDFContext(), si.bsdf(), emission(scene, path, si)
 
         # ---------------------- Emitter sampling ----------------------
@@ -208,7 +208,8 @@ class MovedPair:
     def _connect(
         self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: PairState, now: Vertex, before: Vertex
     ) -> None:
-        """Add what emitters give, where they are to be seen. What adds nothing is not asked for, nor what is known from the other state."""
+        """Add the contributions of visible emitter samples. Shadow rays are skipped for contributions of 0 and for results of the other
+        state."""
         scene, sceneₚ = scenes
         ray, asked, askedₚ = now.si.spawn_ray_to(now.to), dr.max(now.Ld) != 0, dr.max(before.Ld) != 0
         hidden = scene.ray_test(ray, asked)
@@ -218,7 +219,7 @@ class MovedPair:
         path.previous.L += before.Le + dr.select(dr.select(known, hidden, hiddenₚ), 0, before.Ld)
 
     def _scatter(self, vertex: Vertex, numbers: tuple[Any, Any]) -> Direction:
-        """A direction off a vertex."""
+        """Sample a direction at a vertex."""
         si, active = vertex.si, vertex.active
         bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, *numbers, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -235,37 +236,41 @@ class MovedPair:
         path: PairState,
         followed: Bool,
     ) -> Continuation:
-        """Where the previous state's path goes on: in its own direction, or to the current path's next vertex, as it was.
+        """Return the next segment of the previous state's path: in its own direction, or a reconnection to the current path's next
+        vertex.
 
         Args:
+            scenes, tables: of `sample`.
+            out: sampled directions of both paths.
             pi: the current path's next vertex, of the lanes `followed`.
-            share, carried: probability, and which.
-            path: so far.
+            share, carried: probability of a reconnection, and lanes that chose it.
+            path: state before the segment.
+            followed: lanes whose current path has a next vertex.
         """
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
         same, own = path.same, before.active & ~carried
-        looked = own & self._may_add(tables, path, before.ray)
+        traced = own & self._may_add(tables, path, before.ray)
         clear = same & followed & is_clear(tables, now.ray, pi)
-        piₚ, met = follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, looked, same & followed)
-        if not self._carries:
+        piₚ, coincides = follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, traced, same & followed)
+        if not self._reconnects:
             bs = before.bs
-            return Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, met)
-        asked = own & (share > 0)
-        mixed = carried | asked
+            return Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, coincides)
+        weighed = own & (share > 0)
+        mixed = carried | weighed
 
         link = Link(tables, (now, before), (pi, piₚ), carried, mixed)
 
-        # ------------- Whether either technique could have come there -------------
+        # ------------- Densities of both techniques at the chosen point -------------
         wo = dr.select(carried, now.bs.wo, now.si.to_local(link.direction))
         woₚ = dr.select(carried, before.si.to_local(link.direction), before.bs.wo)
         forward = now.bsdf.pdf(ctx, now.si, wo, mixed)
         value, pdf = before.bsdf.eval_pdf(ctx, before.si, woₚ, mixed)
         free = carried & (forward > 0) & (dr.max(value) > 0)
         free &= clear | ~sceneₚ.ray_test(link.ray(before.si), free & ~clear)
-        seen = asked & (forward > 0)
-        seen &= met | ~scene.ray_test(link.ray(now.si), seen & ~met)
+        visible = weighed & (forward > 0)
+        visible &= coincides | ~scene.ray_test(link.ray(now.si), visible & ~coincides)
         change = link.density_ratio() * (link.area_ratio(tables) if self.areas else 1)
-        forward = dr.select(carried | seen, forward * dr.select(link.valid, change, 1), 0)
+        forward = dr.select(carried | visible, forward * dr.select(link.valid, change, 1), 0)
 
         # ------------------------------ Mixture ------------------------------
         weight = value / (share * forward + (1 - share) * pdf)
@@ -277,22 +282,22 @@ class MovedPair:
             dr.select(mixed, pdf, before.bs.pdf),
             before.delta & ~carried,
             dr.select(carried, 1, before.bs.eta),
-            dr.select(carried, self.shared & ~moves(tables, pi.shape), met),
+            dr.select(carried, self.shared & ~moves(tables, pi.shape), coincides),
         )
 
     @property
-    def _carries(self) -> bool:
-        """Whether anything is carried along."""
+    def _reconnects(self) -> bool:
+        """Whether there are any reconnections."""
         return self.max_depth > 2 and self.share > 0
 
     def _may_add(self, tables: Mapping[str, Any], path: PairState, ray: Any) -> Bool:
-        """Lanes whose next segment may add something: the last one must meet an emitter."""
+        """Return the lanes whose next segment may contribute: the last one must hit an emitter."""
         if tables["lights"] is None:
             return mi.Bool(True)
         return (path.depth + 2 < self.max_depth) | tables["lights"].meet(ray, mi.Float(dr.inf))
 
     def _roulette(self, depth: UInt32, β: Spectrum, η: Float, number: Float) -> tuple[Bool, Spectrum]:
-        """Which lanes go on, and their throughput."""
+        """Return which lanes survive Russian roulette, and their throughput."""
         most = dr.max(β)
         q = dr.minimum(most * dr.square(η), 0.95)
         asked = depth >= self.rr_depth

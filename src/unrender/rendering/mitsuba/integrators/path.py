@@ -1,7 +1,7 @@
-"""The surface path tracer: next-event estimation, multiple importance sampling, roulette, for one state or two, and its adjoint.
+"""Surface path tracer for one state or two, and its adjoint: next-event estimation, multiple importance sampling, Russian roulette.
 
-Symbols: β throughput, L radiance, δL adjoint radiance, η relative index of refraction, si surface interaction. β, L and whatever else
-differs between the states are lists, the current state first; the previous state is traced on the current state's paths.
+Symbols: β throughput, L radiance, δL adjoint radiance, η relative index of refraction, si surface interaction. β, L and all other
+quantities that differ between the states are lists, the current state first. The previous state is traced on the current state's paths.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from unrender.rendering.mitsuba.integrators.base import (
 from unrender.rendering.mitsuba.integrators.differential_bsdf import BranchVertex, DifferentialBsdf, RoughLobe
 
 ROULETTE_FLOOR = 0.25
-"""Roulette looks at the current throughput alone, so that the adjoint can replay it without the previous state. This floor
-keeps paths alive that only the previous state still uses: both images stay unbiased whatever the ratio of throughputs."""
+"""Minimum survival probability of Russian roulette, which depends on the current throughput only, so that the adjoint can replay it
+without the previous state. The floor keeps paths that only the previous state needs: both images are unbiased for any throughputs."""
 
 
 @dataclass
 class PathState:
-    """A path's loop state.
+    """Loop state of a path.
 
     Attributes:
-        ray: of the next segment.
-        depth: segments traced.
-        L: radiance of each state: gathered so far or, in a replay, still to be gathered.
+        ray: ray of the next segment.
+        depth: number of segments traced.
+        L: radiance of each state: accumulated so far or, in a replay, remaining.
         δL: derivative of the radiance along the tangents (forward mode).
-        δlogβ: of the logarithm of the throughput, where connections are recorded.
+        δlogβ: derivative of the logarithm of the throughput, if connections are recorded.
         β: throughput of each state.
         η: relative index of refraction.
-        last: the vertex that `ray` leaves.
-        active: lanes whose path goes on.
-        branches: the vertex of the differential paths, where there are any; else nothing.
+        last: vertex that `ray` leaves.
+        active: lanes whose path continues.
+        branches: vertex of the differential paths, if there are any; else empty.
     """
 
     ray: mi.Ray3f
@@ -63,14 +63,14 @@ class PathState:
 
 
 class BsdfDirection:
-    """A direction sampled off a BSDF.
+    """A direction sampled from a BSDF.
 
     Attributes:
         bs: `mi.BSDFSample3f`.
-        pdf: solid angle density, all smooth lobes together.
+        pdf: solid angle density of all smooth lobes together.
         delta: lanes that sampled a perfectly specular lobe.
-        values: of each state, BSDF times cosine, or of the specular lobe where that follows its parameters; attached.
-        weights: of each state, sampling weights; detached.
+        values: for each state, BSDF times cosine, or value of the specular lobe if it depends on parameters; attached.
+        weights: for each state, sampling weights; detached.
     """
 
     def __init__(
@@ -85,18 +85,18 @@ class BsdfDirection:
 
 
 class PathPair:
-    """Settings of the path tracer.
+    """Path tracer of surfaces.
 
     Args:
-        max_depth: the longest path in segments, as in Mitsuba (1: directly visible emitters only), >= 1.
-        rr_depth: the depth from which roulette may end a path.
-        changing_delta: whether a BSDF with a parameter to recover has perfectly specular lobes (a few evaluations more per bounce).
-        differential: how derivatives by roughness are sampled in replays of one state; None for like everything else. With it, `tables`
-            has "rough", the BSDFs that this concerns.
+        max_depth: maximum path length in segments, as in Mitsuba (1: directly visible emitters only), >= 1.
+        rr_depth: depth from which Russian roulette may terminate a path.
+        changing_delta: whether a BSDF with an unknown parameter has perfectly specular lobes, which need further evaluations per bounce.
+        differential: differential sampling of roughness in replays of one state; None for standard sampling. It needs the entry "rough" of
+            `tables`.
 
-    Differences from Mitsuba's `path` that matter to the estimates, none to their means: a sampled direction is weighted by the
-    BSDF's whole density and value (not by the sampled lobe's own), so that both states share one density; the visibility of
-    an emitter is tested apart from its radiance, so that an emitter that is black in one state still counts in the other.
+    Differences from Mitsuba's `path`, which do not change expected values: a sampled direction is weighted by the BSDF's total density
+    and value, not by those of the sampled lobe, so that both states share one density; and the visibility of an emitter is tested
+    separately from its radiance, so that an emitter that is black in one state still contributes in the other.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class PathPair:
         changing_delta: bool = False,
         differential: DifferentialBsdf | None = None,
     ):
-        # No dataclass: Dr.Jit would take it for state of the loop below.
+        # This is not a dataclass, since Dr.Jit would treat a dataclass as state of the loop below.
         self.max_depth = max_depth
         self.rr_depth = rr_depth
         self.changing_delta = changing_delta
@@ -124,7 +124,7 @@ class PathPair:
         geometry: Any = None,
         active: Bool | bool = True,
     ) -> tuple[Spectrum, Spectrum | None]:
-        """Trace one path per lane. See `PathKernel.sample`; the "delta" entry of `tables` is used with `changing_delta`."""
+        """Trace one path per lane, see `PathKernel.sample`. The "delta" entry of `tables` is used with `changing_delta`."""
         context = PathContext(mode, scene, tables, replay, pair, geometry)
         path = self._trace(context, self._begin(context, ray, active), sampler)
         if path.branches:
@@ -152,7 +152,7 @@ class PathPair:
         connections: ConnectionRecord,
         active: Bool | bool = True,
     ) -> None:
-        """Replay the paths forward, as `sample` does, and write what connections to emitters add."""
+        """Replay the paths in forward mode, and record the contributions of emitter-sampling connections."""
         context = PathContext(dr.ADMode.Forward, scene, tables, (replay,), False, None, connections)
         self._trace(context, self._begin(context, ray, active), sampler)
 
@@ -178,7 +178,7 @@ class PathPair:
         return path
 
     def _bounce(self, context: PathContext, path: PathState, sampler: Any) -> PathState:
-        """One segment and the vertex at its end."""
+        """Trace one segment and process the vertex at its end."""
         si = context.geometry.ray_intersect(
             path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active
         )
@@ -205,7 +205,7 @@ class PathPair:
         path.ray = si.spawn_ray(si.to_world(bs.wo))
         path.η *= bs.eta
         path.β = [β * weight for β, weight in zip(path.β, direction.weights, strict=True)]
-        pdf = dr.select(direction.delta, 1, direction.pdf)  # no emitter sample competes with a delta lobe
+        pdf = dr.select(direction.delta, 1, direction.pdf)  # emitter sampling cannot sample a delta lobe
         path.last = ScatteringVertex(dr.detach(si, True), pdf, direction.delta)
 
         # -------------------- Stopping criterion ---------------------
@@ -229,7 +229,7 @@ class PathPair:
         active: Bool,
         lobe: RoughLobe | None,
     ) -> tuple[list[Spectrum], emitters.EmitterConnection]:
-        """Ld of each state, by next-event estimation."""
+        """Return Ld of each state, by next-event estimation."""
         si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em)
@@ -244,7 +244,7 @@ class PathPair:
             ]
             if lobe is None:
                 return connection.contributions(β, [f, *previous], pdf), connection
-            # What competes with these samples for the derivative of the lobe is the branches' directions.
+            # For the derivative of the lobe, MIS combines these samples with the directions of the branches.
             rest = connection.contributions(β, [lobe.without(f, wo)], pdf)
             change = connection.contributions(β, [lobe.change(f, wo)], lobe.pdf(wo))
             return [total([*rest, *change])], connection
@@ -285,9 +285,9 @@ class PathPair:
         Ld: Sequence[Spectrum],
         values: Sequence[Spectrum],
     ) -> None:
-        """Back-propagate the derivative of this vertex, or carry tangents forward through it.
+        """Back-propagate the derivative of this vertex, or propagate tangents through it.
 
-        `path.L` holds what arrives through the sampled direction: times f / detach(f) it carries f's derivative.
+        `path.L` is the radiance that arrives from the sampled direction. Multiplied by f / detach(f), it has f's derivative.
         """
         with dr.resume_grad():
             Lo = [e + d + L * relative(value) for e, d, L, value in zip(Le, Ld, path.L, values, strict=True)]
@@ -304,11 +304,11 @@ class PathPair:
         connection: emitters.EmitterConnection,
         parts: tuple[Spectrum, Spectrum, Spectrum],
     ) -> None:
-        """Write the connection of this vertex, from its Le, Ld and value of the direction. The derivative of what it adds has a part of its
-        own, and one of the throughput that leads to it."""
+        """Record the connection of this vertex, from its Le, Ld and value of the direction. The derivative of its contribution is that
+        of Ld itself plus that of the throughput up to the vertex."""
         Le, Ld, value = parts
         with dr.resume_grad():
-            # Le is of no account; but Dr.Jit wants all that is attached within an iteration to be traversed in it.
+            # Le is not needed, but Dr.Jit requires that everything attached within an iteration is traversed in it.
             tangents: Any = dr.forward_to(Le, Ld, relative(value))
             _, δLd, δlogf = tangents
         Ld = dr.detach(Ld)
@@ -323,7 +323,7 @@ class PathPair:
     def _rough_lobe(
         self, context: PathContext, path: PathState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: Bool
     ) -> RoughLobe | None:
-        """Of the vertex that is the path's first whose roughness derivative is sampled apart, which is kept; None in other passes."""
+        """Return the lobe of the path's first vertex with differential roughness sampling, and store that vertex; None in other passes."""
         if not path.branches or self.differential is None:
             return None
         (branch,) = path.branches
@@ -332,7 +332,7 @@ class PathPair:
         return lobe
 
     def _follow_branches(self, context: PathContext, path: PathState, sampler: Any) -> None:
-        """Back-propagate the roughness derivatives that the replay left out, or carry tangents forward."""
+        """Back-propagate the roughness derivatives that the replay has omitted, or propagate tangents."""
         (branch,) = path.branches
         numbers = independent(sampler, dr.width(branch.ray))
         dr.eval(branch, path.δL, numbers)  # Two backward passes in one kernel would race for the same gradients.
@@ -345,7 +345,7 @@ class PathPair:
                 dr.backward_from(context.adjoint_sum([contribution]))
 
     def _incident(self, context: PathContext) -> Callable[..., Spectrum]:
-        """See `DifferentialBsdf.contribution`: by ordinary paths."""
+        """Return the `incident` argument of `DifferentialBsdf.contribution`, which traces standard paths."""
         primal = PathContext(dr.ADMode.Primal, context.scene, context.tables, (), False, context.geometry)
 
         def trace(branch: BranchVertex, vertex: ScatteringVertex, ray: Any, numbers: Any, active: Bool) -> Spectrum:

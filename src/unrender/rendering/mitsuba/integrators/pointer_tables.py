@@ -1,4 +1,4 @@
-"""From objects of the current scene to those of the previous one, by gathers from registry id to registry id."""
+"""Maps from objects of the current scene to those of the previous one, by gathers from registry id to registry id."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ Pointer = TypeVar("Pointer", "mi.BSDFPtr", "mi.EmitterPtr", "mi.ShapePtr", "mi.M
 
 
 def registry_id(pointer: Any) -> UInt32:
-    """The registry id of each lane's object, 0 for none."""
+    """Return the registry id of each lane's object, 0 for none."""
     return dr.reinterpret_array(mi.UInt32, pointer)
 
 
 def remap(table: UInt32, pointer: Pointer) -> Pointer:
-    """The previous scene's object for the current scene's `pointer`; `table` is one of `ScenePair.tables()`."""
+    """Return the previous scene's object for the current scene's `pointer`. `table` is one of `ScenePair.tables()`."""
     return dr.reinterpret_array(type(pointer), dr.gather(mi.UInt32, table, registry_id(pointer)))  # pyright: ignore[reportReturnType]
 
 
 class StatePointers:
-    """Objects of each traced state: of the current scene alone or, for a pair, of the current and of the previous one.
+    """Objects of each traced state: of the current scene or, for a pair, of the current and of the previous one.
 
     Args:
-        tables: of `ScenePair.tables()`; read for a pair only.
+        tables: `ScenePair.tables()`; used for a pair only.
         pair: whether the previous state is traced too.
     """
 
@@ -41,19 +41,19 @@ class StatePointers:
         return [pointer, remap(self._tables[kind], pointer)] if self.pair else [pointer]
 
     def bsdfs(self, bsdf: mi.BSDFPtr) -> list[mi.BSDFPtr]:
-        """Of each state."""
+        """Return the BSDF of each state."""
         return self._of("bsdf", bsdf)
 
     def emitters(self, emitter: mi.EmitterPtr) -> list[mi.EmitterPtr]:
-        """Of each state."""
+        """Return the emitter of each state."""
         return self._of("emitter", emitter)
 
     def media(self, medium: mi.MediumPtr) -> list[mi.MediumPtr]:
-        """Of each state."""
+        """Return the medium of each state."""
         return self._of("medium", medium)
 
     def interactions(self, si: mi.SurfaceInteraction3f) -> list[mi.SurfaceInteraction3f]:
-        """`si` on the shape of each state."""
+        """Return `si` on the shape of each state."""
         if not self.pair:
             return [si]
         siₚ = mi.SurfaceInteraction3f(si)
@@ -64,7 +64,7 @@ class StatePointers:
 def pointer_table(current: Any, previous: Any) -> mi.UInt32:
     """Return the table from the registry ids of one load's pointers to those of another load.
 
-    Raises `InputError` where the two loads differ in their number.
+    Raises `InputError` if the two loads differ in their number.
     """
     source = dr.reinterpret_array(mi.UInt32, current).numpy()  # pyright: ignore[reportAttributeAccessIssue]
     target = dr.reinterpret_array(mi.UInt32, previous).numpy()  # pyright: ignore[reportAttributeAccessIssue]

@@ -14,8 +14,8 @@ from unrender.rendering.mitsuba.integrators.path import PathPair
 
 
 class PrbKernel:
-    """Mitsuba's `prb` as a `PathKernel`, for parameters that move geometry: its adjoint carries the continuous part of their derivative.
-    Visibility is left out; `BoundaryIntegrator` has it, of meshes."""
+    """Mitsuba's `prb` as a `PathKernel`, for parameters that move geometry. Its adjoint is the continuous part of their derivative. It
+    omits visibility, which `BoundaryIntegrator` adds for meshes."""
 
     def __init__(self, max_depth: int, rr_depth: int = 5):
         self._integrator: Any = mi.load_dict({"type": "prb", "max_depth": max_depth, "rr_depth": rr_depth})
@@ -33,7 +33,8 @@ class PrbKernel:
         geometry: Any = None,
         active: Bool | bool = True,
     ) -> tuple[Spectrum, None]:
-        """See `PathKernel.sample`. Raises `ValueError` for pairs and for other geometry, which `prb` does not know."""
+        """Trace one path per lane, see `PathKernel.sample`. Raise `ValueError` for pairs and for `geometry`, which `prb` does not
+        support."""
         del tables
         if pair or geometry is not None:
             raise ValueError("prb: expected one state and the scene's own geometry")
@@ -48,5 +49,5 @@ class PrbKernel:
         ray: mi.RayDifferential3f,
         geometry: Any = None,
     ) -> Float:
-        """See `PathKernel.vertices`: of paths of the same distribution."""
+        """Return the number of vertices per lane of paths with the same distribution, see `PathKernel.vertices`."""
         return PathPair(*self._depths).vertices(scene, tables, sampler, ray, geometry)

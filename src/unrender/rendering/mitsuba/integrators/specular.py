@@ -1,4 +1,4 @@
-"""Perfectly specular (delta) lobes whose parameters are recovered: their values, which no BSDF evaluation returns."""
+"""Values of perfectly specular (delta) lobes with unknown parameters, which BSDF evaluation does not return."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from unrender.rendering.mitsuba.integrators.base import PathContext
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
 DELTA_EQUAL, DELTA_SIMPLE, DELTA_MASK = 0, 1, 2
-"""Entries of `tables["delta"]`, by registry id of BSDFs: how perfectly specular lobes follow a change of the BSDF's parameters. Not at
-all; by their value alone (conductor, dielectric, plastic); by the opacity of a mask."""
+"""Entries of `tables["delta"]`, by registry id of BSDFs: dependence of perfectly specular lobes on the BSDF's parameters. None; only by
+their value (conductor, dielectric, plastic); by the opacity of a mask."""
 
 
 class DeltaLobes:
-    """The perfectly specular lobes that were sampled at one path vertex.
+    """Perfectly specular lobes that were sampled at one path vertex.
 
     Args:
-        tables: its "delta" entry is read.
-        bsdf: of the current state, which was sampled.
+        tables: its "delta" entry is used.
+        bsdf: sampled BSDF of the current state.
         bs: the sampled directions.
-        samples: the random numbers (1D, 2D) that these were sampled with.
+        samples: the random numbers (1D, 2D) of the samples.
         active: lanes where `bsdf` was sampled.
         delta: lanes where it sampled a perfectly specular lobe.
     """
@@ -42,19 +42,19 @@ class DeltaLobes:
         self._bs, self._samples, self._delta = bs, samples, delta
 
     def _value(self, bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f) -> Spectrum:
-        """The value of the sampled lobe in one state; 1 for BSDFs whose specular lobes do not change.
+        """Return the value of the sampled lobe in one state; 1 for BSDFs whose specular lobes do not change.
 
-        A conductor's, dielectric's or plastic's is had by sampling that lobe alone, with probability one; a mask's null lobe from
-        its null transmission. The derivative is that of the lobe, not of the probability of choosing it, which the weight of an attached
-        sample would add.
+        The value for a conductor, dielectric or plastic results from sampling that lobe alone, with probability one. That of a mask's
+        null lobe is its null transmission. The derivative is that of the lobe. It does not include the probability of choosing the
+        lobe, which the weight of an attached sample would add.
         """
         bs, value = self._bs, mi.Spectrum(1)
         for lobe in mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission, mi.BSDFFlags.Null:
             chosen = self._delta & (self._kind == DELTA_SIMPLE) & mi.has_flag(bs.sampled_type, lobe)
             ctx = mi.BSDFContext()
             ctx.type_mask = +lobe
-            again, weight = bsdf.sample(ctx, si, *self._samples, chosen)
-            value = dr.select(chosen, weight * dr.detach(again.pdf), value)
+            resampled, weight = bsdf.sample(ctx, si, *self._samples, chosen)
+            value = dr.select(chosen, weight * dr.detach(resampled.pdf), value)
         chosen = self._delta & (self._kind == DELTA_MASK) & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
         return dr.select(chosen, bsdf.eval_null_transmission(si, chosen), value)
 
@@ -66,9 +66,11 @@ class DeltaLobes:
         values: list[Spectrum],
         weights: list[Spectrum],
     ) -> None:
-        """Put the lobes' values in the place of what BSDF evaluations gave for them, and those of the previous state into its weight."""
+        """Replace the BSDF values of the specular lobes, and the previous state's weight, in place."""
         bs = self._bs
-        for state in range(1 if context.primal else 0, context.state_count):  # the current state's weight is its own
+        for state in range(
+            1 if context.primal else 0, context.state_count
+        ):  # the current state's weight does not change
             with context.resume_grad():
                 lobe = self._value(bsdfs[state], surfaces[state])
                 values[state] = dr.select(self._delta, lobe, values[state])
@@ -85,13 +87,15 @@ def sampling_weights(
     smooth: Bool,
     delta: Bool,
 ) -> list[Spectrum]:
-    """Sampling weight of each state for a direction that the current state sampled: the BSDF's whole value over its whole density,
-    which both states share; the sampled lobe's own weight where it is perfectly specular.
+    """Return the sampling weight of each state for a direction that the current state sampled.
+
+    It is the BSDF's total value over its total density, which both states share, or the sampled lobe's own weight if it is perfectly
+    specular.
 
     Args:
-        values: of the BSDF (times cosine) or phase function of each state, in the sampled direction.
+        values: value of each state's BSDF (times cosine) or phase function, in the sampled direction.
         pdf: solid angle density of that direction.
-        weight: of a perfectly specular lobe.
+        weight: weight of a perfectly specular lobe.
         smooth: lanes whose direction has a density.
         delta: lanes that sampled a perfectly specular lobe.
     """

@@ -1,7 +1,7 @@
-"""Steps through a participating medium: free flights, transmittance, and where the derivative of in-scattering is estimated.
+"""Sampling along a ray in a participating medium: free flight, transmittance, and points for the derivative of in-scattering.
 
-Symbols: σ̄ majorant (one number per lane that bounds all channels of all states), σₜ extinction, σₛ scattering, β throughput,
-T transmittance. Media, throughputs and transmittances are lists with one entry per state, the current state first.
+Symbols: σ̄ majorant (one number per lane that bounds all channels of all states), σₜ extinction, σₛ scattering, β throughput, T
+transmittance. Media, throughputs and transmittances are lists with one entry per state, the current state first.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from unrender.rendering.mitsuba.integrators.majorant_supergrid import (
 )
 
 _FAINT = 0.1
-"""Below this transmittance, roulette decides whether a walk through a medium goes on."""
+"""Transmittance below which Russian roulette may terminate tracking."""
 
 _POINTS = 4.0
-"""Tentative points on a segment, in the mean at least, where a derivative is looked for: an empty medium has none of its own."""
+"""Minimum expected number of tentative points for the derivative on a segment, since an empty medium has no tentative collisions."""
 
 
 def medium_interaction(ray: mi.Ray3f, t: Float) -> mi.MediumInteraction3f:
-    """The point of a medium at distance `t` along a ray."""
+    """Return the medium interaction at distance `t` along a ray."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.t = t
     mei.p = ray(t)
@@ -41,7 +41,7 @@ def medium_interaction(ray: mi.Ray3f, t: Float) -> mi.MediumInteraction3f:
 
 
 def clip_segment(medium: mi.MediumPtr, ray: mi.Ray3f, reach: Float, active: Bool) -> tuple[Float, Float]:
-    """From where to where a ray that ends at `reach` is inside the bounding box of a medium; (0, 0) where it is not."""
+    """Return the interval of a ray that ends at `reach` inside the bounding box of a medium; (0, 0) if it is outside."""
     hit, near, far = medium.intersect_aabb(ray)
     near, far = dr.maximum(near, 0), dr.minimum(far, reach)
     inside = active & hit & (near < far)
@@ -49,19 +49,20 @@ def clip_segment(medium: mi.MediumPtr, ray: mi.Ray3f, reach: Float, active: Bool
 
 
 class MediumSegment:
-    """A ray's way through a medium, and bounds of the extinction along it. No dataclass: Dr.Jit would take it for state of its loops.
+    """A ray segment inside a medium, with bounds of the extinction. This is not a dataclass, since Dr.Jit would treat a dataclass as
+    loop state.
 
     Args:
-        tables: the majorants of `ScenePair.majorants()`; media without a supergrid there are bounded by their own majorant.
+        tables: majorants of `ScenePair.majorants()`; media without a supergrid there have their own majorant.
         media: `mi.MediumPtr` of each state.
-        ray: through the medium.
-        near, far: of `clip_segment`.
+        ray: ray through the medium.
+        near, far: results of `clip_segment`.
         active: lanes inside the medium.
-        by_extinction: whether the two estimators of in-scattering's derivative are weighted by σₜ in place of σₛ, where that is dear to
-            look up and nowhere 0 unless σₜ is: as the emission of a radiance field.
+        by_extinction: whether the MIS weights of the in-scattering derivative use σₜ instead of σₛ. This is cheaper if σₛ is expensive
+            to evaluate, and requires σₛ > 0 wherever σₜ > 0: as for the emission of a radiance field.
 
     Attributes:
-        majorant: bounds all channels of all states from `near` to `far`.
+        majorant: bound of all channels of all states from `near` to `far`.
     """
 
     def __init__(
@@ -90,16 +91,16 @@ class MediumSegment:
         return HomogeneousMajorant(σ̄, self.near, self.far)
 
     def at(self, t: Float) -> mi.MediumInteraction3f:
-        """The point at distance `t` along the ray."""
+        """Return the medium interaction at distance `t` along the ray."""
         return medium_interaction(self.ray, t)
 
     def extinctions(self, mei: mi.MediumInteraction3f, active: Bool) -> list[Spectrum]:
-        """σₜ of each state."""
+        """Return σₜ of each state."""
         return [medium.get_scattering_coefficients(mei, active)[2] for medium in self.media]
 
 
 def sample_optical_depth(u: Float) -> Float:
-    """The optical depth of majorants to the next tentative collision, from a uniform number."""
+    """Return the optical depth of the majorant to the next tentative collision, from a uniform number."""
     return -dr.log(1 - u)
 
 
@@ -114,7 +115,7 @@ class FreeFlight:
         dda: position on the segment.
         β: throughput of each state.
         collides: whether the collision at `dda.t` is real.
-        active: lanes still flying.
+        active: lanes without a real collision so far.
     """
 
     dda: DdaState
@@ -127,13 +128,13 @@ class FreeFlight:
 def sample_free_flight(
     segment: MediumSegment, β: Sequence[Spectrum], sampler: Any, active: Bool
 ) -> tuple[Float, Bool, list[Spectrum]]:
-    """Delta tracking through a segment.
+    """Sample a collision on a segment by delta tracking.
 
-    A tentative collision is real with a probability that weighs all channels of all states by their throughput: the
-    sum of all throughputs then stays as it is at every null collision, so none of them explodes.
+    The probability of a real collision weights all channels of all states by their throughput. The sum of all throughputs is then
+    constant at every null collision, so none of them diverges.
 
     Returns:
-        distance of the real collision, whether there is one, and the throughputs, σₛ over its density included.
+        distance of the real collision, whether there is one, and the throughputs, including σₛ over the density.
     """
     flying = active & (segment.near < segment.far)
     flight = FreeFlight(segment.majorant.start(), list(β), mi.Bool(False), flying)
@@ -143,7 +144,7 @@ def sample_free_flight(
 
 
 def _scattered(segment: MediumSegment, flight: FreeFlight) -> list[Spectrum]:
-    """Throughput of each state behind the collision. Only here, since an albedo is dear to look up and null collisions need none."""
+    """Return the throughput of each state after the collision. σₛ is evaluated only here, since an albedo lookup is expensive."""
     mei, collides = segment.at(flight.dda.t), flight.collides
     σₛ = [medium.get_scattering_coefficients(mei, collides)[0] for medium in segment.media]
     return [β * dr.select(collides, σ, 1) for β, σ in zip(flight.β, σₛ, strict=True)]
@@ -154,8 +155,8 @@ def _tentative_collision(segment: MediumSegment, flight: FreeFlight, sampler: An
     flying = flight.active & (dda.t < segment.far)
     σ̄ = dda.σ̄
     σₜ = segment.extinctions(segment.at(dda.t), flying)
-    share = total([dr.sum(β * σ) for β, σ in zip(flight.β, σₜ, strict=True)])
-    p = dr.clip(share / (σ̄ * total([dr.sum(β) for β in flight.β])), 0, 1)
+    mass = total([dr.sum(β * σ) for β, σ in zip(flight.β, σₜ, strict=True)])
+    p = dr.clip(mass / (σ̄ * total([dr.sum(β) for β in flight.β])), 0, 1)
     flight.collides = flying & (sampler.next_1d() < p)
     scale = dr.rcp(dr.select(flight.collides, p, 1 - p) * σ̄)
     flight.β = [
@@ -176,8 +177,8 @@ class RatioTracking:
 
     Attributes:
         dda: position on the segment.
-        T: transmittance of each state up to there.
-        active: lanes still walking.
+        T: transmittance of each state up to this position.
+        active: lanes that are still tracking.
     """
 
     dda: DdaState
@@ -187,7 +188,7 @@ class RatioTracking:
 
 @dr.syntax
 def estimate_transmittance(segment: MediumSegment, sampler: Any, active: Bool) -> list[Spectrum]:
-    """Transmittance of a segment in each state: in closed form where the medium is homogeneous, else by ratio tracking."""
+    """Return the transmittance of a segment in each state: in closed form for homogeneous media, else by ratio tracking."""
     length = segment.far - segment.near
     active = active & (segment.near < segment.far)
     closed = active & segment.media[0].is_homogeneous()
@@ -213,7 +214,7 @@ def _ratio_tracking_step(segment: MediumSegment, walk: RatioTracking, sampler: A
 
 
 def _roulette(faint: Bool, sampler: Any) -> Float:
-    """The weight of a walk: 1; where it is `faint`, 2 or 0."""
+    """Return the weight of Russian roulette: 1, or 2 or 0 for `faint` lanes."""
     return dr.select(faint, dr.select(sampler.next_1d() < 0.5, 2.0, 0.0), 1.0)
 
 
@@ -222,16 +223,16 @@ def _roulette(faint: Bool, sampler: Any) -> Float:
 
 @dataclass
 class Reservoir:
-    """One point of a path, kept of all those where in-scattering might begin. State of Dr.Jit loops, hence mutable.
+    """A point of a path, sampled from all points where in-scattering may begin. It is state of Dr.Jit loops, hence mutable.
 
     Attributes:
-        ray: it lies at `t` along this one.
-        t: distance.
-        medium: where it lies.
-        depth: of the path before it.
-        β: throughput of each state to the point, times its multiple importance sampling weight, over σ̄.
-        weight: of the point, when it was taken.
-        total: of all points that were offered.
+        ray: ray that the point lies on.
+        t: distance along the ray.
+        medium: medium at the point.
+        depth: depth of the path before the point.
+        β: throughput of each state to the point, times its MIS weight, over σ̄.
+        weight: weight of the point.
+        total: total weight of all points offered.
     """
 
     ray: mi.Ray3f
@@ -244,14 +245,14 @@ class Reservoir:
 
     @staticmethod
     def empty(state_count: int) -> Reservoir:
-        """Nothing was offered yet."""
+        """Return a reservoir without points."""
         ray, medium = dr.zeros(mi.Ray3f), dr.zeros(mi.MediumPtr)
         β = [mi.Spectrum(0) for _ in range(state_count)]
         return Reservoir(ray, mi.Float(0), medium, mi.UInt32(0), β, mi.Float(0), mi.Float(0))
 
     @property
     def inverse_probability(self) -> Float:
-        """1 / probability that the kept point was kept; 0 where there is none."""
+        """Reciprocal of the probability of the sampled point; 0 without a point."""
         return dr.select(self.weight > 0, self.total / self.weight, 0)
 
 
@@ -261,9 +262,9 @@ class DifferentialRatioTracking:
 
     Attributes:
         dda: position on the segment.
-        β: throughput of each state up to there, ratio-tracked transmittance included.
-        reservoir: of the path.
-        active: lanes still walking.
+        β: throughput of each state up to this position, including ratio-tracked transmittance.
+        reservoir: reservoir of the path.
+        active: lanes that are still tracking.
     """
 
     dda: DdaState
@@ -281,11 +282,11 @@ def update_reservoir(
     sampler: Any,
     active: Bool,
 ) -> Reservoir:
-    """Differential ratio tracking (Nimier-David et al. 2022): points of a segment in proportion to transmittance alone.
+    """Sample points of a segment in proportion to transmittance only, by differential ratio tracking (Nimier-David et al. 2022).
 
-    The whole segment is walked with a majorant; each tentative point is offered to the reservoir with the ratio-tracked
-    transmittance up to it, whatever the density at the point itself. So points are found where the medium is empty, and
-    none is weighted by 1/σₜ.
+    Tracking covers the full segment with a majorant. Each tentative point is offered to the reservoir with the ratio-tracked
+    transmittance up to it, independent of the density at the point. Points are therefore sampled where the medium is empty, and none is
+    weighted by 1/σₜ.
     """
     near, far = segment.near, segment.far
     active = active & (near < far)
@@ -311,23 +312,23 @@ def _offer_point(
     t, σ̄ = dda.t, dda.σ̄
     mei = segment.at(t)
     coefficients = [medium.get_scattering_coefficients(mei, walking) for medium in segment.media]
-    weighed = [σₜ if segment.by_extinction else σₛ for σₛ, _, σₜ in coefficients]
-    offered = [β * mis_complement(σ, c) / σ̄ for β, σ in zip(walk.β, weighed, strict=True)]
+    σ_of_states = [σₜ if segment.by_extinction else σₛ for σₛ, _, σₜ in coefficients]
+    offered = [β * mis_complement(σ, c) / σ̄ for β, σ in zip(walk.β, σ_of_states, strict=True)]
     weight = dr.select(walking, total([dr.mean(β) for β in offered]), 0)
-    kept = walk.reservoir
-    kept.total += weight
-    take = walking & (sampler.next_1d() * kept.total < weight)
-    kept.ray = dr.select(take, segment.ray, kept.ray)
-    kept.t = dr.select(take, t, kept.t)
-    kept.medium = dr.select(take, segment.media[0], kept.medium)
-    kept.depth = dr.select(take, depth, kept.depth)
-    kept.β = [dr.select(take, new, old) for new, old in zip(offered, kept.β, strict=True)]
-    kept.weight = dr.select(take, weight, kept.weight)
+    reservoir = walk.reservoir
+    reservoir.total += weight
+    take = walking & (sampler.next_1d() * reservoir.total < weight)
+    reservoir.ray = dr.select(take, segment.ray, reservoir.ray)
+    reservoir.t = dr.select(take, t, reservoir.t)
+    reservoir.medium = dr.select(take, segment.media[0], reservoir.medium)
+    reservoir.depth = dr.select(take, depth, reservoir.depth)
+    reservoir.β = [dr.select(take, new, old) for new, old in zip(offered, reservoir.β, strict=True)]
+    reservoir.weight = dr.select(take, weight, reservoir.weight)
 
     walk.β = [β * dr.maximum(1 - σₜ / σ̄, 0) for β, (_, _, σₜ) in zip(walk.β, coefficients, strict=True)]
     most = largest(walk.β)
-    # Roulette, relative to what the reservoir holds: points that would hardly be taken are not worth a walk.
-    survival = _roulette(most * (segment.far - t) < _FAINT * kept.total, sampler)
+    # Russian roulette relative to the reservoir's total weight, since further points would rarely be sampled.
+    survival = _roulette(most * (segment.far - t) < _FAINT * reservoir.total, sampler)
     walk.β = [β * survival for β in walk.β]
     walk.active = walking & ~(most <= 0) & (survival > 0)
     walk.dda = dda
@@ -335,36 +336,41 @@ def _offer_point(
 
 
 def relative_derivatives(segment: MediumSegment, t: Float, collides: Bool, noise: Any, inside: Bool) -> list[Spectrum]:
-    """Of each state, the derivative of a path's contribution by the medium of a segment, as a share of the contribution (attached; only
-    its derivative matters).
+    """Return, for each state, the derivative of a path's contribution by the medium of a segment, relative to the contribution
+    (attached; only the derivative is meaningful).
 
     Args:
-        t: where the segment ends, if it `collides`.
-        noise: random numbers apart from those of the path.
+        segment: segment inside the medium.
+        t: distance where the segment ends, if it `collides`.
+        collides: lanes with a real collision.
+        noise: random numbers independent of those of the path.
         inside: lanes inside the medium.
     """
-    flown = dr.select(collides, t, segment.far) - segment.near
-    collision, middle = segment.at(t), segment.at(segment.near + noise.next_1d() * flown)
+    length = dr.select(collides, t, segment.far) - segment.near
+    collision, middle = segment.at(t), segment.at(segment.near + noise.next_1d() * length)
     c = mis_constant(segment.near, segment.far)
-    found = []
+    result = []
     with dr.resume_grad():
         for medium in segment.media:
-            depth = flown * medium.get_scattering_coefficients(middle, inside)[2]
+            depth = length * medium.get_scattering_coefficients(middle, inside)[2]
             σₛ, _, σₜ = medium.get_scattering_coefficients(collision, collides)
             either = dr.detach(σₛ) + c
             if segment.by_extinction:
-                # The weight σₜ/(σₜ + c) over σₛ. At a collision neither is 0.
+                # The weight σₜ/(σₜ + c) over σₛ. Neither is 0 at a collision.
                 either = dr.detach(σₛ) * (1 + c / dr.detach(σₜ))
-            found.append(dr.select(collides & (either > 0), σₛ / either, 0) - depth)
-    return found
+            result.append(dr.select(collides & (either > 0), σₛ / either, 0) - depth)
+    return result
 
 
 def mis_constant(near: Float, far: Float) -> Float:
-    """The constant c of the two estimators of in-scattering's derivative: a collision is weighted by σ/(σ + c), σ being σₛ or σₜ, a
-    point of differential ratio tracking by the rest. Any c is unbiased; the density of the latter is about 1/(far - near)."""
+    """Return the constant c of the two estimators of the in-scattering derivative.
+
+    A collision has the MIS weight σ/(σ + c), where σ is σₛ or σₜ, and a point of differential ratio tracking the complement. Any c is
+    unbiased. The density of the latter is about 1/(far - near).
+    """
     return dr.select(near < far, dr.rcp(far - near), 0)
 
 
 def mis_complement(σ: Spectrum, c: Float) -> Spectrum:
-    """c/(σ + c), 0 where both are."""
+    """Return c/(σ + c), 0 where both are 0."""
     return dr.select(c > 0, c / (σ + c), 0)

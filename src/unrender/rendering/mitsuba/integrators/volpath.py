@@ -1,7 +1,7 @@
-"""The volumetric path tracer: surfaces as in `path.py`, and participating media, for one state or two, and its adjoint.
+"""Volumetric path tracer for one state or two, and its adjoint: surfaces as in `path.py`, and participating media.
 
-Symbols as there, and: T transmittance, σₜ extinction, σₛ scattering, σ̄ majorant. A vertex is where a path scatters, on a surface or
-in a medium; boundaries that let light pass straight on are no vertices.
+Symbols as there, and: T transmittance, σₜ extinction, σₛ scattering, σ̄ majorant. A vertex is a scattering event, on a surface or in a
+medium. Index-matched boundaries are not vertices.
 """
 
 from __future__ import annotations
@@ -38,29 +38,29 @@ from unrender.rendering.mitsuba.integrators.volume_path import (
 
 
 class VolumePair:
-    """Settings of the volumetric path tracer.
+    """Volumetric path tracer.
 
     Args:
-        max_depth: the longest path in segments, as in Mitsuba's `volpath` (1: directly visible emitters only), >= 1.
-        rr_depth: the depth from which roulette may end a path.
+        max_depth: maximum path length in segments, as in Mitsuba's `volpath` (1: directly visible emitters only), >= 1.
+        rr_depth: depth from which Russian roulette may terminate a path.
         changing_delta: as for `PathPair`.
-        differentiate_media: whether parameters of media are to be recovered: only then is their derivative looked for.
+        differentiate_media: whether parameters of media are unknown; otherwise their derivative is not estimated.
         emission: whether there are media that emit (`emissive.py`).
-        radiance_field: whether all media do, with a radiance above 0 wherever there is extinction.
+        radiance_field: whether all media emit, with radiance > 0 wherever there is extinction.
 
-    Collisions, directions and roulette depend on both states, so the adjoint of a pair needs both (`adjoint_pair`), also where only
-    one gradient is wanted.
+    Collisions, directions and Russian roulette depend on both states. The adjoint of a pair therefore needs both (`adjoint_pair`), even
+    for one gradient.
 
     *The derivative of a medium.* Along a segment of length D, with L(t) arriving from beyond t and Lₛ(t) scattered into it,
 
-        ∂L = ∫ T(t) (∂σₛ(t) Lₛ(t) - ∂σₜ(t) L(t)) dt + (what the path's other vertices give)
+        ∂L = ∫ T(t) (∂σₛ(t) Lₛ(t) - ∂σₜ(t) L(t)) dt + (contribution of the path's other vertices)
 
-    The second term is -C ∫ ∂σₜ over the part of the segment that was flown, for a path that contributes C: the integral is estimated by one
-    point, uniform and independent of the collisions that C is made of. The first is found twice, at the path's
-    own collisions and, where σₛ is small, by differential ratio tracking (`update_reservoir`), weighted by σₛ/(σₛ + c) and c/(σₛ + c):
-    neither divides by σₛ or σₜ, nor by σ̄ - σₜ. So gradients are unbiased wherever density or albedo is zero, and where
-    density is at the majorant. In a radiance field, where σₛ stands for what is emitted, the weights are σₜ/(σₜ + c) and c/(σₜ + c): so
-    points are offered without looking up its many coefficients.
+    For a path that contributes C, the second term is -C ∫ ∂σₜ over the part of the segment before the collision. One uniform point,
+    independent of the collisions in C, estimates the integral. The first term has two estimators, the path's own collisions and, where
+    σₛ is small, differential ratio tracking (`update_reservoir`), with the MIS weights σₛ/(σₛ + c) and c/(σₛ + c). Neither divides by
+    σₛ, σₜ, or σ̄ - σₜ. Gradients are therefore unbiased where density or albedo is zero, and where the density equals the majorant. In
+    a radiance field, where σₛ is the emission, the weights are σₜ/(σₜ + c) and c/(σₜ + c), so points are offered without evaluating its
+    many coefficients.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class VolumePair:
         emission: bool = False,
         radiance_field: bool = False,
     ):
-        # No dataclass: Dr.Jit would take it for state of the loop below.
+        # This is not a dataclass, since Dr.Jit would treat a dataclass as state of the loop below.
         self.max_depth = max_depth
         self.rr_depth = rr_depth
         self.changing_delta = changing_delta
@@ -92,9 +92,9 @@ class VolumePair:
         geometry: Any = None,
         active: Bool | bool = True,
     ) -> tuple[Spectrum, Spectrum | None]:
-        """Trace one path per lane. See `PathKernel.sample`; `tables` has also the entries of `ScenePair.media()` and `.majorants()`.
+        """Trace one path per lane, see `PathKernel.sample`. `tables` also has the entries of `ScenePair.media()` and `.majorants()`.
 
-        Raises `ValueError` for other geometry than the scene's: posed shapes and media do not meet.
+        Raises `ValueError` for `geometry`, since posed shapes are not supported with media.
         """
         if geometry is not None:
             raise ValueError("media: expected the scene's own geometry")
@@ -118,7 +118,7 @@ class VolumePair:
         ray: mi.RayDifferential3f,
         geometry: Any = None,
     ) -> Float:
-        """See `PathKernel.vertices`. Borders that let light pass unchanged do not count."""
+        """Return the number of vertices of each lane's path. Index-matched boundaries do not count."""
         del geometry
         camera_medium: Any = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
         start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(True))
@@ -143,14 +143,14 @@ class VolumePair:
 
     @dr.syntax
     def _trace(self, context: VolumeContext, path: VolumePathState, sampler: Any, noise: Any) -> VolumePathState:
-        """Paths from `context.start` on, or their replay."""
+        """Trace paths from `context.start` on, or replay them."""
         label = f"volume pair ({context.mode.name})"
         while dr.hint(path.active, label=label):
             path = self._bounce(context, path, sampler, noise)
         return path
 
     def _bounce(self, context: VolumeContext, path: VolumePathState, sampler: Any, noise: Any) -> VolumePathState:
-        """One segment and the vertex at its end."""
+        """Trace one segment and process the vertex at its end."""
         si = context.scene.ray_intersect(
             path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active
         )
@@ -160,7 +160,7 @@ class VolumePair:
         scatters, escaped = flight.collides, path.active & ~flight.collides
         Lm = []
         if self.emission:
-            # What a medium emits takes the place of what it scatters: it is in the throughput already. The path ends.
+            # The throughput already includes the emission, which replaces the scattering coefficient. The path ends.
             Lm = [[dr.select(scatters & flight.emits, β, 0) for β in path.β]]
             scatters = scatters & ~flight.emits
 
@@ -187,15 +187,15 @@ class VolumePair:
         roulette = moved & (path.depth >= self.rr_depth)
         rr_weight = dr.select(roulette, dr.rcp(q), 1)
         path.β = [β * rr_weight for β in path.β]
-        goes_on = vertex.scatters | (vertex.meets & (vertex.may_scatter | direction.null))
-        path.active = goes_on & carries_light(path.β) & (~roulette | (sampler.next_1d() < q))
+        continues = vertex.scatters | (vertex.meets & (vertex.may_scatter | direction.null))
+        path.active = continues & carries_light(path.β) & (~roulette | (sampler.next_1d() < q))
         path.depth[moved] += 1
         return path
 
     def _fly(
         self, context: VolumeContext, path: VolumePathState, si: mi.SurfaceInteraction3f, sampler: Any, noise: Any
     ) -> Flight:
-        """Sample a collision on the next segment; its throughput goes to `path`, its candidates for derivatives to the reservoir."""
+        """Sample a collision on the next segment. The throughput is stored in `path`, points for the derivative in the reservoir."""
         start, tables, ray, medium = context.start, context.tables, path.ray, path.medium
         follow_media = self.differentiate_media and not context.primal
         media = context.states.media(medium)
@@ -225,25 +225,25 @@ class VolumePair:
     def _sample_emitter(
         self, context: VolumeContext, path: VolumePathState, vertex: Vertex, sampler: Any, noise: Any
     ) -> tuple[list[Spectrum], ConnectionSample | None]:
-        """Ld of each state, by next-event estimation, and a point of the connection, where derivatives of media are looked for."""
+        """Return Ld of each state, by next-event estimation, and a point of the connection if derivatives of media are needed."""
         si = vertex.si
-        if not context.scene.emitters():  # nothing to connect to; paths have the same random numbers all the same
+        if not context.scene.emitters():  # no emitter to sample; keep the sequence of random numbers
             sampler.next_2d()
             return [mi.Spectrum(0) for _ in range(context.state_count)], None
         smooth = mi.has_flag(vertex.bsdfs[0].flags(), mi.BSDFFlags.Smooth)
         at_medium = vertex.scatters & path.medium.use_emitter_sampling()
         at_surface = vertex.meets & vertex.may_scatter & smooth
-        found = emitters.EmitterConnection(context, vertex.interaction, sampler.next_2d(), at_medium | at_surface)
-        ds = found.ds
+        sampled = emitters.EmitterConnection(context, vertex.interaction, sampler.next_2d(), at_medium | at_surface)
+        ds = sampled.ds
         medium = dr.select(at_surface & si.is_medium_transition(), si.target_medium(ds.d), path.medium)
         noise = noise if self.differentiate_media else None
-        T, sample = connect(context, vertex.interaction, ds.p, medium, sampler, noise, found.active)
+        T, sample = connect(context, vertex.interaction, ds.p, medium, sampler, noise, sampled.active)
         with context.resume_grad():
             values, pdf = vertex.evaluate(
-                context, si.to_local(ds.d), ds.d, at_surface & found.active, at_medium & found.active
+                context, si.to_local(ds.d), ds.d, at_surface & sampled.active, at_medium & sampled.active
             )
             β = [throughput * passed for throughput, passed in zip(path.β, T, strict=True)]
-            return found.contributions(β, values, pdf), sample if self.differentiate_media else None
+            return sampled.contributions(β, values, pdf), sample if self.differentiate_media else None
 
     def _sample_direction(self, context: VolumeContext, vertex: Vertex, sampler: Any) -> SampledDirection:
         meets, scatters = vertex.meets, vertex.scatters
@@ -270,9 +270,9 @@ class VolumePair:
         connection: ConnectionSample | None,
         contributions: tuple[Sequence[Spectrum], ...],
     ) -> None:
-        """Back-propagate the derivative of this segment and vertex, or carry tangents forward through them.
+        """Back-propagate the derivative of this segment and vertex, or propagate tangents through them.
 
-        `contributions` are Le, Ld and the value in the sampled direction, through which `path.L` arrives: times f / detach(f) that carries
+        `contributions` are Le, Ld and the value in the sampled direction, which scatters `path.L`. Multiplied by f / detach(f), it has
         f's derivative.
         """
         Le, Ld, values = contributions
@@ -289,7 +289,7 @@ class VolumePair:
                 dr.backward_from(context.adjoint_sum(Lo), flags=KEEP)
 
     def _scatter_on(self, path: VolumePathState, vertex: Vertex, direction: SampledDirection) -> Bool:
-        """Leave the vertex in the sampled direction. Tells which lanes scattered, or met a boundary that turned them."""
+        """Continue in the sampled direction. Return the lanes that scattered, in the medium or at a boundary that is not index-matched."""
         si, bs, scatters, meets = vertex.si, direction.bs, vertex.scatters, vertex.meets
         connects = path.medium.use_emitter_sampling()
         moved = scatters | (meets & ~direction.null)
@@ -306,23 +306,23 @@ class VolumePair:
         )
         return moved
 
-    def _in_scattering(self, context: VolumeContext, kept: Reservoir, noise: Any) -> Spectrum:
-        """Back-propagate the derivative of the scattering at the kept point, whose light is found by a path of its own; with `Forward`
-        the derivative along the tangents is returned, else 0."""
-        active = kept.total > 0
-        start = PathStart(kept.ray, kept.medium, kept.depth, active, kept.t)
+    def _in_scattering(self, context: VolumeContext, point: Reservoir, noise: Any) -> Spectrum:
+        """Back-propagate the derivative of the scattering at the sampled point, whose incident radiance a separate path estimates. In
+        `Forward` mode return the derivative along the tangents, else 0."""
+        active = point.total > 0
+        start = PathStart(point.ray, point.medium, point.depth, active, point.t)
         primal = VolumeContext(start, dr.ADMode.Primal, context.scene, context.tables, (), context.pair)
         path = self._begin(primal)
         if self.radiance_field:
-            path.L = [mi.Spectrum(1) for _ in path.L]  # No path: its radiance is what the coefficient below holds.
+            path.L = [mi.Spectrum(1) for _ in path.L]  # The coefficient below is the emission, so no path is needed.
         else:
             path = self._trace(primal, path, noise, None)
-        share = kept.inverse_probability
-        mei = tracking.medium_interaction(kept.ray, kept.t)
+        inverse_probability = point.inverse_probability
+        mei = tracking.medium_interaction(point.ray, point.t)
         with dr.resume_grad():
             Lo = [
-                L * β * share * medium.get_scattering_coefficients(mei, active)[0]
-                for L, β, medium in zip(path.L, kept.β, context.states.media(kept.medium), strict=True)
+                L * β * inverse_probability * medium.get_scattering_coefficients(mei, active)[0]
+                for L, β, medium in zip(path.L, point.β, context.states.media(point.medium), strict=True)
             ]
             if context.forward:
                 return dr.forward_to(Lo[0])

@@ -1,4 +1,4 @@
-"""What the volumetric path tracer knows of a path: where it begins, its loop state, a segment, a vertex, the direction it goes on in."""
+"""Data types of the volumetric path tracer: start, loop state, segment, vertex, sampled direction and connection."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from unrender.rendering.mitsuba.integrators.tracking import MediumSegment, Reser
 
 
 class PathStart:
-    """Where paths begin: on rays, or in a medium at distance `t` along rays, where they scatter first.
+    """Start of paths: on rays, or at distance `t` along rays in a medium, where they scatter first.
 
     Attributes:
         ray: `mi.Ray3f`.
-        medium: at its origin.
-        depth: of what lies before.
-        active: which lanes have one.
-        t: None, or where to scatter.
+        medium: medium at its origin.
+        depth: depth of the path before it.
+        active: lanes that have a path.
+        t: distance of the first scattering event, or None.
     """
 
     def __init__(self, ray: mi.Ray3f, medium: mi.MediumPtr, depth: UInt32, active: Bool, t: Float | None = None):
@@ -32,20 +32,20 @@ class PathStart:
 
 @dataclass
 class VolumePathState:
-    """A path's loop state.
+    """Loop state of a path.
 
     Attributes:
-        ray: of the next segment.
-        medium: that it lies in.
-        depth: vertices so far.
-        L: radiance of each state: gathered so far or, in a replay, still to be gathered.
+        ray: ray of the next segment.
+        medium: medium of the next segment.
+        depth: number of vertices so far.
+        L: radiance of each state: accumulated so far or, in a replay, remaining.
         δL: derivative of the radiance along the tangents (forward mode).
         β: throughput of each state.
         η: relative index of refraction.
-        last: the vertex that the path left last.
-        reservoir: what differential ratio tracking keeps of the path.
+        last: last vertex of the path.
+        reservoir: reservoir of differential ratio tracking.
         forced: lanes whose first collision is `PathStart.t`.
-        active: lanes whose path goes on.
+        active: lanes whose path continues.
     """
 
     ray: mi.Ray3f
@@ -62,7 +62,7 @@ class VolumePathState:
 
 
 class VolumeContext(PathContext):
-    """A `PathContext` that knows where its paths begin."""
+    """A `PathContext` with the start of its paths."""
 
     def __init__(self, start: PathStart, *others: Any):
         super().__init__(*others)
@@ -70,15 +70,15 @@ class VolumeContext(PathContext):
 
 
 class Flight:
-    """A segment and what happens on it.
+    """A segment and its collision.
 
     Attributes:
-        segment: the part inside a medium.
+        segment: part of the segment inside a medium.
         t: distance of the collision.
         collides: lanes that collide in the medium.
-        emits: lanes whose medium emits, and scatters nothing.
-        may_scatter: lanes that depth lets scatter once more.
-        derivatives: of each state, the derivative of L by the medium (attached); () where it is not looked for.
+        emits: lanes whose medium emits and does not scatter.
+        may_scatter: lanes whose depth allows another scattering event.
+        derivatives: for each state, the derivative of L by the medium (attached); () if it is not needed.
     """
 
     def __init__(
@@ -95,15 +95,15 @@ class Flight:
 
 
 class Vertex:
-    """Where a segment ends, in a medium or on a surface.
+    """End of a segment, in a medium or on a surface.
 
     Attributes:
-        mei, si: the interaction, as that of a medium and of a surface.
-        interaction: the one of the two that it is.
+        mei, si: medium interaction and surface interaction.
+        interaction: the valid one of the two.
         media, surfaces, bsdfs: the segment's medium, the surface interaction and the BSDF, of each state.
         scatters: lanes that scatter in the medium.
-        meets: lanes that meet a surface and may go on.
-        may_scatter: lanes that depth lets scatter once more.
+        meets: lanes that hit a surface and may continue.
+        may_scatter: lanes whose depth allows another scattering event.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Vertex:
         self.si, self.mei = surfaces[0], flight.segment.at(flight.t)
         self.media, self.surfaces, self.bsdfs = flight.segment.media, surfaces, bsdfs
         self.scatters, self.may_scatter = scatters, flight.may_scatter
-        # At the last depth a boundary can still let light straight on.
+        # Paths of maximum depth may still pass through index-matched boundaries.
         null = mi.has_flag(bsdfs[0].flags(), mi.BSDFFlags.Null)
         self.meets = escaped & self.si.is_valid() & (flight.may_scatter | null)
         self.interaction = dr.select(scatters, mi.Interaction3f(self.mei), mi.Interaction3f(self.si))
@@ -125,7 +125,8 @@ class Vertex:
     def evaluate(
         self, context: PathContext, wo: mi.Vector3f, d: mi.Vector3f, at_surface: Bool, at_medium: Bool
     ) -> tuple[list[Spectrum], Float]:
-        """Values of each state, and the current state's density: of the BSDF towards `wo` (local), of the phase function towards `d`."""
+        """Return the values of each state, and the current state's density: of the BSDF towards `wo` (local), and of the phase function
+        towards `d`."""
         f, pdf = self.bsdfs[0].eval_pdf(context.bsdf_ctx, self.si, wo, at_surface)
         fₘ, pdfₘ = self.media[0].phase_function().eval_pdf(context.phase_ctx, self.mei, d, at_medium)
         values = [dr.select(at_medium, fₘ, f)]
@@ -137,16 +138,16 @@ class Vertex:
 
 
 class SampledDirection:
-    """The direction in which a path goes on.
+    """Direction in which a path continues.
 
     Attributes:
         bs: `mi.BSDFSample3f`, on surfaces.
-        d: in media, to the world.
+        d: world-space direction, in media.
         pdf: solid angle density.
         delta: lanes that sampled a perfectly specular lobe.
-        null: of these, lanes that go straight on.
-        values: of each state, of the BSDF, specular lobe or phase function; attached.
-        weights: of each state, sampling weights; detached.
+        null: lanes among these that continue straight.
+        values: value of each state's BSDF, specular lobe or phase function; attached.
+        weights: sampling weight of each state; detached.
     """
 
     def __init__(
@@ -164,13 +165,13 @@ class SampledDirection:
 
 @dataclass
 class ConnectionSample:
-    """One point of a connection, uniform over its length inside media. State of a Dr.Jit loop, hence mutable.
+    """A point of a connection, uniform over its length inside media. It is state of a Dr.Jit loop, hence mutable.
 
     Attributes:
-        ray: it lies at `t` along this one.
-        t: distance.
-        medium: where it lies; null where the connection meets no medium.
-        length: of the connection inside media.
+        ray: ray that the point lies on.
+        t: distance along the ray.
+        medium: medium at the point; null if the connection is outside all media.
+        length: length of the connection inside media.
     """
 
     ray: mi.Ray3f
@@ -180,11 +181,11 @@ class ConnectionSample:
 
     @staticmethod
     def empty() -> ConnectionSample:
-        """Before any medium."""
+        """Return the state before any medium."""
         return ConnectionSample(dr.zeros(mi.Ray3f), mi.Float(0), dr.zeros(mi.MediumPtr), mi.Float(0))
 
     def update(self, segment: MediumSegment, noise: Any) -> None:
-        """Extend the connection by a segment, inside whose medium the point may lie."""
+        """Extend the connection by a segment inside a medium, which may contain the point."""
         length = segment.far - segment.near
         self.length += length
         take = noise.next_1d() * self.length < length
@@ -193,7 +194,7 @@ class ConnectionSample:
         self.t = dr.select(take, segment.near + noise.next_1d() * length, self.t)
 
     def optical_depth(self, medium: mi.MediumPtr) -> Spectrum:
-        """The optical depth that this point stands for, in `medium`. Its derivative is that of -log T, unbiased."""
+        """Return an estimate of the optical depth in `medium` from this point. Its derivative is that of -log T, unbiased."""
         mei = tracking.medium_interaction(self.ray, self.t)
         return self.length * medium.get_scattering_coefficients(mei, self.length > 0)[2]
 
@@ -203,11 +204,11 @@ class Connection:
     """Loop state of `connect`, and its result.
 
     Attributes:
-        ray: of the next segment.
-        medium: that it lies in.
+        ray: ray of the next segment.
+        medium: medium of the next segment.
         T: transmittance of each state so far.
         sample: see `connect`.
-        active: lanes still on their way.
+        active: lanes that have not arrived.
     """
 
     ray: mi.Ray3f
@@ -227,22 +228,22 @@ def connect(
     noise: Any,
     active: Bool,
 ) -> tuple[list[Spectrum], ConnectionSample]:
-    """Transmittance of each state from `vertex`, which light leaves into `medium`, to `target`.
+    """Return the transmittance of each state from `vertex`, which light leaves into `medium`, to `target`.
 
-    With `noise`, random numbers of its own, also a point of the connection.
+    With `noise`, independent random numbers, also return a point of the connection.
     """
     ray = vertex.spawn_ray_to(target)
     T = [mi.Spectrum(1) for _ in range(context.state_count)]
-    way = Connection(ray, mi.MediumPtr(medium), T, ConnectionSample.empty(), mi.Bool(active))
-    while dr.hint(way.active, label="emitter connection"):
-        way = _connection_segment(context, target, way, sampler, noise)
-    return way.T, way.sample
+    connection = Connection(ray, mi.MediumPtr(medium), T, ConnectionSample.empty(), mi.Bool(active))
+    while dr.hint(connection.active, label="emitter connection"):
+        connection = _connection_segment(context, target, connection, sampler, noise)
+    return connection.T, connection.sample
 
 
 def _connection_segment(
-    context: PathContext, target: mi.Point3f, way: Connection, sampler: Any, noise: Any
+    context: PathContext, target: mi.Point3f, connection: Connection, sampler: Any, noise: Any
 ) -> Connection:
-    ray, medium, active = way.ray, way.medium, way.active
+    ray, medium, active = connection.ray, connection.medium, connection.active
     scene: Any = context.scene
     si = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=False, active=active)
     inside = active & (medium != None)  # noqa: E711 (a comparison per lane)
@@ -250,15 +251,15 @@ def _connection_segment(
     segment = MediumSegment(context.tables, context.states.media(medium), ray, near, far, inside)
     passed = tracking.estimate_transmittance(segment, sampler, inside)
     if noise is not None:
-        way.sample.update(segment, noise)
+        connection.sample.update(segment, noise)
 
     hit = active & si.is_valid()
     surfaces, bsdfs = context.states.interactions(si), context.states.bsdfs(si.bsdf())
-    way.T = [
+    connection.T = [
         T * (dr.select(active, through, 1) * dr.select(hit, bsdf.eval_null_transmission(surface, hit), 1))
-        for T, through, bsdf, surface in zip(way.T, passed, bsdfs, surfaces, strict=True)
+        for T, through, bsdf, surface in zip(connection.T, passed, bsdfs, surfaces, strict=True)
     ]
-    way.active = hit & carries_light(way.T)
-    way.medium = dr.select(way.active & si.is_medium_transition(), si.target_medium(ray.d), medium)
-    way.ray = dr.select(way.active, si.spawn_ray_to(target), ray)
-    return way
+    connection.active = hit & carries_light(connection.T)
+    connection.medium = dr.select(connection.active & si.is_medium_transition(), si.target_medium(ray.d), medium)
+    connection.ray = dr.select(connection.active, si.spawn_ray_to(target), ray)
+    return connection
