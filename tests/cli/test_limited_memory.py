@@ -40,6 +40,23 @@ def supervised():
 
 memory.supervised = supervised
 """
+INTERRUPTED = """
+import os, signal, time
+
+os.setsid()
+fork = os.fork
+
+def forked():
+    if child := fork():
+        time.sleep(0.1)
+        os.killpg(0, signal.SIGINT)
+    else:
+        time.sleep(0.3)
+    return child
+
+os.fork = forked
+"""
+"""Ctrl-C reaches both processes before either is ready for it."""
 TOY = ["run", "exponential", "--method", "plain", "--final-spp", "1", "--out", "run"]
 
 
@@ -134,6 +151,11 @@ def test_signals_reach_a_run_in_a_container_once(tmp_path: Path, number: signal.
     words = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}[number]
     assert ended(process) == (128 + number, f"unrender: {words}\n")
     assert json.loads((tmp_path / "run" / "run.json").read_text())["stopped"] == words
+
+
+def test_a_signal_between_the_processes_is_one_line(tmp_path: Path) -> None:
+    process = start(tmp_path, [*TOY, "--steps", "1000000"], None, CONTAINER + INTERRUPTED)
+    assert ended(process) == (130, "unrender: interrupted\n")
 
 
 def test_a_killed_parent_takes_the_command_along(tmp_path: Path) -> None:

@@ -61,12 +61,10 @@ def take_in(module: str, table: str, names: list[str], folder: Path, limit: floa
 
 def _one_process(module: str, table: str, names: list[str], folder: Path, limit: float) -> tuple[list[Outcome], str]:
     command = [sys.executable, str(_HERE), module, table, str(folder)]
-    with (folder / "errors").open("wb") as errors:
-        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=folder)
-    assert process.stdin is not None
+    (folder / "names").write_text("".join(f"{name}\n" for name in names))  # more than a pipe holds
+    with (folder / "errors").open("wb") as errors, (folder / "names").open("rb") as given:
+        process = subprocess.Popen(command, stdin=given, stdout=subprocess.PIPE, stderr=errors, cwd=folder)
     assert process.stdout is not None
-    process.stdin.write("".join(f"{name}\n" for name in names).encode())
-    process.stdin.close()
     outcomes: list[Outcome] = []
     os.set_blocking(process.stdout.fileno(), False)
     data, last, end = b"", time.monotonic() + 60, ""

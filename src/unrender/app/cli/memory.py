@@ -78,12 +78,13 @@ def supervised() -> int | None:
     """Run the rest of the command in a child. Returns None there, and the exit status in the parent once the child has ended.
 
     What the child writes on standard error is shown when it ends, and is dropped where native code ended it. The child has a process
-    group of its own, so that a signal reaches it once: by its parent.
+    group of its own, so that a signal reaches it once: by its parent. Signals wait until both are ready for them.
     """
     global _is_child
     errors = os.memfd_create("unrender-errors")
     sys.stdout.flush()
     sys.stderr.flush()
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [*map(signal.Signals.__getitem__, _PASSED_ON), signal.SIGTSTP])
     parent, child = os.getpid(), os.fork()
     if child == 0:
         _is_child = True
@@ -95,10 +96,12 @@ def supervised() -> int | None:
         ctypes.CDLL(None).prctl(_DEATH_OF_PARENT, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(ENVIRONMENT)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         return None
     with contextlib.suppress(OSError):
         os.setpgid(child, child)
     with _passing_on(child):
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     name = "" if status >= 0 else signal.Signals(-status).name
     if name in _OF_MEMORY:
@@ -137,7 +140,7 @@ def _passing_on(child: int) -> Iterator[None]:
         os.kill(os.getpid(), signal.SIGSTOP)
         pass_on(signal.SIGCONT, frame)
 
-    handlers = dict.fromkeys((getattr(signal, name) for name in _PASSED_ON), pass_on) | {signal.SIGTSTP: stop}
+    handlers = dict.fromkeys(map(signal.Signals.__getitem__, _PASSED_ON), pass_on) | {signal.SIGTSTP: stop}
     for number, handler in handlers.items():
         if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, handler)
