@@ -175,6 +175,9 @@ def _png_chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
 
+_PNG_HEAD = b"\x89PNG\r\n\x1a\n" + _png_chunk(b"IHDR", struct.pack(">IIBBBBB", 16, 16, 16, 2, 0, 0, 0))
+
+
 def _webp(side: int) -> bytes:
     bits = (side - 1) | (side - 1) << 14
     body = b"VP8L" + struct.pack("<I", 10) + b"\x2f" + struct.pack("<I", bits) + bytes(5)
@@ -197,6 +200,8 @@ BOMBS: dict[str, Callable[[], bytes]] = {
     "a BMP": lambda: b"BM" + struct.pack("<IIIIiiHHIIiiII", 64, 0, 54, 40, 20_000, 20_000, 1, 24, 0, 0, 0, 0, 0, 0),
     "a PNG": lambda: b"\x89PNG\r\n\x1a\n" + _png_chunk(b"IHDR", struct.pack(">IIBBBBB", 20_000, 20_000, 8, 2, 0, 0, 0)),
     "a 16-bit PNG": lambda: b"\x89PNG\r\n\x1a\n" + _png_chunk(b"IHDR", struct.pack(">IIBBBBB", 20_000, 20_000, 16, 2, 0, 0, 0)),
+    "a PNG of a chunk of 4 gigabytes": lambda: _PNG_HEAD + struct.pack(">I", 0xFFFFFFFF) + b"IDAT" + bytes(100),
+    "a PNG of many chunks": lambda: _PNG_HEAD + _png_chunk(b"tEXt", b"") * (1 << 19),
     "a PGM": lambda: b"P5 # no pixels\n20000 20000\n255\n",
     "a plain PPM": lambda: b"P3\n20000 20000\n255\n",
     "an HDR": lambda: b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 20000 +X 20000\n",

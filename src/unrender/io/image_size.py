@@ -28,6 +28,7 @@ LONGEST_SIDE = 1 << 17
 _HEADER = 1 << 20
 _EXR_PARTS = 0x1000
 _MOST_ATTRIBUTES = 4096
+_MOST_CHUNKS = 1 << 18
 _MOST_SCANS = 100
 _MOST_SCANNED = 1 << 30
 """Largest product of pixels and scans of a JPEG file: each scan covers the entire image, and may have a few bytes."""
@@ -295,12 +296,31 @@ def _check_runs(packets: bytes, pixels: int, depth: int) -> None:
         raise ValueError("runs that do not fill the picture")
 
 
-def _png(data: bytes, _: IO[bytes]) -> tiff_header.TiffHeader:
+def _png(data: bytes, file: IO[bytes]) -> tiff_header.TiffHeader:
     """Return size and bits per channel; indexed colours count as four channels, to which they are converted."""
     if data[12:16] != b"IHDR":
         raise ValueError("no IHDR")
+    _check_chunks(file)
     width, height, bits, kind = struct.unpack_from(">IIBB", data, 16)
     return tiff_header.TiffHeader((width, height, {0: 1, 2: 3, 4: 2}.get(kind, 4)), bits)
+
+
+def _check_chunks(file: IO[bytes]) -> None:
+    """Raise `InputError` where a PNG file ends within a chunk: OpenCV allocates the length that a chunk declares."""
+    size = file.seek(0, 2)
+    at = file.seek(8)
+    for _ in range(_MOST_CHUNKS):
+        head = file.read(8)
+        if len(head) < 8 or head[4:] == b"IEND":
+            return
+        (length,) = struct.unpack_from(">I", head)
+        at += 12 + length
+        if at > size:
+            raise InputError(
+                f"cannot be read as a picture: a chunk of {length} bytes goes on behind the end of the file"
+            )
+        file.seek(at)
+    raise InputError(f"cannot be read as a picture: more than {_MOST_CHUNKS} chunks")
 
 
 def _jpeg(data: bytes, file: IO[bytes]) -> Sizes:
