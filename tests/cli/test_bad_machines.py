@@ -74,6 +74,28 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_later(tmp_path: Path, full:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["sweep", "exponential", "-m", "plain", "--over", "learning_rate=0.003,0.01", "--steps", "20"],
+        ["run", "two-planets", "-p", "resolution=16", "-p", "texture_resolution=8", "-p", "reference_spp=8"]
+        + ["--method", "plain", "--steps", "3"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_workers_in_a_container_with_64_megabytes_of_shared_memory(tmp_path: Path, words: list[str]) -> None:
+    pytest.importorskip("ray")
+    mounted = 'mount -t tmpfs -o size=64m tmpfs /dev/shm && exec "$@"'
+    if os.geteuid() or subprocess.run(["unshare", "-m", "true"], capture_output=True, check=False).returncode:
+        pytest.skip("needs root, to mount a small file system")
+    line = ["unshare", "-m", "sh", "-c", mounted, "sh", sys.executable, "-c", COMMAND, *words]
+    line += ["--workers", "2", "--final-spp", "1", "--out", "out"]
+    kept = os.environ | {"RAY_worker_niceness": "0"}
+    done = subprocess.run(line, cwd=tmp_path, env=kept, capture_output=True, text=True, timeout=300, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.slow
 def test_damaged_and_exchanged_kernels_change_nothing(tmp_path: Path) -> None:
     """Those of the cache are code; a damaged one is compiled anew."""
     cache = tmp_path / "kernels"

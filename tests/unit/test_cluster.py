@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickletools
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,8 +21,10 @@ from unrender.app.distributed.cluster import (
     connect,
     load_ray,
     share,
+    workers,
 )
 from unrender.app.distributed.cluster.connection import HeadNode
+from unrender.backend import limits
 from unrender.core.errors import InputError
 
 
@@ -79,6 +82,18 @@ def test_all_workers_find_room(count: int) -> None:
                 by_cores = int(cores / found.cpus + 1e-9)
                 fits += min(by_cores, int(gpus / found.gpus + 1e-9)) if gpu else by_cores
             assert fits >= count, (machines, gpu, found)
+
+
+@pytest.mark.parametrize(
+    ("free", "most", "expected"), [(0, 7, 7), (0, None, None), (1 << 31, None, 4), (1 << 31, 3, 3), (1, 3, 1)]
+)
+def test_workers_of_one_machine_fit_its_memory(
+    monkeypatch: pytest.MonkeyPatch, free: int, most: int | None, expected: int | None
+) -> None:
+    monkeypatch.setattr(limits, "free_memory", lambda: free)
+    assert workers.most_by_memory(most) == expected
+    if expected:
+        assert share([(64.0, 0.0)], None, False, expected).count == expected
 
 
 def test_without_ray_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,3 +244,19 @@ def test_in_this_process_a_failure_is_a_line_and_an_interrupt_passes() -> None:
     with pytest.raises(KeyboardInterrupt):
         here.wait(0.0)
     assert here.wait(0.0) == []
+
+
+def test_tasks_are_data_and_functions_go_by_name() -> None:
+    """Ray pickles what it sends. Nothing in a task of `sweep` or `compare` is code."""
+    from unrender.app.cli import tasks
+
+    cloudpickle = pytest.importorskip("ray").cloudpickle
+    job = tasks.Job("room.toml", {"resolution": "16"}, True, "unrender sweep", "/sweep", "token")
+    run = tasks.RunTask("trial-000", "plain", {"spp": "2"}, 3, None, 0, 1, {0.5: 0.1})
+    sent = cloudpickle.dumps((tasks.on_worker, job, [run]))
+    words = [argument for _, argument, _ in pickletools.genops(sent) if isinstance(argument, str)]
+    modules = {word for word in words if word.startswith(("unrender.", "ray", "builtins", "types", "cloudpickle"))}
+    assert modules == {"unrender.app.cli.tasks"}
+    assert {"on_worker", "Job", "RunTask"} <= set(words)
+    by_value = cloudpickle.dumps(lambda: run)
+    assert b"cloudpickle" in by_value, "a function that goes by value is told apart"

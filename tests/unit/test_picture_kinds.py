@@ -93,6 +93,7 @@ def test_pillow_decodes_kinds_of_the_allow_list_alone(tmp_path: Path, monkeypatc
     assert len(set(Image.OPEN) - reached) > 30, "so many decoders are out of reach"
 
 
+@pytest.mark.mitsuba
 def test_opencv_decodes_kinds_of_the_allow_list_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each format that OpenCV writes, in 8 and 16 bits, under each name."""
     given: set[str] = set()

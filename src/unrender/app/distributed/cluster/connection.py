@@ -17,7 +17,7 @@ from typing import Any
 
 from unrender.app.distributed.cluster.private import check_private, private_cluster
 from unrender.app.distributed.cluster.trust import check_cluster, check_token, has_token
-from unrender.app.distributed.cluster.workers import Share, Workers, share
+from unrender.app.distributed.cluster.workers import Share, Workers, most_by_memory, share
 from unrender.backend import limits, variant
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line, reason_of
@@ -166,6 +166,7 @@ def connect(
             given = stack.enter_context(private_cluster(ray))
             given |= {"num_cpus": limits.cores(), "include_dashboard": False, "object_store_memory": store_bytes}
             given |= {} if gpu else {"num_gpus": 0}
+            most = most_by_memory(most)
         else:
             gpu = name == variant.CUDA
             given = {"address": address}

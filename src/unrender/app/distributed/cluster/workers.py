@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from unrender.backend import variant
+from unrender.backend import limits, variant
 from unrender.core.errors import InputError
 
 _prepared: list[tuple[str, int]] = []
@@ -34,6 +34,8 @@ def prepare_worker(name: str, threads: int) -> str:
 
 _ADDRESS = re.compile(r"(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9](?:[A-Za-z0-9._-]*[A-Za-z0-9])?):([0-9]{1,5})\Z")
 _MOST = 100_000
+_WORKER_BYTES = 512 << 20
+"""Memory of a worker with its libraries and a small problem."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,19 @@ def share(machines: Sequence[tuple[float, float]], count: int | None, gpu: bool,
     fitting = [int(g / each + 1e-9) for g in gpus]
     per_worker = min(c // n if c >= n else 1 / -(-n // c) for c, n in zip(cores, fitting, strict=True))
     return Share(count, float(per_worker), each)
+
+
+def most_by_memory(most: int | None) -> int | None:
+    """Return how many workers have room in the memory that this machine, or this container, has left.
+
+    Args:
+        most: of how many there is work for; None for any number, which is also returned where the memory is unknown.
+    """
+    free = limits.free_memory()
+    if not free:
+        return most
+    fitting = max(1, free // _WORKER_BYTES)
+    return fitting if most is None else min(most, fitting)
 
 
 def _most_each(devices: Sequence[int], count: int) -> float:
