@@ -56,7 +56,8 @@ def _explain(detail: Any, model: type[Table], tables: Mapping[str, type[Table]])
     place: Place = location[:1]
     if len(location) >= 2 and location[0] in tables:
         model, place = tables[location[0]], location[: 3 if isinstance(location[1], int) else 2]
-    name, fields = str(place[-1]) if place else "", model.model_fields
+    name = str(place[-1]) if place else ""
+    fields = {field.alias or own: field for own, field in model.model_fields.items()}
     if detail["type"] == "extra_forbidden" and name not in fields:
         names = ", ".join(fields)
         return place, f"no such field{did_you_mean(name, fields) or f'; there are {names}'}"

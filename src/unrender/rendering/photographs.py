@@ -14,6 +14,7 @@ from unrender.rendering.renderer import Renderer
 from unrender.rendering.response import RESPONSE, RespondingRenderer
 from unrender.rendering.tied import TiedRenderer
 from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer
+from unrender.rendering.worlds import WorldsRenderer
 
 __all__ = [
     "OF_PHOTOGRAPHS",
@@ -38,9 +39,10 @@ def check_response(names: Collection[str]) -> None:
 
 
 def scene_renderer(renderer: Renderer) -> Renderer:
-    """Return the renderer of the scene alone, without ties and parameters of photographs."""
+    """Return what renders the scene alone, without ties, parameters of photographs and worlds of single views."""
     renderer = _without_photographs(renderer)
-    return renderer.inner if isinstance(renderer, TiedRenderer) else renderer
+    renderer = renderer.inner if isinstance(renderer, TiedRenderer) else renderer
+    return renderer.inner if isinstance(renderer, WorldsRenderer) else renderer
 
 
 def member_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

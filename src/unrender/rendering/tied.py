@@ -180,7 +180,8 @@ class TiedRenderer(RendererWrapper):
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
         return super().with_meshes(meshes, self.expanded(keys))
 
-    def _around(self, inner: Renderer) -> TiedRenderer:
+    def around(self, inner: Renderer) -> TiedRenderer:
+        """Return the same ties around another renderer."""
         return TiedRenderer(inner, self.ties)
 
     def expanded(self, keys: Iterable[str]) -> list[str]:

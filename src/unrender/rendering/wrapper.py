@@ -75,22 +75,21 @@ class RendererWrapper:
         return self.inner.cameras() if isinstance(self.inner, WithCameras) else {}
 
     def with_differential_bsdf(self) -> Renderer:
-        """Return the wrapped `with_differential_bsdf` of the inner renderer. Raise `InputError` if it does not support
-        this.
-        """
-        return self._around(with_differential_bsdf(self.inner))
+        """Return the wrapped `with_differential_bsdf` of the inner renderer. Raises `InputError` where it has none."""
+        return self.around(with_differential_bsdf(self.inner))
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
         """Return the wrapped `with_meshes` of the inner renderer. Raise `InputError` if it does not support this."""
         if not isinstance(self.inner, Remeshable):
             raise InputError(f"{', '.join(meshes)}: this renderer cannot replace meshes; keep their triangles fixed")
         known = self.inner.parameters()
-        return self._around(self.inner.with_meshes(meshes, [key for key in keys if key in known]))
+        return self.around(self.inner.with_meshes(meshes, [key for key in keys if key in known]))
 
-    def _around(self, inner: Renderer) -> Renderer:
-        wrapped = copy.copy(self)
-        wrapped.inner = inner
-        return wrapped
+    def around(self, inner: Renderer) -> Renderer:
+        """Return the same wrapper around another renderer."""
+        made = copy.copy(self)
+        made.inner = inner
+        return made
 
 
 class SessionWrapper:

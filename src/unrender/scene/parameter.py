@@ -107,6 +107,12 @@ def ties_of(parameters: Sequence[Parameter]) -> tuple[Tie, ...]:
     return tuple(ties)
 
 
+def scene_keys(parameters: Sequence[Parameter]) -> list[str]:
+    """Return the keys of some parameters and of the members of their ties. Raises `FieldError` as `ties_of`."""
+    keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
+    return [*keys, *(member for tie in ties_of(parameters) for member in tie.factors)]
+
+
 def tied(renderer: Renderer, parameters: Sequence[Parameter], ties: Sequence[Tie]) -> Renderer:
     """Return the renderer with the ties of these parameters. Raises `FieldError` for members that cannot share a value."""
     try:

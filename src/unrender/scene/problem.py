@@ -25,7 +25,7 @@ from unrender.scene.coordinates import Coordinates
 from unrender.scene.errors import FieldError
 from unrender.scene.executor import LOCAL, Executor
 from unrender.scene.mesh_checks import check_surfaces
-from unrender.scene.parameter import Parameter, ParameterSettings, tied, ties_of
+from unrender.scene.parameter import Parameter, ParameterSettings, scene_keys, tied, ties_of
 from unrender.scene.reference_noise import likelihood_scale
 from unrender.scene.references import References
 from unrender.scene.surfaces import Surface
@@ -48,6 +48,7 @@ from unrender.scene.validation import (
 from unrender.scene.view import View
 from unrender.scene.view_checks import check_views
 from unrender.scene.view_losses import ViewLosses
+from unrender.scene.view_worlds import known_keys, of_views
 
 __all__ = ["Bounds", "Problem", "open_scene"]
 
@@ -126,9 +127,9 @@ class Problem(ViewLosses):
         given: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         given_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
-        renderer = _opened(scene, max_depth, given, given_views)
+        renderer, located = _opened(scene, max_depth, given, given_views)
         unknowns = _unknowns(given, renderer, truth or {}, surfaces or {})
-        checked_views, view_notices = check_views(given_views, renderer, checked_loss)
+        checked_views, view_notices = check_views(located, renderer, checked_loss)
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))
         told = [line for unknown in unknowns.values() for line in unknown.notices]
         vars(self).update(
@@ -307,13 +308,19 @@ class Problem(ViewLosses):
         return {key: error for key, error in errors.items() if error is not None}
 
 
-def _opened(scene: Any, max_depth: int | None, parameters: Sequence[Parameter], views: Sequence[View]) -> Renderer:
-    """Return the renderer of a scene, including the parameters of photographs. Raises `FieldError`."""
+def _opened(
+    scene: Any, max_depth: int | None, parameters: Sequence[Parameter], views: Sequence[View]
+) -> tuple[Renderer, tuple[View, ...]]:
+    """Return the renderer of a scene, with unknowns that photographs have, and the views by its sensors. Raises `FieldError`."""
     keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
-    renderer = open_scene(scene, max_depth, parameters)
-    sensors = [view.sensor for view in views if isinstance(view.sensor, int)]
+    renderer = open_scene(scene, max_depth, parameters, known_keys(views))
+    members = scene_keys(parameters)
+    renderer, located = of_views(
+        renderer, views, members, lambda of: open_renderer(of, max_depth, [*members, *known_keys(views)])
+    )
+    sensors = [view.sensor for view in located if isinstance(view.sensor, int)]
     try:
-        return with_photographs(renderer, keys, sensors)
+        return with_photographs(renderer, keys, sensors), located
     except InputError as error:
         named = str(error).partition(":")[0]
         raise FieldError(("parameters", keys.index(named), "key"), str(error)) from error
@@ -338,9 +345,13 @@ def _unknowns(
     return unknowns
 
 
-def open_scene(scene: Any, max_depth: int | None, parameters: Sequence[Parameter]) -> Renderer:
-    """Return the renderer of a scene with the ties of these parameters. Raises `FieldError`."""
-    ties = ties_of(parameters)
-    keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
-    members = [member for tie in ties for member in tie.factors]
-    return tied(open_renderer(scene, max_depth, [*keys, *members]), parameters, ties)
+def open_scene(
+    scene: Any, max_depth: int | None, parameters: Sequence[Parameter], others: Sequence[str] = ()
+) -> Renderer:
+    """Return the renderer of a scene in which the ties of these parameters are unknowns. Raises `FieldError`.
+
+    Args:
+        scene, max_depth, parameters: As for `Problem`.
+        others: Further parameters that will be asked for.
+    """
+    return tied(open_renderer(scene, max_depth, [*scene_keys(parameters), *others]), parameters, ties_of(parameters))

@@ -58,6 +58,11 @@ def _described(problem: Problem, folder: Path) -> dict[str, Any]:
         for name, picture in (("reference", view.reference), ("mask", view.mask)):
             if picture is not None:
                 table |= store.field(name, picture, f"view{index}-{name}", inline=False)
+        if isinstance(view.scene, (str, Path)):
+            table["scene"] = str(Path(view.scene).resolve())
+        if view.known:
+            known = [store.field(key, x, f"view{index}-{n}") for n, (key, x) in enumerate(view.known.items())]
+            table["with"] = {key: value for part in known for key, value in part.items()}
         views.append(table)
     scene = {"scene": problem.origin["scene"]} if rebuilt else {}
     head = {"name": problem.name, **scene, "max_depth": problem.max_depth, "loss": _component(problem.loss)}

@@ -94,6 +94,10 @@ class _View(Table):
     sensor: StrictInt = Field(0, description="the index of a sensor of the scene, from 0")
     weight: _Number = Field(1.0, description="a number above 0")
     mask: StrictStr | None = Field(None, description="the path of a picture with values from 0 to 1")
+    known: dict[str, _Number | StrictStr | list[Any]] | None = Field(
+        None, alias="with", description='a table of values by key, such as { "lamp.intensity.value" = 0 }'
+    )
+    scene: StrictStr | None = Field(None, description="the path of a Mitsuba .xml file")
 
 
 class _Problem(Table):
@@ -138,15 +142,18 @@ def _build(model: _Problem, file: Path) -> Problem:
     return Problem(
         folder / model.scene,
         parameters,
-        [
-            View(folder / view.reference, view.sensor, view.weight, None if view.mask is None else folder / view.mask)
-            for view in model.views
-        ],
+        [_view(view, folder) for view in model.views],
         loss,
         model.max_depth,
         truth={p.key: _value(truth, folder) for p, truth in truths if truth is not None},
         name=model.name or file.stem,
     )
+
+
+def _view(model: _View, folder: Path) -> View:
+    known = None if model.known is None else {key: _value(value, folder) for key, value in model.known.items()}
+    mask, scene = (None if name is None else folder / name for name in (model.mask, model.scene))
+    return View(folder / model.reference, model.sensor, model.weight, mask, known, scene)
 
 
 def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:

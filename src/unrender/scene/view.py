@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +23,16 @@ class View:
         sensor: index of the scene's sensor.
         weight: factor of this view's loss, > 0.
         mask: file or array (H, W), in [0, 1], the factor of each pixel's loss; None for ones.
+        known: {key: value} of parameters that have this value in this view alone, such as lamps that are off, or the pose of an object on
+            a turntable. Values as for `Parameter.initial`. An unknown among them does not act on this view. None for the problem's scene
+            as it is.
+        scene: Another scene that this view is of, as for `Problem`: an .xml file, a dictionary, a function, or a renderer. Unknowns are
+            those of the problem's scene; the ones that this scene has under the same key act on it. None for the problem's scene.
     """
 
     reference: str | Path | np.ndarray | StoredPicture
     sensor: int = 0
     weight: float = 1.0
     mask: str | Path | np.ndarray | StoredPicture | None = None
+    known: Mapping[str, Any] | None = None
+    scene: str | Path | dict[str, Any] | Callable[[], Any] | Any = None

@@ -14,7 +14,6 @@ from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.io.stored_pictures import PictureStore, StoredPicture
 from unrender.losses import Censored, Loss
-from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import PictureFormat, Renderer, format_of
 from unrender.scene.errors import FieldError
 from unrender.scene.references import ON_DEVICE
@@ -107,11 +106,10 @@ def check_views(given: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[
         loss: loss; one that handles saturated pixels needs no notice of them.
     """
     checked, notices, resolutions = [], [], renderer.resolutions()
-    films = scene_renderer(renderer)
     known = [v.sensor for v in given if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
     store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
     for number, one in enumerate(given):
-        view, notes = _check_view(number, one, resolutions, films, not isinstance(loss, Censored))
+        view, notes = _check_view(number, one, resolutions, renderer, not isinstance(loss, Censored))
         checked.append(view if store is None else _stored(view, store))
         notices += notes
     return tuple(checked), notices

@@ -44,7 +44,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     Raises:
         InputError: it was made of what cannot be sent: a loaded scene, or a function or object tied to this process.
     """
-    given = [_located(problem.given_views[view], "reference", "mask") for view in views]
+    given = [_located(problem.given_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
     sensors = sensors_with_rows(problem.renderer)
     parts = _Parts(_scene(problem), parameters, given, problem.loss, problem.max_depth, problem.name, sensors)

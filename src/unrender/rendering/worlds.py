@@ -1,0 +1,394 @@
+"""Views of different worlds: some see the scene with other values of known parameters, or another scene. A renderer around several."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from unrender.core import arrays, trees
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.trees import Tree
+from unrender.rendering.renderer import (
+    EmitterMoments,
+    ParameterInfo,
+    PictureFormat,
+    Renderer,
+    Rendering,
+    RenderSession,
+    ReplacedMesh,
+    SampleRequest,
+    Space,
+    counted_vertices,
+    differentiated,
+    drawing_emitters,
+    format_of,
+    with_differential_bsdf,
+)
+from unrender.rendering.wrapper import RendererWrapper
+
+__all__ = ["World", "WorldsRenderer", "with_worlds"]
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What one sensor of a `WorldsRenderer` sees.
+
+    Attributes:
+        renderer: Renders the scene.
+        sensor: Index among the sensors of that renderer.
+        values: {key: value} of parameters that are known here: float32 arrays of the parameters' shapes.
+    """
+
+    renderer: Renderer
+    sensor: int
+    values: Mapping[str, np.ndarray]
+
+    def same(self, other: World) -> bool:
+        """Return whether both show the same."""
+        return self.renderer is other.renderer and self.sensor == other.sensor and self.same_state(other)
+
+    def same_state(self, other: World) -> bool:
+        """Return whether both show the same scene with the same known values."""
+        if self.renderer is not other.renderer or self.values.keys() != other.values.keys():
+            return False
+        return all(np.array_equal(value, other.values[key]) for key, value in self.values.items())
+
+
+def with_worlds(renderer: Renderer, worlds: Sequence[World]) -> tuple[Renderer, list[int]]:
+    """Return a renderer with a sensor for each world, and the indices of these sensors.
+
+    A renderer that has them already is returned as it is. Wrappers around the scene's renderer stay around the result.
+    """
+    if not worlds:
+        return renderer, []
+    if isinstance(renderer, WorldsRenderer):
+        if (known := renderer.sensors_of(worlds)) is not None:
+            return renderer, known
+        return with_worlds(renderer.inner, worlds)
+    if isinstance(renderer, RendererWrapper):
+        inner, sensors = with_worlds(renderer.inner, worlds)
+        return (renderer if inner is renderer.inner else renderer.around(inner)), sensors
+    distinct: list[World] = []
+    for world in worlds:
+        if not any(world.same(other) for other in distinct):
+            distinct.append(world)
+    made = WorldsRenderer(renderer, distinct)
+    return made, made.sensors_of(worlds) or []
+
+
+class WorldsRenderer(RendererWrapper):
+    """A renderer whose first sensors are those of a scene, and whose others each see a world of their own.
+
+    Images, gradients and tangents are as unbiased as those of the renderers inside. A parameter that is known in a world has no gradient
+    there. A parameter that a world's scene does not have changes nothing there.
+
+    Args:
+        inner: Renders the scene that has all parameters.
+        worlds: One for each further sensor.
+    """
+
+    def __init__(self, inner: Renderer, worlds: Sequence[World]):
+        super().__init__(inner)
+        self.worlds = tuple(worlds)
+        self.max_depth = getattr(inner, "max_depth", 6)
+        self._count = len(inner.resolutions())
+        states: list[World] = [World(inner, 0, {})]
+        numbers = []
+        for world in self.worlds:
+            found = next((n for n, known in enumerate(states) if world.same_state(known)), None)
+            numbers.append(len(states) if found is None else found)
+            states += [world] if found is None else []
+        self.states = tuple(states)
+        self._state = np.array([0] * self._count + numbers)
+        self._sensor = np.array([*range(self._count), *(world.sensor for world in self.worlds)])
+
+    @property
+    def renderers(self) -> list[Renderer]:
+        """The renderers of all scenes, the first that of `inner`."""
+        found: list[Renderer] = []
+        for state in self.states:
+            if not any(state.renderer is other for other in found):
+                found.append(state.renderer)
+        return found
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """See `RendererWrapper.notices`: those of all scenes, each once."""
+        return tuple(dict.fromkeys(line for one in self.renderers for line in getattr(one, "notices", ())))
+
+    def sensors_of(self, worlds: Sequence[World]) -> list[int] | None:
+        """Return the index of each world's sensor; None where one is missing."""
+        found = [next((n for n, known in enumerate(self.worlds) if world.same(known)), None) for world in worlds]
+        return None if None in found else [self._count + n for n in found if n is not None]
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """See `Renderer.parameters`. What one scene cannot differentiate, none can."""
+        others = [one.parameters() for one in self.renderers[1:]]
+        found = {}
+        for key, info in self.inner.parameters().items():
+            for other in (known[key] for known in others if key in known):
+                info = replace(
+                    info,
+                    differentiable=info.differentiable and other.differentiable,
+                    shares_paths=info.shares_paths and other.shares_paths,
+                    perturbable=info.perturbable and other.perturbable,
+                    reason=info.reason or other.reason,
+                )
+            found[key] = info if info.sensor is None else replace(info, sensor=self._only(info.sensor))
+        return found
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        """See `Renderer.resolutions`."""
+        return [*self.inner.resolutions(), *(world.renderer.resolutions()[world.sensor] for world in self.worlds)]
+
+    def formats(self) -> Sequence[PictureFormat]:
+        """See `WithFormats.formats`."""
+        own = [format_of(self.inner, sensor) for sensor in range(self._count)]
+        return [*own, *(format_of(world.renderer, world.sensor) for world in self.worlds)]
+
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> RenderSession:
+        """See `Renderer.prepare`."""
+        wanted, sessions = differentiated(keys, derivatives), {}
+        for renderer in self.renderers:
+            known = renderer.parameters()
+            held = [key for state in self.states if state.renderer is renderer for key in state.values]
+            own = list(dict.fromkeys([*(key for key in keys if key in known), *held]))
+            sessions[id(renderer)] = renderer.prepare(own, space, wanted & frozenset(own))
+        return WorldsSession(self, sessions, wanted)
+
+    def parts(self, request: SampleRequest) -> list[tuple[int, SampleRequest, np.ndarray | None]]:
+        """Return (number of the state, request for its renderer, positions in the request's pixels) for each state that a request sees.
+
+        Positions are None where the part is the whole.
+        """
+        if request.sensors is None:
+            return [(int(self._state[request.sensor]), self._inner_request(request, request.sensor, None), None)]
+        asked = arrays.numpy(request.sensors).astype(np.int64)
+        numbers = self._state[asked]
+        found = []
+        for number in np.unique(numbers):
+            (chosen,) = np.nonzero(numbers == number)
+            part = self._part(request, asked, chosen)
+            found.append((int(number), part, None if len(chosen) == len(asked) else chosen))
+        return found
+
+    def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
+        """See `Remeshable.with_meshes`. Raises `InputError` where there are several scenes."""
+        if len(self.renderers) > 1:
+            raise InputError(f"{', '.join(meshes)}: views of several scenes keep their triangles")
+        return super().with_meshes(meshes, keys)
+
+    def with_differential_bsdf(self) -> Renderer:
+        """See `DifferentialBsdfRenderer`."""
+        changed = {id(one): with_differential_bsdf(one) for one in self.renderers}
+        return self._changed(lambda one: changed[id(one)])
+
+    def around(self, inner: Renderer) -> Renderer:
+        """Return the same around another renderer of the first scene."""
+        return self._changed(lambda one: inner if one is self.inner else one)
+
+    def _changed(self, change: Callable[[Renderer], Renderer]) -> WorldsRenderer:
+        worlds = [replace(world, renderer=change(world.renderer)) for world in self.worlds]
+        return WorldsRenderer(change(self.inner), worlds)
+
+    def _only(self, sensor: int) -> int | None:
+        """Return the one sensor that looks through a sensor of the first scene; None where several do."""
+        inner = [False] * self._count + [world.renderer is self.inner for world in self.worlds]
+        found = [n for n in range(len(self._sensor)) if self._sensor[n] == sensor and (n < self._count or inner[n])]
+        return found[0] if len(found) == 1 else None
+
+    def _part(self, request: SampleRequest, asked: np.ndarray, chosen: np.ndarray) -> SampleRequest:
+        pixels, positions = request.pixels, request.positions
+        inner = self._sensor[asked[chosen]]
+        sensors = arrays.like_integers(inner, request.sensors) if len(set(inner)) > 1 else None
+        if len(chosen) < len(asked):
+            index = arrays.like_integers(chosen, request.sensors)
+            pixels = arrays.gather(pixels, index)
+            positions = index if positions is None else arrays.gather(positions, index)
+        return replace(request, sensor=int(inner[0]), sensors=sensors, pixels=pixels, positions=positions)
+
+    def _inner_request(self, request: SampleRequest, sensor: int, sensors: Array | None) -> SampleRequest:
+        return replace(request, sensor=int(self._sensor[sensor]), sensors=sensors)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """The paths of one state of a rendering.
+
+    Attributes:
+        state: Its number.
+        chosen: Positions of its pixels in the request; None for all.
+        count: Number of pixels of the request; 0 where `chosen` is None.
+        paths: Those of the renderer inside.
+    """
+
+    state: int
+    chosen: np.ndarray | None
+    count: int
+    paths: Any
+
+
+class WorldsSession:
+    """Images and derivatives of views of different worlds. See `RenderSession`."""
+
+    def __init__(self, renderer: WorldsRenderer, sessions: Mapping[int, RenderSession], wanted: frozenset[str]):
+        self._renderer, self._sessions, self._wanted = renderer, sessions, wanted
+        self._known = [{key: renderer.array(x) for key, x in state.values.items()} for state in renderer.states]
+        self._keys = [frozenset(state.renderer.parameters()) for state in renderer.states]
+        self._own = [self._scene_values(state.renderer) for state in renderer.states]
+
+    def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
+        """See `RenderSession.image`."""
+        return self._rendered(request, lambda n, part: self._session(n).image(self._at(n, parameters), part))
+
+    def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
+        """See `RenderSession.image_pair`."""
+
+        def pair(number: int, part: SampleRequest) -> Rendering:
+            states = self._at(number, current), self._at(number, previous)
+            return self._session(number).image_pair(*states, part, space)
+
+        return self._rendered(request, pair)
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
+        """See `RenderSession.image_batch`."""
+        ((number, part, _),) = self._renderer.parts(request)
+        count = len(next(iter(parameters.values())))
+        known, scene = (
+            {key: np.broadcast_to(x, (count, *x.shape)) for key, x in trees.numpy(values).items()}
+            for values in (self._known[number], self._own[number])
+        )
+        own = {key: x for key, x in parameters.items() if key in self._keys[number]}
+        return self._session(number).image_batch({**scene, **own, **known}, part)
+
+    def adjoint(self, parameters: Tree, paths: Sequence[_Part], weights: Array) -> Tree:
+        """See `RenderSession.adjoint`."""
+        found = [
+            self._session(part.state).adjoint(self._at(part.state, parameters), part.paths, _of_part(weights, part))
+            for part in paths
+        ]
+        return self._sum(parameters, paths, found)
+
+    def adjoint_pair(
+        self, current: Tree, previous: Tree, paths: Sequence[_Part], weights: Array, weights_previous: Array
+    ) -> tuple[Tree, Tree]:
+        """See `RenderSession.adjoint_pair`."""
+        found = []
+        for part in paths:
+            states = self._at(part.state, current), self._at(part.state, previous)
+            both = _of_part(weights, part), _of_part(weights_previous, part)
+            found.append(self._session(part.state).adjoint_pair(*states, part.paths, *both))
+        ones, others = ([pair[n] for pair in found] for n in (0, 1))
+        return self._sum(current, paths, ones), self._sum(previous, paths, others)
+
+    def tangent_moment(self, parameters: Tree, paths: Sequence[_Part], tangents: Tree) -> Array:
+        """See `RenderSession.tangent_moment`."""
+        found = []
+        for part in paths:
+            state = self._at(part.state, parameters)
+            session = self._session(part.state)
+            found.append(session.tangent_moment(state, part.paths, self._tangents(part.state, state, tangents)))
+        return _joined(found, paths)
+
+    def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
+        """See `CountingSession.vertices`."""
+        parts = self._renderer.parts(request)
+        found = [counted_vertices(self._session(n), self._at(n, parameters), part) for n, part, _ in parts]
+        count = 0 if request.pixels is None else arrays.shape(request.pixels)[0]
+        of = [_Part(n, chosen, count, None) for n, _, chosen in parts]
+        grouped = [arrays.add_first_axis(x) for x in found]
+        return _joined(grouped, of)[0] if of[0].chosen is not None else found[0]
+
+    def emitters(self) -> np.ndarray:
+        """See `EmitterSession.emitters`. Raises `InputError` where there are several scenes."""
+        if len(self._sessions) > 1:
+            raise InputError("views of several scenes draw emitters in their own way alone")
+        return drawing_emitters(self._session(0)).emitters()
+
+    def emitter_moments(
+        self, parameters: Tree, paths: Sequence[_Part], tangents: Tree, weights: Array, noise: Array
+    ) -> EmitterMoments:
+        """See `EmitterSession.emitter_moments`."""
+        found = []
+        for part in paths:
+            state = self._at(part.state, parameters)
+            own, both = self._tangents(part.state, state, tangents), (_of_part(weights, part), _of_part(noise, part))
+            session = drawing_emitters(self._session(part.state))
+            found.append(session.emitter_moments(state, part.paths, own, *both))
+        return sum(found[1:], found[0])
+
+    def _scene_values(self, renderer: Renderer) -> Tree:
+        """Return the scene's values of parameters that have other values in some of its worlds."""
+        keys = [key for state in self._renderer.states if state.renderer is renderer for key in state.values]
+        return renderer.values(list(dict.fromkeys(keys)))
+
+    def _session(self, state: int) -> RenderSession:
+        return self._sessions[id(self._renderer.states[state].renderer)]
+
+    def _at(self, state: int, parameters: Tree) -> Tree:
+        """Return the parameters of a state's session: those that its scene has, with the known values."""
+        own = {key: x for key, x in parameters.items() if key in self._keys[state]}
+        return {**self._own[state], **own, **self._known[state]}
+
+    def _tangents(self, state: int, at: Tree, tangents: Tree) -> Tree:
+        known = self._known[state]
+        return {
+            key: tangents[key] if key in tangents and key not in known else arrays.zeros_like(x)
+            for key, x in at.items()
+        }
+
+    def _rendered(self, request: SampleRequest, render: Callable[[int, SampleRequest], Rendering]) -> Rendering:
+        parts = self._renderer.parts(request)
+        found = [render(number, part) for number, part, _ in parts]
+        count = 0 if request.pixels is None else arrays.shape(request.pixels)[0]
+        paths = [_Part(number, chosen, count, one.paths) for (number, _, chosen), one in zip(parts, found, strict=True)]
+        previous = [one.previous for one in found]
+        return Rendering(
+            _joined([one.images for one in found], paths),
+            None if any(x is None for x in previous) else _joined(previous, paths),
+            paths,
+        )
+
+    def _sum(self, parameters: Tree, paths: Sequence[_Part], found: Sequence[Tree]) -> Tree:
+        """Return the sum of the states' gradients; a value that a state knows has none there."""
+        total = trees.zeros_like({key: x for key, x in parameters.items() if key in self._wanted})
+        for part, gradient in zip(paths, found, strict=True):
+            known = self._known[part.state]
+            total = {key: x + gradient[key] if key in gradient and key not in known else x for key, x in total.items()}
+        return total
+
+
+def _of_part(images: Array, part: _Part) -> Array:
+    """Return the pixels (groups, n, 3) of a part, of those of a whole request (groups, N, 3)."""
+    if part.chosen is None:
+        return images
+    groups, _, channels = arrays.shape(images)
+    rows = arrays.shaped(arrays.flat(images), (groups * part.count, channels), images)
+    found = arrays.gather_rows(rows, _rows(part, groups, arrays.flat(images)))
+    return arrays.shaped(arrays.flat(found), (groups, len(part.chosen), channels), images)
+
+
+def _joined(parts: Sequence[Any], paths: Sequence[_Part]) -> Array:
+    """Return the images of a whole request from those of its parts."""
+    if paths[0].chosen is None:
+        return parts[0]
+    total, groups, channels = None, *(arrays.shape(parts[0])[n] for n in (0, 2))
+    for images, part in zip(parts, paths, strict=True):
+        flat = arrays.flat(images)
+        rows = arrays.shaped(flat, (groups * arrays.shape(images)[1], channels), images)
+        placed = arrays.add_rows(rows, _rows(part, groups, flat), groups * part.count)
+        total = placed if total is None else total + placed
+    return arrays.shaped(arrays.flat(total), (groups, paths[0].count, channels), parts[0])
+
+
+def _rows(part: _Part, groups: int, like: Array) -> Array:
+    chosen = np.asarray(part.chosen)
+    rows = (np.arange(groups)[:, None] * part.count + chosen).reshape(-1)
+    return arrays.like_integers(rows, like)

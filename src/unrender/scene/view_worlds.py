@@ -1,0 +1,113 @@
+"""Views that see other values or other scenes than the problem's: from what a user gives to sensors of a renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.io import parameter_values
+from unrender.rendering.photographs import scene_renderer
+from unrender.rendering.renderer import ParameterInfo, Renderer
+from unrender.rendering.worlds import World, with_worlds
+from unrender.scene.errors import FieldError
+from unrender.scene.view import View
+
+
+def known_keys(views: Sequence[View]) -> list[str]:
+    """Return the keys that any view gives a value of its own."""
+    return list(dict.fromkeys(key for view in views if isinstance(view.known, Mapping) for key in view.known))
+
+
+def of_views(
+    renderer: Renderer, views: Sequence[View], keys: Sequence[str], opened: Callable[[Any], Renderer]
+) -> tuple[Renderer, tuple[View, ...]]:
+    """Return a renderer in which each view's world is a sensor, and the views with these sensors.
+
+    Args:
+        renderer: Renders the problem's scene.
+        views: As given.
+        keys: Parameters of the scenes that are unknown.
+        opened: Returns the renderer of a scene. Called once for equal scenes.
+
+    Raises:
+        FieldError: A sensor, key or value that does not suit, or a scene that has none of the unknowns.
+    """
+    scenes: list[tuple[Any, Renderer]] = []
+    worlds: dict[int, World] = {}
+    for index, view in enumerate(views):
+        if view.known is None and view.scene is None:
+            continue
+        own = scene_renderer(renderer)
+        if view.scene is not None:
+            own = next((made for scene, made in scenes if scene is view.scene or _equal(scene, view.scene)), None)
+            if own is None:
+                own = _opened(index, view, keys, scene_renderer(renderer), opened)
+                scenes.append((view.scene, own))
+        worlds[index] = World(own, _sensor(index, view, own), _values(index, view.known or {}, own.parameters()))
+    made, sensors = with_worlds(renderer, list(worlds.values()))
+    located = dict(zip(worlds, sensors, strict=True))
+    return made, tuple(
+        replace(view, sensor=located[index], known=None, scene=None) if index in located else view
+        for index, view in enumerate(views)
+    )
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return isinstance(one, (str, Path)) and isinstance(other, (str, Path)) and Path(one) == Path(other)
+
+
+def _opened(
+    index: int, view: View, keys: Sequence[str], first: Renderer, opened: Callable[[Any], Renderer]
+) -> Renderer:
+    place = ("views", index, "scene")
+    try:
+        own = scene_renderer(opened(view.scene))
+    except FieldError as error:
+        raise FieldError(place, error.what, f"view {index}: scene") from error
+    known, others = own.parameters(), first.parameters()
+    if not any(key in known for key in keys):
+        raise FieldError(place, f"it has none of the unknowns, such as {keys[0]}", f"view {index}: scene")
+    for key in keys:
+        if key in known and key in others and known[key].shape != others[key].shape:
+            what = f"{key} has the shape {known[key].shape} there, {others[key].shape} in the problem's scene"
+            raise FieldError(place, what, f"view {index}: scene")
+    return own
+
+
+def _sensor(index: int, view: View, renderer: Renderer) -> int:
+    count = len(renderer.resolutions())
+    if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < count:
+        have = f"0 to {count - 1}" if count > 1 else "0, the only sensor"
+        raise FieldError(("views", index, "sensor"), f"expected {have}, got {view.sensor!r}", f"view {index}: sensor")
+    return view.sensor
+
+
+def _values(index: int, given: Any, known: Mapping[str, ParameterInfo]) -> dict[str, np.ndarray]:
+    place, owner = ("views", index, "with"), f"view {index}: known"
+    if not isinstance(given, Mapping):
+        raise FieldError(place, f"expected a table of values by key, got {given!r:.60}", owner)
+    found = {}
+    for key, value in given.items():
+        if key not in known:
+            raise FieldError(place, f"the scene has no parameter {key}{did_you_mean(str(key), known)}", owner)
+        info = known[key]
+        if not info.perturbable:
+            raise FieldError(place, f"{key} cannot have a value of its own: {info.reason}", owner)
+        try:
+            filled, _ = parameter_values.fill(value, info.shape, info.conversion)
+        except InputError as error:
+            raise FieldError(place, f"{key}: {error}", owner) from error
+        low, high = info.lowest, info.highest
+        if (low is not None and (filled < low).any()) or (high is not None and (filled > high).any()):
+            ends = " and ".join(
+                f"{word} {end:g}" for word, end in (("at least", low), ("at most", high)) if end is not None
+            )
+            raise FieldError(place, f"{key}: expected {ends}, got {value!r:.60}", owner)
+        found[key] = np.asarray(filled, np.float32)
+    return found

@@ -1,0 +1,237 @@
+"""Views of different worlds: values of single views, scenes of single views, from Python and from files, against separate renders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.core.random import Key
+from unrender.estimators.base import as_numpy
+from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.scene.batches import PixelBatch, PixelSample
+
+pytestmark = pytest.mark.mitsuba
+
+WALL, LAMP, PAINT = "wall.bsdf.reflectance.data", "right.intensity.value", 4
+DARK = [0.0, 0.0, 0.0]
+
+
+def scene(
+    left: float = 1.0, right: float = 3.0, paint: float = 0.5, width: int = 8, turned: float = 0.0
+) -> dict[str, Any]:
+    """A wall with a texture under two lamps."""
+    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": width, "height": 8, "rfilter": {"type": "box"}}
+    texture = mi.Bitmap(np.full((PAINT, PAINT, 3), paint, np.float32))
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "sensor": {"type": "perspective", "fov": 50, "to_world": look, "film": film},
+        "wall": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], turned),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": texture, "raw": True}},
+        },
+        "left": {"type": "point", "position": [-1, 0, 2], "intensity": left},
+        "right": {"type": "point", "position": [1, 0, 2], "intensity": right},
+    }
+
+
+def picture(spp: int = 256, **of: Any) -> np.ndarray:
+    return np.array(mi.render(mi.load_dict(scene(**of)), spp=spp, seed=mi.UInt32(7)))
+
+
+def problem(views: list[ur.View], keys: tuple[str, ...] = (WALL,), **options: Any) -> ur.Problem:
+    return ur.Problem(scene, [ur.Parameter(key) for key in keys], views, **options)
+
+
+def lit_apart() -> ur.Problem:
+    """Three views of one sensor: both lamps, the left alone, the right alone."""
+    seen = [
+        ur.View(picture(paint=0.3)),
+        ur.View(picture(paint=0.3, right=0.0), known={LAMP: DARK}),
+        ur.View(picture(paint=0.3, left=0.0), known={"left.intensity.value": DARK}),
+    ]
+    return problem(seen, (WALL, LAMP))
+
+
+def agree(found: np.ndarray, expected: np.ndarray, errors: float = 5.0) -> bool:
+    """Whether pictures agree within their noise, which two lamps of which one is drawn have: the means over all pixels within 5 σ."""
+    noise = (found - expected).std() / np.sqrt(found[..., 0].size)
+    return bool(abs((found - expected).mean()) < errors * noise + 1e-5)
+
+
+def test_each_view_shows_its_own_world() -> None:
+    made = lit_apart()
+    values = {WALL: np.full((PAINT, PAINT, 3), 0.3, np.float32), LAMP: np.full(3, 3.0, np.float32)}
+    for index, view in enumerate(made.views):
+        assert agree(ur.render(made, values, view=index, spp=256), np.asarray(view.reference))
+    # The planted fault: another view's world.
+    assert not agree(ur.render(made, values, view=1, spp=256), np.asarray(made.views[2].reference))
+
+
+@pytest.mark.parametrize("image", ["plain", "rcv"])
+def test_the_gradient_is_the_sum_of_separate_problems(image: str) -> None:
+    """Whole views, with the same random numbers: equal to rounding. A lamp that is off in a view has no gradient there."""
+    estimator = ur.PathGradient(RecursiveControlVariate(), spp=8) if image == "rcv" else ur.PathGradient(spp=8)
+    references = [picture(paint=0.3), picture(paint=0.3, right=0.0)]
+    together = problem([ur.View(references[0]), ur.View(references[1], known={LAMP: DARK})], (WALL, LAMP))
+    point = together.initial()
+    state, total = estimator.init(together, point), []
+    for step in range(3):
+        estimate, state = estimator.estimate(together, point, state, Key(1, step))
+        total.append(as_numpy(estimate).gradient)
+    apart = problem([ur.View(references[0]), ur.View(references[0])], (WALL, LAMP))
+    assert np.abs(total[-1][WALL]).max() > 0
+    other = estimator.estimate(apart, point, estimator.init(apart, point), Key(1, 0))[0]
+    assert not np.allclose(as_numpy(other).gradient[WALL], total[0][WALL], rtol=1e-2)
+    lamp_off = problem([ur.View(references[1], known={LAMP: DARK})], (WALL, LAMP))
+    alone = estimator.estimate(lamp_off, point, estimator.init(lamp_off, point), Key(1, 0))[0]
+    assert (as_numpy(alone).gradient[LAMP] == 0).all()
+
+
+def test_the_gradient_is_the_slope_of_the_loss() -> None:
+    """A brighter wall and a brighter lamp, by differences of many-sample pictures."""
+    made = lit_apart()
+    paint, lamp = np.full((PAINT, PAINT, 3), 0.5, np.float32), np.full(3, 3.0, np.float32)
+    point = {WALL: made.renderer.array(paint), LAMP: made.renderer.array(lamp)}
+    estimator, found = ur.PathGradient(spp=128), []
+    for seed in range(12):
+        estimate = estimator.estimate(made, point, estimator.init(made, point), Key(seed))[0]
+        found.append([float(np.sum(x)) for x in as_numpy(estimate).gradient.values()])
+    mean, error = np.mean(found, axis=0), np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
+
+    def loss(of_paint: float, of_lamp: float) -> float:
+        worlds = [{"right": of_lamp}, {"right": 0.0}, {"right": of_lamp, "left": 0.0}]
+        pictures = [picture(spp=4096, paint=of_paint, **world) for world in worlds]
+        references = [np.asarray(view.reference) for view in made.views]
+        return sum(float(np.mean((one - other) ** 2)) for one, other in zip(pictures, references, strict=True))
+
+    slopes = [(loss(0.51, 3.0) - loss(0.49, 3.0)) / 0.02, (loss(0.5, 3.05) - loss(0.5, 2.95)) / 0.1]
+    for slope, value, sigma in zip(slopes, mean, error, strict=True):
+        assert abs(value - slope) < 5 * sigma + 0.01 * abs(slope)
+        assert abs(1.5 * value - slope) > 5 * sigma + 0.01 * abs(slope)
+
+
+def test_pixels_drawn_from_all_views_are_those_of_the_views() -> None:
+    made = lit_apart()
+    point = made.initial()
+    session = made.renderer.prepare(list(point), None)
+    rng = np.random.default_rng(0)
+    views, pixels = rng.integers(0, 3, 50), rng.integers(0, 64, 50)
+    like = made.renderer.array(np.zeros(1))
+    sample = PixelSample(
+        arrays.like_integers(views, like), arrays.like_integers(pixels, like), made.renderer.array(np.ones((50, 1)))
+    )
+    request = PixelBatch(made, sample).request(256, 3, 2)
+    rendering = session.image(point, request)
+    images = arrays.numpy(rendering.images).mean(axis=0)
+    whole = [ur.render(made, view=view, spp=1024).reshape(-1, 3) for view in range(3)]
+    expected = np.stack([whole[view][pixel] for view, pixel in zip(views, pixels, strict=True)])
+    for view in range(3):
+        assert images[views == view].mean() == pytest.approx(expected[views == view].mean(), rel=0.1)
+    # The adjoint of a weight on view 1 alone does not see the lamp that is off there.
+    weights = np.zeros((2, 50, 3), np.float32)
+    weights[:, views == 1] = 1.0
+    gradient = session.adjoint(point, rendering.paths, made.renderer.array(weights))
+    assert (arrays.numpy(gradient[LAMP]) == 0).all()
+    assert (arrays.numpy(gradient[WALL]) != 0).any()
+    weights = np.zeros((2, 50, 3), np.float32)
+    weights[:, views == 2] = 1.0
+    gradient = session.adjoint(point, rendering.paths, made.renderer.array(weights))
+    assert arrays.numpy(gradient[LAMP])[0] == pytest.approx(images[views == 2, 0].sum() / 3.0, rel=1e-3)
+
+
+def test_a_view_may_have_a_scene_and_a_film_of_its_own() -> None:
+    """One paint in two rooms, of which one is dark on the right, and has a wider film."""
+    other = scene(right=0.0, width=12)
+    references = [picture(paint=0.3), picture(paint=0.3, right=0.0, width=12)]
+    made = problem([ur.View(references[0]), ur.View(references[1], scene=other)])
+    assert made.sizes == [(8, 8), (8, 12)]
+    values = {WALL: np.full((PAINT, PAINT, 3), 0.3, np.float32)}
+    assert agree(ur.render(made, values, view=1, spp=256), references[1])
+    result = ur.optimize(made, "auto", steps=60, progress=False)
+    assert np.abs(result.parameters[WALL][1:-1, 1:-1] - 0.3).mean() < 0.05
+
+
+def test_a_known_pose_turns_an_object_in_one_view() -> None:
+    turned = picture(paint=0.3, turned=20.0)
+    made = problem([ur.View(picture(paint=0.3)), ur.View(turned, known={"wall.rotation": [0, np.radians(20.0), 0]})])
+    values = {WALL: np.full((PAINT, PAINT, 3), 0.3, np.float32)}
+    assert agree(ur.render(made, values, view=1, spp=256), turned)
+    assert not agree(ur.render(made, values, view=0, spp=256), turned)
+    result = ur.optimize(made, "auto", steps=60, progress=False)
+    assert np.abs(result.parameters[WALL][1:-1, 1:-1] - 0.3).mean() < 0.05
+
+
+def test_lamps_of_three_pictures_are_told_apart() -> None:
+    """Wall and lamp trade off in one picture; lamps that are lit one by one, of which one is known, tell them apart."""
+    result = ur.optimize(lit_apart(), "auto", steps=150, progress=False)
+    assert result.parameters[LAMP] == pytest.approx(np.full(3, 3.0), rel=0.1)
+    assert result.status == "finished"
+
+
+# ---------------------------------------------------------------------- files
+
+XML = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="2"/></integrator>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,3" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="{width}"/><integer name="height" value="8"/><rfilter type="box"/></film></sensor>
+<shape type="rectangle" id="wall"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
+<emitter type="point" id="lamp"><point name="position" x="0" y="0" z="2"/><rgb name="intensity" value="{light}"/></emitter></scene>"""
+HEAD = 'scene = "scene.xml"\n[[parameters]]\nkey = "wall.bsdf.reflectance.value"\n[[views]]\nreference = "one.npy"\n'
+
+
+def files(folder: Path, more: str) -> Path:
+    (folder / "scene.xml").write_text(XML.format(width=8, light=2.0))
+    (folder / "other.xml").write_text(XML.format(width=6, light=5.0))
+    np.save(folder / "one.npy", np.full((8, 8, 3), 0.1, np.float32))
+    np.save(folder / "two.npy", np.full((8, 6, 3), 0.1, np.float32))
+    (folder / "problem.toml").write_text(HEAD + more)
+    return folder / "problem.toml"
+
+
+def test_a_file_has_worlds_and_its_run_resumes(tmp_path: Path) -> None:
+    worlds = '[[views]]\nreference = "one.npy"\nwith = { "lamp.intensity.value" = [0.5, 0.5, 0.5] }\n'
+    worlds += '[[views]]\nreference = "two.npy"\nscene = "other.xml"\n'
+    made = ur.Problem.from_file(files(tmp_path, worlds))
+    means = [ur.render(made, view=view, spp=16).mean() for view in range(3)]
+    assert means[1] == pytest.approx(means[0] / 4, rel=1e-4)
+    assert means[2] > 2 * means[0]
+    ur.optimize(made, "auto", steps=6, run_directory=tmp_path / "run", progress=False)
+    straight = ur.optimize(made, "auto", steps=12, run_directory=tmp_path / "straight", progress=False)
+    resumed = ur.resume(tmp_path / "run", steps=12)
+    key = "wall.bsdf.reflectance.value"
+    assert resumed.parameters[key] == pytest.approx(straight.parameters[key], rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("with = { nothing = 1.0 }", r"problem.toml:6: views\[0\].with: the scene has no parameter nothing"),
+        ("with = 3", r"problem.toml:6: views\[0\].with: expected a table of values by key"),
+        ('with = { "lamp.intensity.value" = -1 }', r"views\[0\].with: lamp.intensity.value: expected at least 0"),
+        ('with = { "lamp.intensity.value" = [1, 2] }', r"views\[0\].with: lamp.intensity.value: "),
+        ('scene = "missing.xml"', r"views\[0\].scene: "),
+        ('scene = "other.xml"', r"views\[0\].reference: 8x8 pixels"),
+        ('scene = "other.xml"\nsensor = 3', r"views\[0\].sensor: expected 0, the only sensor, got 3"),
+        ("when = 3", r"views\[0\].when: no such field; there are reference, sensor, weight, mask, with, scene"),
+    ],
+)
+def test_a_world_that_cannot_be_is_refused_in_one_line(tmp_path: Path, more: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        ur.Problem.from_file(files(tmp_path, more + "\n"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_scene_without_the_unknowns_is_refused() -> None:
+    other = scene()
+    other["floor"] = other.pop("wall")
+    with pytest.raises(InputError, match="view 0: scene: it has none of the unknowns, such as wall"):
+        problem([ur.View(picture(), scene=other)])
