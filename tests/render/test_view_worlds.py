@@ -16,6 +16,7 @@ from unrender.core.random import Key
 from unrender.estimators.base import as_numpy
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.scene.batches import PixelBatch, PixelSample
+from unrender.scene.fingerprint import fingerprint
 
 pytestmark = pytest.mark.mitsuba
 
@@ -24,7 +25,7 @@ DARK = [0.0, 0.0, 0.0]
 
 
 def scene(
-    left: float = 1.0, right: float = 3.0, paint: float = 0.5, width: int = 8, turned: float = 0.0
+    left: float = 1.0, right: float = 3.0, paint: float = 0.5, width: int = 8, shift: float = 0.0
 ) -> dict[str, Any]:
     """A wall with a texture under two lamps."""
     look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
@@ -36,7 +37,7 @@ def scene(
         "sensor": {"type": "perspective", "fov": 50, "to_world": look, "film": film},
         "wall": {
             "type": "rectangle",
-            "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], turned),
+            "to_world": mi.ScalarTransform4f().translate([shift, 0, 0]),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": texture, "raw": True}},
         },
         "left": {"type": "point", "position": [-1, 0, 2], "intensity": left},
@@ -161,14 +162,15 @@ def test_a_view_may_have_a_scene_and_a_film_of_its_own() -> None:
     assert np.abs(result.parameters[WALL][1:-1, 1:-1] - 0.3).mean() < 0.05
 
 
-def test_a_known_pose_turns_an_object_in_one_view() -> None:
-    turned = picture(paint=0.3, turned=20.0)
-    made = problem([ur.View(picture(paint=0.3)), ur.View(turned, known={"wall.rotation": [0, np.radians(20.0), 0]})])
+def test_a_known_pose_moves_an_object_in_one_view() -> None:
+    moved = picture(paint=0.3, shift=0.7)
+    made = problem([ur.View(picture(paint=0.3)), ur.View(moved, known={"wall.translation": [0.7, 0.0, 0.0]})])
     values = {WALL: np.full((PAINT, PAINT, 3), 0.3, np.float32)}
-    assert agree(ur.render(made, values, view=1, spp=256), turned)
-    assert not agree(ur.render(made, values, view=0, spp=256), turned)
+    still, turned = (ur.render(made, values, view=view, spp=256) for view in range(2))
+    assert np.abs(turned - moved).mean() < 0.15 * moved.mean()
+    assert np.abs(still - moved).mean() > 0.3 * moved.mean()
     result = ur.optimize(made, "auto", steps=60, progress=False)
-    assert np.abs(result.parameters[WALL][1:-1, 1:-1] - 0.3).mean() < 0.05
+    assert np.abs(result.parameters[WALL] - 0.3).mean() < 0.05
 
 
 def test_lamps_of_three_pictures_are_told_apart() -> None:
@@ -206,6 +208,14 @@ def test_a_file_has_worlds_and_its_run_resumes(tmp_path: Path) -> None:
     assert means[2] > 2 * means[0]
     ur.optimize(made, "auto", steps=6, run_directory=tmp_path / "run", progress=False)
     straight = ur.optimize(made, "auto", steps=12, run_directory=tmp_path / "straight", progress=False)
+    known = fingerprint(made)
+    assert (
+        known["view 1: known lamp.intensity.value"]
+        != fingerprint(ur.Problem.from_file(files(tmp_path, worlds.replace("0.5,", "0.6,"))))[
+            "view 1: known lamp.intensity.value"
+        ]
+    )
+    assert known["view 2: scene"].endswith("other.xml")
     resumed = ur.resume(tmp_path / "run", steps=12)
     key = "wall.bsdf.reflectance.value"
     assert resumed.parameters[key] == pytest.approx(straight.parameters[key], rel=1e-5)

@@ -77,6 +77,16 @@ def _take(problem: Problem) -> dict[str, str]:
         parts[f"view {index}: weight"] = str(view.weight)
         parts[f"view {index}: reference"] = _of_array(np.asarray(view.reference))
         parts[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
+    for index, view in enumerate(problem.given_views):
+        known = {} if view.known is None else dict(sorted(view.known.items()))
+        fields = {
+            f"known {key}": str(x) if isinstance(x, (str, Path)) else _of_array(np.asarray(x, np.float32))
+            for key, x in known.items()
+        }
+        fields |= (
+            {} if view.scene is None else {"scene": str(view.scene) if isinstance(view.scene, (str, Path)) else "given"}
+        )
+        parts |= {f"view {index}: {name}": value for name, value in fields.items()}
     return parts | _of_scene(problem) | _of_files(problem)
 
 

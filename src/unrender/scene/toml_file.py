@@ -3,8 +3,7 @@
     name = "wall"
     scene = "room.xml"
     max_depth = 6                              # default: that of the scene's integrator
-    loss = "L1"                                # or { type = "Huber", delta = 0.1 }, { type = "Perceptual", weights = "vgg16.safetensors"
-    }
+    loss = "L1"                                # or { type = "Huber", delta = 0.1 }
 
     [[parameters]]
     key = "wall.bsdf.reflectance.data"         # or keys = [...] for parameters that share one value; { "a" = 1, "b" = 0.5 } for factors
@@ -14,6 +13,7 @@
     preconditioner = { type = "LargeSteps", strength = 10.0 }
     coarse_to_fine = [200, 400]                # steps at which the resolution doubles, see CoarseToFine
     parameterisation = "logit"                 # variable of the optimizer: identity, log, logit, softplus
+    prior = { total_variation = 0.1 }          # what is known of the values beforehand
     truth = "wall.exr"                         # true value, if known, to measure the error
 
     [[views]]
@@ -21,6 +21,8 @@
     sensor = 0
     weight = 1.0
     mask = "mask.png"
+    with = { "lamp.intensity.value" = 0 }      # values of known parameters in this view alone
+    scene = "room-2.xml"                       # another scene that this view is of
 
 Paths are relative to the file. Only `scene`, `key` (or `keys`) and `reference` are required.
 """
