@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.campaigns import cuts, kills, worker_kills
+from tests.campaigns import cuts, kills, sweep_kills, worker_kills
 from tests.campaigns.cluster_machines import Link, Machines
 from tests.campaigns.machine import Victims
 
@@ -58,3 +58,9 @@ def test_a_distributed_run_survives_kills_and_a_slow_worker(method: str, tmp_pat
     print(method, summary, slow)
     assert summary["right"] == summary["kills"] > 0, summary
     assert slow["right"], slow
+
+
+def test_a_sweep_on_workers_survives_kills(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    rows = sweep_kills.campaign(tmp_path, COUNT, random.Random(SEED))
+    assert [row for row in rows if row["wrong"]] == []

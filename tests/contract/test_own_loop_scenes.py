@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,37 @@ def test_a_scene_of_another_variant_is_refused() -> None:
     Foreign = type("Scene", (), {"__module__": "mitsuba.scalar_rgb"})
     with pytest.raises(InputError, match="loaded under another variant than"):
         ur.Renderer(Foreign(), KEYS)
+
+
+@pytest.mark.parametrize("by_call", [False, True], ids=["explicit", "differentiable"])
+def test_two_threads_draw_what_each_draws_alone(by_call: bool) -> None:
+    """Renderers of two threads take turns: neither raises, and no random sequence depends on the other."""
+
+    def descend(seed: int, found: dict[int, Any]) -> None:
+        renderer = ur.Renderer(surface(), KEYS, groups=2, seed=seed)
+        found[seed] = []
+        for _ in range(3):
+            if by_call:
+                values = attached()
+                dr.backward(loss(renderer(values)))
+                gradient = dr.grad(values[LAMP]).numpy()
+            else:
+                gradient = explicit(renderer, {TEXTURE: START, LAMP: GLOW})[LAMP]
+            found[seed].append(np.ravel(gradient))
+
+    alone: dict[int, Any] = {}
+    together: dict[int, Any] = {}
+    for seed in (1, 2):
+        descend(seed, alone)
+    threads = [threading.Thread(target=descend, args=(seed, together)) for seed in (1, 2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for seed in (1, 2):
+        assert len(together[seed]) == 3
+        np.testing.assert_array_equal(together[seed], alone[seed])
+    assert not np.array_equal(alone[1], alone[2])
 
 
 def test_the_tutorials_loop_with_three_lines_changed() -> None:
