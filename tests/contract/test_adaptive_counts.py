@@ -18,6 +18,7 @@ from unrender.pixels.base import DrawStatistics, MiniBatch
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder.state import pack, unpack
 from unrender.scene.batches import WholeView
+from unrender.scene.executor import LOCAL
 from unrender.scene.sample_counts import SampleCounts, SampleShares, rounded
 
 CV, Counts = ur.images.RecursiveControlVariate, ur.pixels.AdaptiveCounts
@@ -115,7 +116,8 @@ def test_gradients_are_unbiased_whatever_the_numbers(image: Any, monkeypatch: py
             for step in range(3 if isinstance(image, CV) else 1):
                 shares = last if step != 1 else tuple(rng.random((4, 4)) ** 6 for _ in range(2))
                 batch = MiniBatch(None, shares=SampleShares(2, shares, (rng.random(), rng.random())))
-                found = GradientRequest(at, image, state, 5, Key(seed, step), batch=batch).carry_out(asked)
+                request = GradientRequest(at, image, state, 5, Key(seed, step), batch=batch)
+                found = LOCAL.estimate_gradient(asked, request)
                 state = found.image
             assert found is not None
             rows.append(np.concatenate([g.ravel() for g in found.gradient.values()]))
@@ -143,7 +145,8 @@ def test_the_variance_of_a_control_variate_is_known_with_other_numbers_at_each_s
         state, found = image.init(asked, at), None
         for step, shares in enumerate(schedule):
             batch = MiniBatch(None, shares=SampleShares(2, shares, (0.5,)))
-            found = GradientRequest(at, image, state, 6, Key(seed, step), batch=batch).carry_out(asked)
+            request = GradientRequest(at, image, state, 6, Key(seed, step), batch=batch)
+            found = LOCAL.estimate_gradient(asked, request)
             state = found.image
         assert found is not None
         images.append(found.images[0])

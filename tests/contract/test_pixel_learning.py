@@ -18,6 +18,7 @@ from unrender.pixels.map_denoising import pool
 from unrender.pixels.tiles import cut
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder.state import pack, unpack
+from unrender.scene.executor import LOCAL
 
 
 def few_pixels(sparse: float = 0.1, views: int = 1, grain: float = 0.0) -> ur.Problem:
@@ -54,7 +55,8 @@ def test_draws_tell_both_factors_of_their_pixels(spp: int) -> None:
         tangents = pixel_statistics.random_tangents(asked, at, scales, key.fold(3))
         batch = dataclasses.replace(sampler.redraw(asked, state, key), tangents=tangents)
         assert batch.sample is not None
-        draws = GradientRequest(at, ur.images.Plain(), PlainState(), spp, key, batch=batch).carry_out(asked).draws
+        request = GradientRequest(at, ur.images.Plain(), PlainState(), spp, key, batch=batch)
+        draws = LOCAL.estimate_gradient(asked, request).draws
         assert draws is not None
         told = draws.squares.sum(axis=1)
         np.add.at(sums[0][step % 20], batch.sample.pixels, told)

@@ -18,6 +18,7 @@ from unrender.estimators import sample_groups
 from unrender.estimators.sample_groups import GradientRequest
 from unrender.images.base import ImageEstimate, PairRequest
 from unrender.images.plain import PlainState
+from unrender.scene.executor import LOCAL
 
 STEPS = (0.1, 0.03, 0.01)
 
@@ -33,9 +34,8 @@ def slope(problem: ur.Problem, space: Any, runs: int = 24) -> float:
         rows = []
         for run in range(runs):
             pair_request = PairRequest(previous, space)
-            both = GradientRequest(
-                start, ur.images.Plain(), PlainState(), 2, Key(1, run), pair_request=pair_request
-            ).carry_out(problem)
+            request = GradientRequest(start, ur.images.Plain(), PlainState(), 2, Key(1, run), pair_request=pair_request)
+            both = LOCAL.estimate_gradient(problem, request)
             assert both.previous is not None
             difference = trees.numpy(trees.subtract(both.gradient, both.previous))
             rows.append(np.concatenate([x.ravel() for x in difference.values()]))
@@ -65,7 +65,8 @@ def paired_gradients(problem: ur.Problem, spp: int, difference_spp: int | None, 
     rows = []
     for run in range(runs):
         key = Key(spp, run)
-        found = GradientRequest(start, ur.images.Plain(), PlainState(), spp, key, pair_request=asked).carry_out(problem)
+        request = GradientRequest(start, ur.images.Plain(), PlainState(), spp, key, pair_request=asked)
+        found = LOCAL.estimate_gradient(problem, request)
         current = found.gradient if difference_spp is None else found.paired
         both = (trees.numpy(current), trees.numpy(trees.subtract(current, found.previous)))
         rows.append(np.concatenate([x.ravel() for tree in both for x in tree.values()]))

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import ParamSpec, TypeVar
 
 from unrender.core.errors import InputError
-
-_Parameters = ParamSpec("_Parameters")
-_Returned = TypeVar("_Returned")
 
 
 @dataclass
@@ -43,10 +38,9 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_reset)
 
 
-def exclusive(
-    what: str, long: bool = False
-) -> Callable[[Callable[_Parameters, _Returned]], Callable[_Parameters, _Returned]]:
-    """Return a decorator that serialises calls from different threads. Calls within one thread may nest.
+@contextlib.contextmanager
+def exclusive(what: str, long: bool = False) -> Iterator[None]:
+    """Serialise calls from different threads, as a decorator or in a `with` statement. Calls within one thread may nest.
 
     A call waits for another thread's call to end. If that call is marked `long`, it raises `InputError` instead.
 
@@ -54,20 +48,6 @@ def exclusive(
         what: name of the function in the message.
         long: whether the function may take hours, as a run does.
     """
-
-    def decorate(function: Callable[_Parameters, _Returned]) -> Callable[_Parameters, _Returned]:
-        @functools.wraps(function)
-        def call(*arguments: _Parameters.args, **named: _Parameters.kwargs) -> _Returned:
-            with _lock(what, long):
-                return function(*arguments, **named)
-
-        return call
-
-    return decorate
-
-
-@contextlib.contextmanager
-def _lock(what: str, long: bool) -> Iterator[None]:
     me = threading.current_thread()
     with _turn.changed:
         while _turn.thread not in (None, me):

@@ -113,38 +113,102 @@ class GradientRequest:
             return {}
         return self.batch.tangents
 
-    def carry_out(self, problem: Problem) -> GradientSample:
-        """Estimate the gradient in this process, frame by frame."""
-        batch = self.batch
-        sample, shares = (batch.sample, batch.shares) if batch else (None, None)
+    def begin(self, problem: Problem) -> GatheredFrames:
+        """Return the frames of the step, whose parts are yet to be estimated."""
+        sample, shares = (self.batch.sample, self.batch.shares) if self.batch else (None, None)
         likely = None if self.emitters is None else self.emitters.probabilities
-        whole = sample is None
-        frames = whole_views(problem, shares, self.spp, likely) if whole else [PixelBatch(problem, sample, likely)]
-        sums = {name: GradientSum() for name in TREES}
-        parts = []
-        for index, frame in enumerate(frames):
-            part = estimate_frame(problem, self, frame, self.key.fold(index))
-            for name, total in sums.items():
-                total.add(getattr(part, name))
-            parts.append(replace(part, **{name: {} for name in TREES}))
-            del part
+        frames: Sequence[Frame] = [PixelBatch(problem, sample, likely)] if sample is not None else ()
+        return GatheredFrames(self, frames or whole_views(problem, shares, self.spp, likely))
+
+    def estimate_frame(self, problem: Problem, frame: Frame, key: Key) -> FrameGradient:
+        """Return the part of one frame, computed in this process; `key` is the frame's own."""
+        parameters, spp, adjoint_spp, pair_request = self.parameters, self.spp, self.adjoint_spp, self.pair_request
+        difference_spp = pair_request.difference_spp if pair_request else None
+        on_images = pair_request if difference_spp is None else None  # whose gradients are on the paths of the images
+        groups = leave_one_out_groups(spp, adjoint_spp)
+        session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
+        found, kept = self.image.estimate(
+            problem, parameters, self.state, frame, spp, groups, key.fold(0), pair_request
+        )
+        mean = found.mean()
+        loss = frame.loss_value(mean)
+        paths, traced = found.paths, spp
+        counts = frame.counts if isinstance(frame, WholeView) else None
+        if groups == 1 and counts is None:
+            samples = frame.request(adjoint_spp or spp, key.fold(1).uint32())
+            paths = _paths(session, parameters, samples, on_images)
+            traced += samples.spp
+        derivative = _derivative(problem, frame, found.variance, self.tolerance)
+        others = found.others()
+        weights = derivative(others)
+        paired: Tree = {}
+        previous: Tree = {}
+        if on_images is None:
+            gradient = session.adjoint(parameters, paths, weights)
+        else:
+            weights_previous = derivative(found.previous_others())
+            gradient, previous = session.adjoint_pair(parameters, on_images.previous, paths, weights, weights_previous)
+        if pair_request is not None and difference_spp is not None:
+            samples = frame.request(difference_spp, key.fold(2).uint32())
+            both = (derivative(arrays.add_first_axis(image)) for image in (mean, found.previous_mean()))
+            further = _paths(session, parameters, samples, pair_request)
+            paired, previous = session.adjoint_pair(parameters, pair_request.previous, further, *both)
+            traced += difference_spp
+        fresh: Tree = {}
+        if self.fresh and found.fresh is not None:
+            fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, others, weights))
+        draws = None
+        if self.tangents and isinstance(frame, PixelBatch):
+            draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, self.tangents))
+        elif self.tangents and counts is not None:
+            draws = _view_statistics(counts, weights, session.tangent_moment(parameters, paths, self.tangents))
+        told = None
+        if self.emitters is not None and self.emitters.tangents:
+            told = emitter_selection.connections(session, parameters, self.emitters.tangents, found, weights, spp)
+        pixels = traced * frame.pixels
+        return FrameGradient(gradient, paired, previous, fresh, loss, mean, pixels, found.info, kept, draws, told)
+
+
+class GatheredFrames:
+    """The parts of a step's frames: gradients are summed as they come.
+
+    Args:
+        request: what is estimated.
+        frames: in the order of their parts.
+    """
+
+    def __init__(self, request: GradientRequest, frames: Sequence[Frame]):
+        self.frames = frames
+        self._request = request
+        self._sums = {name: GradientSum() for name in TREES}
+        self._parts: list[FrameGradient] = []
+
+    def add(self, part: FrameGradient) -> None:
+        """Add the part of the next frame."""
+        for name, total in self._sums.items():
+            total.add(getattr(part, name))
+        self._parts.append(replace(part, **{name: {} for name in TREES}))
+
+    def result(self, problem: Problem) -> GradientSample:
+        """Return the estimate of all frames."""
+        batch, parts = self._request.batch, self._parts
         info: dict[str, dict[int, Any]] = (
             {"pixel_probability": batch.probability} if batch and batch.probability else {}
         )
         images: dict[int, Array] = {}
-        for frame, part in zip(frames, parts, strict=True):
+        for frame, part in zip(self.frames, parts, strict=True):
             if isinstance(frame, WholeView):
                 images[frame.view] = part.image
                 for name, value in part.info.items():
                     info.setdefault(name, {})[frame.view] = value
         told = [part.connections for part in parts if part.connections is not None]
         return GradientSample(
-            **{name: total.result() for name, total in sums.items()},
+            **{name: total.result() for name, total in self._sums.items()},
             losses=[part.loss for part in parts],
             images=images,
             samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
             info=info,
-            image=_image_state(problem, self, sample, parts),
+            image=_image_state(problem, self._request, batch.sample if batch else None, parts),
             draws=_joined([part.draws for part in parts if part.draws is not None]),
             connections=functools.reduce(operator.add, told) if told else None,
         )
@@ -219,60 +283,6 @@ class FrameGradient:
     kept: Any
     draws: DrawStatistics | None = None
     connections: EmitterMoments | None = None
-
-
-def estimate_frame(problem: Problem, request: GradientRequest, frame: Frame, key: Key) -> FrameGradient:
-    """The part of one frame; `key` is the frame's own."""
-    parameters, image, state, spp, adjoint_spp = (
-        request.parameters,
-        request.image,
-        request.state,
-        request.spp,
-        request.adjoint_spp,
-    )
-    pair_request = request.pair_request
-    difference_spp = pair_request.difference_spp if pair_request else None
-    on_images = pair_request if difference_spp is None else None  # whose gradients are on the paths of the images
-    groups = leave_one_out_groups(spp, adjoint_spp)
-    session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
-    found, kept = image.estimate(problem, parameters, state, frame, spp, groups, key.fold(0), pair_request)
-    mean = found.mean()
-    loss = frame.loss_value(mean)
-    paths, traced = found.paths, spp
-    counts = frame.counts if isinstance(frame, WholeView) else None
-    if groups == 1 and counts is None:
-        samples = frame.request(adjoint_spp or spp, key.fold(1).uint32())
-        paths = _paths(session, parameters, samples, on_images)
-        traced += samples.spp
-    derivative = _derivative(problem, frame, found.variance, request.tolerance)
-    others = found.others()
-    weights = derivative(others)
-    paired: Tree = {}
-    previous: Tree = {}
-    if on_images is None:
-        gradient = session.adjoint(parameters, paths, weights)
-    else:
-        weights_previous = derivative(found.previous_others())
-        gradient, previous = session.adjoint_pair(parameters, on_images.previous, paths, weights, weights_previous)
-    if pair_request is not None and difference_spp is not None:
-        samples = frame.request(difference_spp, key.fold(2).uint32())
-        both = (derivative(arrays.add_first_axis(image)) for image in (mean, found.previous_mean()))
-        further = _paths(session, parameters, samples, pair_request)
-        paired, previous = session.adjoint_pair(parameters, pair_request.previous, further, *both)
-        traced += difference_spp
-    fresh: Tree = {}
-    if request.fresh and found.fresh is not None:
-        fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, others, weights))
-    draws = None
-    if request.tangents and isinstance(frame, PixelBatch):
-        draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, request.tangents))
-    elif request.tangents and counts is not None:
-        draws = _view_statistics(counts, weights, session.tangent_moment(parameters, paths, request.tangents))
-    told = None
-    if request.emitters is not None and request.emitters.tangents:
-        told = emitter_selection.connections(session, parameters, request.emitters.tangents, found, weights, spp)
-    pixels = traced * frame.pixels
-    return FrameGradient(gradient, paired, previous, fresh, loss, mean, pixels, found.info, kept, draws, told)
 
 
 def _draw_statistics(frame: PixelBatch, weights: Array, moments: Array) -> DrawStatistics:

@@ -83,7 +83,16 @@ class Descent:
         started = time.perf_counter()
         run, state = replace(self.run, warnings=[]), replace(self.state, noise=GradientNoise())
         for _ in range(2):
-            _discarded_step(run, state)
+            found, state.estimator = run.estimator.estimate(
+                run.problem, run.parameters, state.estimator, Key(run.seed, 0, stream=1)
+            )
+            found = penalized(found, run.problem, run.parameters)
+            memory.trim_cache(run.parameters)
+            update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
+            run.parameters, state.optimizer = update.parameters, update.state
+            del update
+            memory.evaluate_in_turn(state.optimizer)
+            state.noise.update(found.gradient, found.variance)
         return time.perf_counter() - started, snapshot(run, state)
 
 
@@ -117,7 +126,14 @@ def descend(descent: Descent) -> Result:
     """Take steps until a hook, a callback or Ctrl-C stops the run. See `Hook` for what happens when."""
     run, hooks = descent.run, descent.hooks
     try:
-        _warm_up(descent)
+        fresh = descent.snapshot()
+        with phases.phase(COMPILING):
+            seconds, warm = descent.warm_up()
+        descent.log.warmup_seconds += seconds
+        for hook in hooks:
+            hook.on_warm_up(descent, fresh, warm)
+        del fresh, warm  # they hold as much as the run itself does
+        memory.trim_cache(run.parameters)
         with interruptible(run):
             for hook in hooks:
                 hook.on_start(descent)
@@ -139,31 +155,6 @@ def descend(descent: Descent) -> Result:
     for hook in hooks:
         hook.on_end(descent, result)
     return result
-
-
-def _warm_up(descent: Descent) -> None:
-    """Compile, and tell the hooks. The two snapshots hold as much as the run itself does: they end with this call."""
-    fresh = descent.snapshot()
-    with phases.phase(COMPILING):
-        seconds, warm = descent.warm_up()
-    descent.log.warmup_seconds += seconds
-    for hook in descent.hooks:
-        hook.on_warm_up(descent, fresh, warm)
-    del fresh, warm
-    memory.trim_cache(descent.run.parameters)
-
-
-def _discarded_step(run: Run, state: RunState) -> None:
-    """One step for its kernels alone."""
-    key = Key(run.seed, 0, stream=1)
-    found, state.estimator = run.estimator.estimate(run.problem, run.parameters, state.estimator, key)
-    found = penalized(found, run.problem, run.parameters)
-    memory.trim_cache(run.parameters)
-    update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
-    run.parameters, state.optimizer = update.parameters, update.state
-    del update
-    memory.evaluate_in_turn(state.optimizer)
-    state.noise.update(found.gradient, found.variance)
 
 
 def _announce(descent: Descent, estimate: Estimate, applied: bool) -> None:

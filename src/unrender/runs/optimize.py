@@ -38,7 +38,7 @@ from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
 from unrender.runs.remeshing import MeshRefinement
 from unrender.runs.result import Result
-from unrender.runs.run import Run, RunState, terminate_if_told
+from unrender.runs.run import Run, terminate_if_told
 from unrender.runs.verify import Verify
 from unrender.runs.watches import BoundsWatch, InfluenceWatch, MeshWatch
 from unrender.scene.problem import Problem
@@ -107,8 +107,9 @@ def optimize(
     run.last_step = last_step(seconds) if annotations.within_seconds else None
     run.warnings += advice.remarks(problem, plan.optimizer)
     log = RunMetadata(describe_run(run, annotations), first_values(run))
-    with _progress(progress) as shown:
-        return _descend(run, state, log, [*shown, *callbacks], annotations, run_directory, checkpoint_every)
+    with _progress(progress) as shown, _folder(run, log, annotations, run_directory, checkpoint_every) as writers:
+        hooks = assemble_hooks([*shown, *callbacks], *writers, earlier=annotations.phases)
+        return descend(Descent(run, state, log, hooks))
 
 
 @contextmanager
@@ -123,25 +124,20 @@ def _progress(wanted: bool | None) -> Iterator[list[Callback]]:
         yield [bar]
 
 
-def _descend(
-    run: Run,
-    state: RunState,
-    log: RunMetadata,
-    callbacks: Sequence[Callback],
-    annotations: RunAnnotations,
-    run_directory: str | Path | None,
-    checkpoint_every: int | None,
-) -> Result:
-    """Run, with a run folder or without."""
-    if run_directory is None:
-        return descend(Descent(run, state, log, assemble_hooks(callbacks, earlier=annotations.phases)))
-    run.folder = Path(run_directory)
+@contextmanager
+def _folder(
+    run: Run, log: RunMetadata, annotations: RunAnnotations, directory: str | Path | None, checkpoint_every: int | None
+) -> Iterator[list[RunWriter]]:
+    """The writer of the run folder, which is begun; none where no folder is wanted."""
+    if directory is None:
+        yield []
+        return
+    run.folder = Path(directory)
     log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(run.problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
         writer.start(log.result(run))
-        result = descend(Descent(run, state, log, assemble_hooks(callbacks, writer, earlier=annotations.phases)))
+        yield [writer]
     terminate_if_told(run)
-    return result
 
 
 def assemble_hooks(

@@ -10,8 +10,7 @@ import numpy as np
 class Executor(Protocol):
     """Executor of an estimator's requests.
 
-    A request is plain data: `estimators.sample_groups.GradientRequest` or `pixels.pixel_statistics.PilotRequest`. Its method
-    `carry_out(problem)` computes it in this process.
+    A request is plain data: `estimators.sample_groups.GradientRequest` or `pixels.pixel_statistics.PilotRequest`.
     """
 
     @property
@@ -57,7 +56,10 @@ class LocalExecutor:
         """Accept every estimator."""
 
     def estimate_gradient(self, problem: Any, request: Any) -> Any:
-        return request.carry_out(problem)
+        gathered = request.begin(problem)
+        for index, frame in enumerate(gathered.frames):
+            gathered.add(request.estimate_frame(problem, frame, request.key.fold(index)))
+        return gathered.result(problem)
 
     def trace_pilot(self, problem: Any, request: Any) -> list[np.ndarray]:
         return request.carry_out(problem)

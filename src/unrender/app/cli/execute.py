@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,6 @@ from unrender.runs.callbacks import Callback
 from unrender.runs.final_images import image_name
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
-from unrender.runs.optimize import optimize
 from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.progress import Progress
 from unrender.runs.result import Result
@@ -29,15 +29,15 @@ from unrender.scene.notebook import describe_views
 from unrender.scene.problem import Problem
 from unrender.statistics import debiased
 
-__all__ = ["RunOrder", "execute", "image_error", "introduce", "summarise", "verified"]
+__all__ = ["RunOrder", "execution", "image_error", "introduce", "summarise", "verified"]
 
 
 @dataclass(frozen=True)
 class RunOrder:
-    """What is to be run.
+    """How a problem is to be run.
 
     Attributes:
-        problem, method: of what, by what.
+        method: by what.
         settings: of the method, where they are not the defaults.
         steps, seconds, seed: see `optimize`.
         final_spp: of the final pictures; None chooses.
@@ -47,7 +47,6 @@ class RunOrder:
         within_seconds: whether `seconds` covers compilation and final pictures too; where methods are compared it is for steps alone.
     """
 
-    problem: Problem
     method: Method | PlanFile
     settings: Mapping[str, Any]
     steps: int | None
@@ -60,37 +59,44 @@ class RunOrder:
     within_seconds: bool = False
 
 
-def execute(
-    order: RunOrder, directory: Path, console: Console, progress: Progress, callbacks: Sequence[Callback] = ()
-) -> Result:
-    """Run, and leave a run folder. An interrupted run is saved as far as it came. `callbacks` listen besides."""
-    plan = order.method.plan(order.problem, order.settings)
+@contextmanager
+def execution(
+    problem: Problem,
+    order: RunOrder,
+    directory: Path,
+    console: Console,
+    progress: Progress,
+    callbacks: Sequence[Callback] = (),
+) -> Iterator[dict[str, Any]]:
+    """Say what is about to run, and yield the arguments of `optimize` for it. Its live page ends with the block.
+
+    The run leaves a run folder; an interrupted one is saved as far as it came. `callbacks` listen besides.
+    """
+    plan = order.method.plan(problem, order.settings)
     for line in plan.lines:
         console.print(f"{order.method.name}: {escape(line)}", soft_wrap=True)
     options = order.method.options_of(order.settings)
     settings = {"options": options, "problem_options": dict(order.problem_settings)}
     settings = {name: value for name, value in settings.items() if value}
-    for line in advice.remarks(order.problem, plan.optimizer):
+    for line in advice.remarks(problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
     annotations = RunAnnotations(
         order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, order.within_seconds
     )
-    live = Live(directory, order.problem.name, order.method.name, order.command)
-    result = optimize(
-        order.problem,
-        plan,
-        None,
-        order.steps,
-        order.seconds,
-        order.seed,
-        [progress, live, *callbacks],
-        directory,
-        order.checkpoint_every,
-        annotations,
-    )
+    live = Live(directory, problem.name, order.method.name, order.command)
+    yield {
+        "problem": problem,
+        "estimator": plan,
+        "steps": order.steps,
+        "seconds": order.seconds,
+        "seed": order.seed,
+        "callbacks": [progress, live, *callbacks],
+        "run_directory": directory,
+        "checkpoint_every": order.checkpoint_every,
+        "annotations": annotations,
+    }
     live.clear()
-    return result
 
 
 def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarray | None] | None = None) -> str:

@@ -10,8 +10,10 @@ from __future__ import annotations
 import errno
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import metadata
+from typing import Any
 
 from unrender.app.cli import memory
 from unrender.app.cli.signals import ENVIRONMENT, INPUT, INTERRUPTED, WORDS, Signals
@@ -36,7 +38,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ended
     signals = Signals(process=is_process)
     try:
-        return _run(given, signals)
+        try:
+            with signals:
+                command = _command(given)
+                found = command()
+                sys.stdout.flush()
+            status = found if isinstance(found, int) else 0
+        except BaseException as error:
+            if (ended := _status_of(error, signals)) is None:
+                raise
+            status = ended
+        status = signals.status or status
+        return _complain(WORDS[status], status) if status in WORDS else status
     except Exception as error:
         if not memory.exhausted(error):
             raise
@@ -46,59 +59,49 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
 
 
-def _run(given: list[str], signals: Signals) -> int:
-    import typer
+def _command(given: list[str]) -> Callable[[], Any]:
+    """Return what carries out a command line."""
+    if given == ["doctor"]:  # which has something to say where the rest cannot even be imported
+        from unrender.app.cli.doctor import doctor
 
-    try:
-        with signals:
-            status = _execute(given)
-        status = signals.status or status
-    except (KeyboardInterrupt, typer.Abort):  # the latter is what Typer makes of the former
-        status = signals.status or INTERRUPTED
-    except BaseException:
-        if not signals.status:
-            raise
-        status = signals.status  # what the interrupt became on its way out of compiled code
-    return _complain(WORDS[status], status) if status in WORDS else status
+        return doctor
+    for argument in given:
+        encode_text(argument, "command line")
+    variant.prepare()  # before Dr.Jit is imported, which the rest of the command line does
+    from unrender.app.cli.app import app
+
+    return partial(app, given, prog_name="unrender", standalone_mode=False, obj=["unrender", *given])
 
 
-def _execute(given: list[str]) -> int:
+def _status_of(error: BaseException, signals: Signals) -> int | None:
+    """Say in one line why a command failed. Returns its exit status; None for an error of the program itself."""
     import typer
 
     # Typer may bring its own copy of click, so its errors are found from the one that typer exports.
     usage_error: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
-    try:
-        if given == ["doctor"]:  # which has something to say where the rest cannot even be imported
-            from unrender.app.cli.doctor import doctor
-
-            return doctor()
-        for argument in given:
-            encode_text(argument, "command line")
-        variant.prepare()  # before Dr.Jit is imported, which the rest of the command line does
-        from unrender.app.cli.app import app
-
-        status = app(given, prog_name="unrender", standalone_mode=False, obj=["unrender", *given])
-        sys.stdout.flush()
-        return status if isinstance(status, int) else 0
-    except VariantError as error:
-        return _complain(str(error), ENVIRONMENT)
-    except UnrenderError as error:
-        if limits.address_space() and memory.says_so(error):
-            return _out_of_memory(f"{error}: ")
-        return _complain(str(error), INPUT)
-    except usage_error as error:
+    match error:
+        case VariantError():
+            return _complain(str(error), ENVIRONMENT)
+        case UnrenderError():
+            if limits.address_space() and memory.says_so(error):
+                return _out_of_memory(f"{error}: ")
+            return _complain(str(error), INPUT)
+        case typer.Exit():
+            return error.exit_code
+        case typer.Abort() | KeyboardInterrupt():  # the former is what Typer makes of the latter
+            return signals.status or INTERRUPTED
+        case BrokenPipeError():
+            # Whoever read our output has gone; Python would complain once more when it flushes at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        case OSError():  # a name that is too long, a folder that may not be entered, a full disk
+            if error.errno in (errno.ENOMEM, errno.EAGAIN):
+                return _out_of_memory()
+            where = f"{error.filename}: " if error.filename else ""
+            return _complain(f"{where}{error.strerror or error}", INPUT)
+    if isinstance(error, usage_error):
         return _complain(error.format_message(), INPUT)  # pyright: ignore[reportAttributeAccessIssue]
-    except typer.Exit as end:
-        return end.exit_code
-    except BrokenPipeError:
-        # Whoever read our output has gone; Python would complain once more when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except OSError as error:  # a name that is too long, a folder that may not be entered, a full disk
-        if error.errno in (errno.ENOMEM, errno.EAGAIN):
-            return _out_of_memory()
-        where = f"{error.filename}: " if error.filename else ""
-        return _complain(f"{where}{error.strerror or error}", INPUT)
+    return signals.status or None  # what the interrupt became on its way out of compiled code
 
 
 def _out_of_memory(what: str = "") -> int:

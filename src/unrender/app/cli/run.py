@@ -84,7 +84,8 @@ def run(
     given, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
         with phases.phase("loading"):
-            from unrender.app.cli.execute import RunOrder, execute, introduce
+            from unrender.app.cli.execute import RunOrder, execution, introduce
+            from unrender.runs.optimize import optimize
 
             chosen, processes = _method(method_name), dealing.check(workers, compress, insecure)
             steps, seconds = _budget_settings(given, steps, seconds)
@@ -102,9 +103,10 @@ def run(
             introduce(console, opened, running)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
                 task = RunOrder(
-                    dealt, chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every, True
+                    chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every, True
                 )
-                result = execute(task, folder, console, progress)
+                with execution(dealt, task, folder, console, progress) as order:
+                    result = optimize(**order)
         finally:
             arguments.remove_if_empty(folder)
         conclude(console, opened, result, folder, progress)

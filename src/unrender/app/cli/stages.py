@@ -219,12 +219,13 @@ def _run_stage(
     run: StagesRun, index: int, values: Mapping[str, Any], console: Console, progress: Progress
 ) -> tuple[Problem, Result]:
     """Begin a stage, or go on with it."""
-    from unrender.app.cli.execute import RunOrder, execute, introduce
+    from unrender.app.cli.execute import RunOrder, execution, introduce
     from unrender.app.stages import stages_file
     from unrender.methods import method
     from unrender.runs import reopen as runs
     from unrender.runs.folder import schema
     from unrender.runs.live import Live
+    from unrender.runs.optimize import optimize
     from unrender.runs.resume import load_run, resume_run
 
     stages, stage = run.stages, run.stages.stages[index]
@@ -246,8 +247,9 @@ def _run_stage(
     last = index == len(stages.stages) - 1
     spp = run.options.final_spp or (None if last else 1)  # those of many views take minutes
     every = run.options.checkpoint_every
-    order = RunOrder(problem, chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every)
-    return problem, execute(order, folder, console, progress)
+    order = RunOrder(chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every)
+    with execution(problem, order, folder, console, progress) as arguments_of_run:
+        return problem, optimize(**arguments_of_run)
 
 
 def _read(stages: Stages) -> Whole:

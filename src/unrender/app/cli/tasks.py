@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from unrender.app.cli import arguments
-from unrender.app.cli.execute import RunOrder, execute
+from unrender.app.cli.execute import RunOrder, execution
 from unrender.app.distributed.cluster import prepare_worker
 from unrender.app.sweeps.pruning import RUNG_FILE, Pruning, read_rungs, stated_error
 from unrender.app.sweeps.record import RunOutcome
@@ -27,6 +27,7 @@ from unrender.runs.folder import reader
 from unrender.runs.folder.lock import holder
 from unrender.runs.folder.schema import CHECKPOINTS, ENDED, RECORD
 from unrender.runs.live import Live
+from unrender.runs.optimize import optimize
 from unrender.runs.progress import Progress
 from unrender.runs.result import PRUNED
 from unrender.runs.resume import load_run, resume_run
@@ -105,7 +106,7 @@ def carry_out(
     progress: Progress,
     callbacks: Sequence[Callback] = (),
 ) -> RunOutcome:
-    """One run, from where an earlier attempt left it. Raises `InputError` as `execute` and `resume_run` do."""
+    """One run, from where an earlier attempt left it. Raises `InputError` as `optimize` and `resume_run` do."""
     folder = Path(job.folder, task.name)
     _wait_until_free(folder)
     record = reader.read_run_record(folder) if (folder / RECORD).is_file() else None
@@ -116,10 +117,11 @@ def carry_out(
         if record is None or record.steps == 0 or not _resumed(folder, problem, listeners, record.command):
             chosen = method(task.method)
             order = RunOrder(
-                problem, chosen, task.settings, task.steps, task.seconds, task.seed, task.final_spp, job.command,
+                chosen, task.settings, task.steps, task.seconds, task.seed, task.final_spp, job.command,
                 job.problem_settings,
             )  # fmt: skip
-            execute(order, folder, console, progress, listeners[1:])
+            with execution(problem, order, folder, console, progress, listeners[1:]) as arguments_of_run:
+                optimize(**arguments_of_run)
         return outcome(folder, task, time.perf_counter() - started)
     return outcome(folder, task, 0.0)
 

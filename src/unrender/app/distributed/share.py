@@ -13,7 +13,7 @@ from unrender.app.distributed.assignment import total
 from unrender.app.distributed.messages import Batch, Call, Difference, Pair, Pilot, References, Reply
 from unrender.core import arrays, trees
 from unrender.core.trees import Tree
-from unrender.estimators.sample_groups import TREES, GradientRequest, estimate_frame, leave_one_out_groups
+from unrender.estimators.sample_groups import TREES, GradientRequest, leave_one_out_groups
 from unrender.images.base import PairRequest
 from unrender.images.recursive_control_variate import RecursiveControlVariateState
 from unrender.pixels.base import MiniBatch
@@ -55,7 +55,7 @@ class ViewShare:
             sample = self._sample(call.batch)
             frames = [(-1, PixelBatch(self.problem, sample))]
             request = replace(request, batch=MiniBatch(sample, tangents=self._tree(call.tangents)))
-        parts = [estimate_frame(self.problem, request, frame, call.key.fold(max(index, 0))) for index, frame in frames]
+        parts = [request.estimate_frame(self.problem, frame, call.key.fold(max(index, 0))) for index, frame in frames]
         kept = tuple(part.kept for part in parts)
         found = {name: [getattr(part, name) for part in parts] for name in TREES}
         arrays.evaluate(kept, found, [part.loss for part in parts])

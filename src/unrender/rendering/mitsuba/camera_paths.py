@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -43,61 +44,62 @@ class CameraPaths:
         pair: bool,
         geometry: Any = None,
     ):
-        self._kernel, self._scene, self._tables, self._sampler = kernel, scene, tables, sampler
-        self._ray, self._weight, self._pair, self._geometry = ray, weight, pair, geometry
+        self._kernel, self._pair, self._geometry = kernel, pair, geometry
+        self.scene, self.tables, self.sampler, self.ray, self.weight = scene, tables, sampler, ray, weight
 
-    def radiance(self) -> tuple[Any, Any]:
-        """Return the weighted radiance per lane of the current state and, for a pair, of the previous state, else None.
+    def primal(self) -> Callable[[], tuple[Any, Any]]:
+        """Return the kernel, ready to trace the paths: `weighted` makes the sensor's radiance of what it returns."""
+        return self._sample(dr.ADMode.Primal)
+
+    def weighted(self, L: Any, Lₚ: Any) -> tuple[Any, Any]:
+        """Return the weighted radiance per lane of the current and, for a pair, of the previous state, else None.
 
         A lane that is not finite in one state is NaN in both, so both images drop the same samples.
         """
-        L, Lₚ = self._sample(dr.ADMode.Primal)
         if Lₚ is None:
-            return L * self._weight, None
-        return dropped_together(L * self._weight, Lₚ * self._weight)
+            return L * self.weight, None
+        return dropped_together(L * self.weight, Lₚ * self.weight)
 
-    def backward(self, *states: tuple[Any, Any]) -> None:
-        """Replay the paths in backward mode.
+    def backward(self, *states: tuple[Any, Any]) -> Callable[[], Any]:
+        """Return the kernel, ready to replay the paths backward.
 
         Args:
             states: (derivative of the loss by the weighted radiance, weighted radiance of the primal pass) per lane, for the current
                 and, for a pair, the previous state. The derivative is None if the state's gradient is not requested.
         """
-        replay = [ReplayState(None if δ is None else δ * self._weight, self._replayed(L)) for δ, L in states]
-        self._sample(dr.ADMode.Backward, tuple(replay), is_finite(*(L for _, L in states)))
+        replay = [ReplayState(None if δ is None else δ * self.weight, self._replayed(L)) for δ, L in states]
+        return self._sample(dr.ADMode.Backward, tuple(replay), is_finite(*(L for _, L in states)))
 
-    def forward(self, radiance: Any) -> Any:
-        """Return the derivative of the weighted radiance along the tangents, per lane. `radiance` is that of the primal pass."""
-        δ, _ = self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),), is_finite(radiance))
-        return δ * self._weight
+    def forward(self, radiance: Any) -> Callable[[], tuple[Any, Any]]:
+        """Return the kernel, ready to replay the paths forward. It returns the derivative along the tangents, yet to be weighted.
 
-    def connections(self, radiance: Any, weights: Any, noise: Any, bounces: int) -> tuple[Any, Any]:
-        """Return values and emitters of each lane's emitter-sampling connections, see `ConnectionRecord`. `radiance` is that of the
-        primal pass."""
+        `radiance` is that of the primal pass.
+        """
+        return self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),), is_finite(radiance))
+
+    def connections(self, radiance: Any, weights: Any, noise: Any, bounces: int) -> Callable[[], ConnectionRecord]:
+        """Return the kernel, ready to record each lane's connections to emitters. `radiance`: as for `forward`."""
         assert isinstance(self._kernel, PathPair)
-        record = ConnectionRecord(weights * self._weight, noise * self._weight, bounces)
+        record = ConnectionRecord(weights * self.weight, noise * self.weight, bounces)
         replay = ReplayState(None, self._replayed(radiance))
-        active = is_finite(radiance)
-        self._kernel.record_connections(self._scene, self._tables, self._sampler, self._ray, replay, record, active)
-        return record.values, record.emitters
+        camera = self.scene, self.tables, self.sampler, self.ray
+        return functools.partial(self._kernel.record_connections, *camera, replay, record, is_finite(radiance))
 
-    def vertices(self) -> Any:
-        """Return the number of vertices of each lane's path."""
-        return self._kernel.vertices(self._scene, self._tables, self._sampler, self._ray, self._geometry)
-
-    def recorded(self, tracer: Callable[..., Any]) -> Any:
-        """Return the result of another tracer for the same rays: a function of scene, tables, sampler, rays and their weights."""
-        with dr.suspend_grad():
-            return tracer(self._scene, self._tables, self._sampler, self._ray, self._weight)
+    def vertices(self) -> Callable[[], Any]:
+        """Return the kernel, ready to count the vertices of each lane's path."""
+        camera = self.scene, self.tables, self.sampler, self.ray
+        return functools.partial(self._kernel.vertices, *camera, self._geometry)
 
     def _replayed(self, radiance: Any) -> Any:
         """Return the unweighted radiance of the kernel, which is the remaining radiance at the start of a replay; 0 for dropped
         samples."""
-        return dr.select((self._weight != 0) & is_finite(radiance), radiance / self._weight, 0)
+        return dr.select((self.weight != 0) & is_finite(radiance), radiance / self.weight, 0)
 
-    def _sample(self, mode: dr.ADMode, replay: tuple[ReplayState, ...] = (), active: Any = True) -> tuple[Any, Any]:
-        arguments = mode, self._scene, self._tables, self._sampler, self._ray, replay, self._pair
-        return self._kernel.sample(*arguments, geometry=self._geometry, active=active)
+    def _sample(
+        self, mode: dr.ADMode, replay: tuple[ReplayState, ...] = (), active: Any = True
+    ) -> Callable[[], tuple[Any, Any]]:
+        camera = self.scene, self.tables, self.sampler, self.ray
+        return functools.partial(self._kernel.sample, mode, *camera, replay, self._pair, self._geometry, active)
 
 
 def is_finite(*states: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -34,10 +34,11 @@ class FrozenFunction:
     Args:
         function: function of device arrays and Mitsuba objects. It may be called again after it failed.
         recordable: whether to record it at all.
+        keys: the parameters that an error about a picture without derivatives names.
     """
 
-    def __init__(self, function: Callable[..., Any], recordable: bool = True):
-        self._function = function
+    def __init__(self, function: Callable[..., Any], recordable: bool = True, keys: Collection[str] = ()):
+        self._function, self._keys = function, keys
         self._tracing = _Tracing()
         self._frozen: Callable[..., Any] | None = _recorder(function, self._tracing) if recordable else None
         self._recorded, self._failures = False, 0
@@ -47,19 +48,22 @@ class FrozenFunction:
         """Return the function's result. `prepare` is called before each attempt, to undo the effects of a failed one."""
         prepare()
         if self._frozen is None:
-            return self._function(*arguments)
+            with _naming(self._keys):
+                return self._function(*arguments)
         if dr.thread_count() != self._threads:
             # Recorded reductions have one slot per thread. A replay with more threads would write out of bounds.
             self._threads, self._recorded = dr.thread_count(), False
             self._frozen = _recorder(self._function, self._tracing)
         self._tracing.happened = False
         try:
-            result = _without_garbage_collection(self._frozen, *arguments)
+            with _without_garbage_collection():
+                result = self._frozen(*arguments)
         except Exception as error:
             if self._recorded and not self._tracing.happened:
                 raise
             prepare()
-            result = self._function(*arguments)  # an error of the function itself propagates
+            with _naming(self._keys):
+                result = self._function(*arguments)  # an error of the function itself propagates
             self._failures += 1
             self._frozen = _recorder(self._function, self._tracing) if self._failures < _ATTEMPTS else None
             if self._frozen is None:
@@ -86,19 +90,20 @@ def _recorder(function: Callable[..., Any], tracing: _Tracing) -> Callable[..., 
     return dr.freeze(traced)
 
 
-def _without_garbage_collection(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function with garbage collection disabled: arrays that die during a recording abort the process."""
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Disable garbage collection: arrays that die during a recording abort the process."""
     enabled = gc.isenabled()
     gc.disable()
     try:
-        return function(*arguments)
+        yield
     finally:
         if enabled:
             gc.enable()
 
 
 @contextmanager
-def naming(keys: Iterable[str]) -> Iterator[None]:
+def _naming(keys: Collection[str]) -> Iterator[None]:
     """Turn Dr.Jit's error about an image that depends on no parameter into an `InputError` that names the parameters."""
     try:
         yield

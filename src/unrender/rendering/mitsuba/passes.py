@@ -1,6 +1,6 @@
 """Kernel launches that serve a sample request, one class each: the traced scene, its tables, and the result.
 
-A pass builds the function that is recorded. Its arguments after the first seven belong to the pass, see `trace`.
+A pass builds the function that is recorded. Its arguments after the first seven belong to the pass, see `call`.
 """
 
 from __future__ import annotations
@@ -114,19 +114,24 @@ class Pass(ABC):
                     of_lane = film.per_sample(films.which, size.spp, size.pixels)
                     tables = {**tables, "camera": dr.gather(mi.UInt32, tables["camera"], of_lane)}
                 paths = CameraPaths(kernel, scene, tables, numbers, ray, ray_weight, self.pair, assembly)
-                return self.trace(paths, size, *own)
+                trace = self.call(paths, size, *own)
+                return self.result(paths, trace())
 
         return launch
 
     @abstractmethod
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Trace the camera rays.
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        """Return the call that traces the camera rays.
 
         Args:
             paths: paths that begin on the rays.
             size: constants that the kernel is compiled for.
             own: the pass's own arrays.
         """
+
+    def result(self, paths: CameraPaths, found: Any) -> Any:
+        """Return what the launch returns, from what `call` found."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -138,9 +143,11 @@ class ImagePass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {}
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Return the radiance of each lane."""
-        return paths.radiance()[0]
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        return paths.primal()
+
+    def result(self, paths: CameraPaths, found: Any) -> Any:
+        return paths.weighted(*found)[0]
 
 
 @dataclass(frozen=True)
@@ -152,9 +159,11 @@ class ImagePairPass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {**pair.tables(), "delta": delta}
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Return the radiance of each lane for the current and the previous state."""
-        return paths.radiance()
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        return paths.primal()
+
+    def result(self, paths: CameraPaths, found: Any) -> Any:
+        return paths.weighted(*found)
 
 
 @dataclass(frozen=True)
@@ -204,8 +213,8 @@ class MovedPairPass(Pass):
 
         return launch
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Raise `NotImplementedError`: `function` traces both states."""
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        """Never called: `function` traces both."""
         raise NotImplementedError
 
 
@@ -215,10 +224,10 @@ class AdjointPass(Pass):
 
     previous: bool = False
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> None:
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         """Replay the paths backward. `own`: radiance of the primal pass, and the film's weights."""
         radiance, weights = own
-        paths.backward((film.film_adjoint(weights, size.spp, size.pixels), radiance))
+        return paths.backward((film.film_adjoint(weights, size.spp, size.pixels), radiance))
 
 
 @dataclass(frozen=True)
@@ -235,13 +244,13 @@ class AdjointPairPass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {**pair.tables(), "delta": delta}
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> None:
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         """Replay the paths backward. `own`: radiance and weights of the current, then of the previous state, without its weights unless
         `both`."""
         radiance, weights, radianceₚ, *rest = own
         δL = film.film_adjoint(weights, size.spp, size.pixels)
         δLₚ = film.film_adjoint(rest[0], size.spp, size.pixels) if self.both else None
-        paths.backward((δL, radiance), (δLₚ, radianceₚ))
+        return paths.backward((δL, radiance), (δLₚ, radianceₚ))
 
 
 @dataclass(frozen=True)
@@ -255,10 +264,13 @@ class TangentPass(Pass):
     combined: tuple[float, ...] | None = None
     needs_tangents: ClassVar[bool] = True
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Return the squared derivative of each lane. `own`: radiance of the primal pass."""
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        """Replay the paths forward. `own`: radiance of the primal pass."""
         (radiance,) = own
-        derivative = paths.forward(radiance)
+        return paths.forward(radiance)
+
+    def result(self, paths: CameraPaths, found: Any) -> Any:
+        derivative = found[0] * paths.weight
         return dr.square(
             derivative if self.combined is None else mi.Spectrum(dr.dot(mi.Spectrum(*self.combined), derivative))
         )
@@ -275,12 +287,14 @@ class ConnectionsPass(Pass):
     bounces: int
     needs_tangents: ClassVar[bool] = True
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Return values and emitters of the connections. `own`: radiance of the primal pass, image weights of derivatives, and of
-        radiance."""
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        """Record the connections. `own`: radiance of the primal pass, image weights of derivatives, and of radiance."""
         radiance, *image_weights = own
         weights, noise = (film.film_adjoint(each, size.spp, size.pixels) for each in image_weights)
         return paths.connections(radiance, weights, noise, self.bounces)
+
+    def result(self, paths: CameraPaths, found: Any) -> Any:
+        return found.values, found.emitters
 
 
 @dataclass(frozen=True)
@@ -290,9 +304,12 @@ class VerticesPass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
         return {}
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        return paths.vertices()
+
+    def result(self, paths: CameraPaths, found: Any) -> Any:
         """Return the number of vertices in each channel of a spectrum, to be developed like radiance."""
-        return mi.Spectrum(paths.vertices())
+        return mi.Spectrum(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,8 +367,8 @@ class PosesPass(Pass):
 
         return launch
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Raise `NotImplementedError`: `function` traces all copies."""
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        """Never called: `function` traces all copies."""
         raise NotImplementedError
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import drjit as dr
@@ -18,7 +18,7 @@ from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor, no_tangents
 from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
-from unrender.rendering.mitsuba.frozen import FrozenFunction, naming
+from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
@@ -174,7 +174,7 @@ class MitsubaSession:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
             return Rendering(self.image_batch(stacked, request), None, None)
         self.set_parameters(parameters)
-        radiance = self.run(ImagePass(), request)
+        radiance = self.kernel(ImagePass(), request)()
         dr.eval(radiance)
         return Rendering(self.develop(radiance, request), None, Paths(request, radiance))
 
@@ -201,12 +201,12 @@ class MitsubaSession:
         at = {key: tensor(values[0]) for key, values in parameters.items()}
         if self._posed is None or self._attached:
             self.set_parameters(at)
-            radiance = self.run(ImagePass(), request)
+            radiance = self.kernel(ImagePass(), request)()
         else:
             detach_all()  # tangents that come and go would make Dr.Jit record kernels again
             self._pair.loaded().set_parameters({key: at[key] for key in self._keys if key in at})
             numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
-            radiance = self.run(PosesPass(self._posed, count), request, tensor(numbers).array)
+            radiance = self.kernel(PosesPass(self._posed, count), request)(tensor(numbers).array)
         dr.eval(radiance)
         return self.dropped.develop(radiance, request.spp, 1, (count, self.count(request), 3)).array
 
@@ -216,14 +216,14 @@ class MitsubaSession:
         # A virtual call reaches both scenes' objects, and its adjoint accumulates gradients in all that are attached.
         self.set_parameters(previous, previous=True, attach=request.both_gradients)
         if space == "primary" and not (self._geometric and self._related):
-            radiance = self.run(ImagePass(), request)
-            radiance_previous = self.run(ImagePass(previous=True), request)
+            radiance = self.kernel(ImagePass(), request)()
+            radiance_previous = self.kernel(ImagePass(previous=True), request)()
         else:
             task: Pass = ImagePairPass()
             if self._geometric:
                 tracer = self._moved_kernel if space == "path" else self._unrelated_kernel
                 task = MovedPairPass(self._moving, tracer, self._still_sensors and self._only_meshes)
-            radiance, radiance_previous = self.run(task, request)
+            radiance, radiance_previous = self.kernel(task, request)()
         dr.eval(radiance, radiance_previous)
         images = self.develop(radiance, request), self.develop(radiance_previous, request)
         return Rendering(*images, Paths(request, radiance, radiance_previous, space, previous))
@@ -236,11 +236,11 @@ class MitsubaSession:
             # The collisions of a pair in a medium depend on both states, and so does its replay.
             self.set_parameters(parameters)
             self.set_parameters(paths.previous, previous=True, attach=paths.request.both_gradients)
-            self.run(AdjointPairPass(both=False), paths.request, paths.radiance, weights, paths.radiance_previous)
+            self.kernel(AdjointPairPass(both=False), paths.request)(paths.radiance, weights, paths.radiance_previous)
             return self._pair.loaded().take_gradients()
         self.set_parameters(parameters)
         if self._replays:
-            self.run(AdjointPass(), paths.request, paths.radiance, weights)
+            self.kernel(AdjointPass(), paths.request)(paths.radiance, weights)
         else:
             self._pair.clear_gradients()
         return self._gradients(paths.request, weights)
@@ -258,14 +258,14 @@ class MitsubaSession:
             if self._replays:
                 radiance = paths.radiance_previous
                 if paths.space == "path":  # the pair's paths differ from those that `prb` replays
-                    radiance = self.run(ImagePass(previous=True), request)
+                    radiance = self.kernel(ImagePass(previous=True), request)()
                     dr.eval(radiance)
-                self.run(AdjointPass(previous=True), request, radiance, weights_previous)
+                self.kernel(AdjointPass(previous=True), request)(radiance, weights_previous)
             else:
                 self._pair.clear_gradients()
             return gradient, self._gradients(request, weights_previous, previous=True)
         states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
-        self.run(AdjointPairPass(), request, *states)
+        self.kernel(AdjointPairPass(), request)(*states)
         self.dropped.read()
         return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
 
@@ -282,7 +282,7 @@ class MitsubaSession:
         rest = {key: value for key, value in parameters.items() if key not in self._poses}
         self._pair.loaded().set_tangents(rest, tangents, self._attached)
         self._set_poses(parameters)
-        squares = self.run(TangentPass(combined), paths.request, paths.radiance)
+        squares = self.kernel(TangentPass(combined), paths.request)(paths.radiance)
         dr.eval(squares)
         moments = self.develop(squares, paths.request)
         if self._boundary is not None:
@@ -305,14 +305,14 @@ class MitsubaSession:
         self._check_keys(parameters)
         scene.set_tangents(parameters, tangents, self._attached)
         task = ConnectionsPass(max(1, self._light.max_depth - 1))
-        connections = self.run(task, paths.request, paths.radiance, weights, noise)
+        connections = self.kernel(task, paths.request)(paths.radiance, weights, noise)
         dr.eval(connections)
         return connection_moments(scene.scene, *connections)
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> mi.TensorXf:
         self.set_parameters(parameters)
         request = replace(request, groups=1)
-        counts = self.run(VerticesPass(), request)
+        counts = self.kernel(VerticesPass(), request)()
         dr.eval(counts)
         return self.develop(counts, request)[0]
 
@@ -366,8 +366,8 @@ class MitsubaSession:
         size = self._pair.resolutions[request.sensor] if request.pixels is None else (self.count(request),)
         return self.dropped.develop(radiance, request.spp, request.groups, (*size, 3))
 
-    def run(self, task: Pass, request: SampleRequest, *own: Any) -> Any:
-        """Launch the kernel of a pass for a request. It is traced once and replayed later."""
+    def kernel(self, task: Pass, request: SampleRequest) -> Callable[..., Any]:
+        """Return the kernel of a pass for a request, a function of the pass's own arrays. It is traced once and replayed later."""
         pair = self._pair
         size = LaunchSize(request.sensor, request.spp, self.count(request), self._light.hide_emitters)
         several = request.sensors is not None
@@ -379,7 +379,7 @@ class MitsubaSession:
         posed = None if isinstance(task, PosesPass) else self._posed_scene(task.previous)
         if key not in self._functions:
             traced = task.function(self._kernel_of(task), self._sampler, size, posed)
-            self._functions[key] = FrozenFunction(traced, self._recordable)
+            self._functions[key] = FrozenFunction(traced, self._recordable, self._attached)
         share_addresses()
         scenes = [loaded.scene for loaded in loaded_scenes()]
         films = pair.films(request)
@@ -393,8 +393,7 @@ class MitsubaSession:
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
         prepare: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
-        with naming(self._attached):
-            return self._functions[key](prepare, scene, scenes, tables, seeds, request.pixels, films, rays, *own)
+        return partial(self._functions[key], prepare, scene, scenes, tables, seeds, request.pixels, films, rays)
 
     def _kernel_of(self, task: Pass) -> Kernel:
         return self._geometry_kernel if self._geometric and not isinstance(task, PosesPass) else self._path_kernel

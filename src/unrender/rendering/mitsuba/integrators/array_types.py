@@ -9,7 +9,12 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
+import drjit as dr
+
 Float: TypeAlias = Any
 Bool: TypeAlias = Any
 UInt32: TypeAlias = Any
 Spectrum: TypeAlias = Any
+
+while_loop: Any = dr.while_loop
+"""Its stub knows loops of one variable alone."""

@@ -11,13 +11,14 @@ Symbols as in `path.py`; a subscript (ₚ) is the previous state.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32, while_loop
 from unrender.rendering.mitsuba.integrators.base import ScatteringVertex
 from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
@@ -100,7 +101,14 @@ class MovedPair:
             states.append(PathState(mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), camera_ray, hit, last, active))
         path = PairState(mi.UInt32(0), states[0], states[1], same)
         if self.max_depth > 1:
-            path = self._trace(scenes, tables, path, sampler, choices)
+            path, *_ = while_loop(
+                (path, sampler, choices),
+                lambda path, sampler, choices: (
+                    (path.current.scatters() | path.previous.scatters()) & (path.depth + 1 < self.max_depth)
+                ),
+                functools.partial(self._bounce, scenes, tables),
+                label="moved path pair",
+            )
 
         # Only emission contributes where paths of maximum length end, and where paths leave the scene.
         def end(path: PairState) -> tuple[Spectrum, Spectrum]:
@@ -114,20 +122,9 @@ class MovedPair:
         ends: Any = path.current.active | path.previous.active
         return dr.if_stmt((path,), ends, end, over, label="ends of moved path pair")
 
-    @dr.syntax
-    def _trace(
-        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: PairState, sampler: Any, choices: Any
-    ) -> PairState:
-        while dr.hint(
-            (path.current.scatters() | path.previous.scatters()) & (path.depth + 1 < self.max_depth),
-            label="moved path pair",
-        ):
-            path = self._bounce(scenes, tables, path, sampler, choices)
-        return path
-
     def _bounce(
         self, scenes: tuple[Any, Any], tables: Mapping[str, Any], path: PairState, sampler: Any, choices: Any
-    ) -> PairState:
+    ) -> tuple[PairState, Any, Any]:
         """Process the current vertices of both paths, and sample their next segments."""
         scene, sceneₚ = scenes
         now, before = path.current, path.previous
@@ -178,7 +175,7 @@ class MovedPair:
         )
         path.same = step.same
         path.depth += 1
-        return path
+        return path, sampler, choices
 
     def _meet(self, tables: Mapping[str, Any], path: PairState) -> tuple[Any, Any]:
         """Return the current vertices of both paths. If they coincide, the previous state's is a copy with its own incident direction."""

@@ -6,6 +6,7 @@ quantities that differ between the states are lists, the current state first. Th
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +16,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.film import independent
 from unrender.rendering.mitsuba.integrators import emitters, specular
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32, while_loop
 from unrender.rendering.mitsuba.integrators.base import (
     KEEP,
     ConnectionRecord,
@@ -126,7 +127,7 @@ class PathPair:
     ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane, see `PathKernel.sample`. The "delta" entry of `tables` is used with `changing_delta`."""
         context = PathContext(mode, scene, tables, replay, pair, geometry)
-        path = self._trace(context, self._begin(context, ray, active), sampler)
+        path, _ = while_loop(**self._loop(context, self._begin(context, ray, active), sampler))
         if path.branches:
             self._follow_branches(context, path, sampler)
         return path.δL if context.forward else path.L[0], path.L[1] if pair else None
@@ -140,7 +141,8 @@ class PathPair:
         geometry: Any = None,
     ) -> Float:
         context = PathContext(dr.ADMode.Primal, scene, tables, (), False, geometry)
-        return mi.Float(self._trace(context, self._begin(context, ray), sampler).depth)
+        path, _ = while_loop(**self._loop(context, self._begin(context, ray), sampler))
+        return mi.Float(path.depth)
 
     def record_connections(
         self,
@@ -151,10 +153,11 @@ class PathPair:
         replay: ReplayState,
         connections: ConnectionRecord,
         active: Bool | bool = True,
-    ) -> None:
-        """Replay the paths in forward mode, and record the contributions of emitter-sampling connections."""
+    ) -> ConnectionRecord:
+        """Replay the paths in forward mode, and return the contributions of emitter-sampling connections."""
         context = PathContext(dr.ADMode.Forward, scene, tables, (replay,), False, None, connections)
-        self._trace(context, self._begin(context, ray, active), sampler)
+        while_loop(**self._loop(context, self._begin(context, ray, active), sampler))
+        return connections
 
     def _begin(self, context: PathContext, ray: mi.RayDifferential3f, active: Bool | bool = True) -> PathState:
         return PathState(
@@ -170,14 +173,17 @@ class PathPair:
             branches=[BranchVertex.nowhere(mi.Ray3f(dr.detach(ray)))] if self._branches_off(context) else [],
         )
 
-    @dr.syntax
-    def _trace(self, context: PathContext, path: PathState, sampler: Any) -> PathState:
-        label = f"path pair ({context.mode.name})"
-        while dr.hint(path.active, max_iterations=self.max_depth, label=label):
-            path = self._bounce(context, path, sampler)
-        return path
+    def _loop(self, context: PathContext, path: PathState, sampler: Any) -> dict[str, Any]:
+        """Return the arguments of the `dr.while_loop` over the segments of the paths; it returns path and sampler."""
+        return {
+            "state": (path, sampler),
+            "cond": lambda path, sampler: path.active,
+            "body": functools.partial(self._bounce, context),
+            "max_iterations": self.max_depth,
+            "label": f"path pair ({context.mode.name})",
+        }
 
-    def _bounce(self, context: PathContext, path: PathState, sampler: Any) -> PathState:
+    def _bounce(self, context: PathContext, path: PathState, sampler: Any) -> tuple[PathState, Any]:
         """Trace one segment and process the vertex at its end."""
         si = context.geometry.ray_intersect(
             path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active
@@ -217,7 +223,7 @@ class PathPair:
         active_next &= ~roulette | (sampler.next_1d() < q)
         path.depth[si.is_valid()] += 1
         path.active = active_next
-        return path
+        return path, sampler
 
     def _sample_emitter(
         self,
@@ -352,6 +358,7 @@ class PathPair:
             path = self._begin(primal, ray)
             path.depth, path.η, path.active = branch.depth + 1, mi.Float(branch.η), mi.Bool(active)
             path.last = vertex
-            return self._trace(primal, path, numbers).L[0]
+            path, _ = while_loop(**self._loop(primal, path, numbers))
+            return path.L[0]
 
         return trace

@@ -6,6 +6,7 @@ medium. Index-matched boundaries are not vertices.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.film import independent
 from unrender.rendering.mitsuba.integrators import emitters, specular, tracking
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, while_loop
 from unrender.rendering.mitsuba.integrators.base import (
     KEEP,
     ReplayState,
@@ -102,7 +103,7 @@ class VolumePair:
         start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(active))
         context = VolumeContext(start, mode, scene, tables, replay, pair)
         noise = None if context.primal else independent(sampler, dr.width(ray))
-        path = self._trace(context, self._begin(context), sampler, noise)
+        path, _, noise = while_loop(**self._loop(context, self._begin(context), sampler, noise))
         if context.primal:
             return path.L[0], path.L[1] if pair else None
         if self.differentiate_media:
@@ -123,7 +124,8 @@ class VolumePair:
         camera_medium: Any = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
         start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(True))
         context = VolumeContext(start, dr.ADMode.Primal, scene, tables, (), False)
-        return mi.Float(self._trace(context, self._begin(context), sampler, None).depth)
+        path, *_ = while_loop(**self._loop(context, self._begin(context), sampler, None))
+        return mi.Float(path.depth)
 
     def _begin(self, context: VolumeContext) -> VolumePathState:
         start, count = context.start, context.state_count
@@ -141,15 +143,18 @@ class VolumePair:
             active=mi.Bool(start.active),
         )
 
-    @dr.syntax
-    def _trace(self, context: VolumeContext, path: VolumePathState, sampler: Any, noise: Any) -> VolumePathState:
-        """Trace paths from `context.start` on, or replay them."""
-        label = f"volume pair ({context.mode.name})"
-        while dr.hint(path.active, label=label):
-            path = self._bounce(context, path, sampler, noise)
-        return path
+    def _loop(self, context: VolumeContext, path: VolumePathState, sampler: Any, noise: Any) -> dict[str, Any]:
+        """Return the arguments of the `dr.while_loop` over the segments from `context.start` on; it returns path, sampler and noise."""
+        return {
+            "state": (path, sampler, noise),
+            "cond": lambda path, sampler, noise: path.active,
+            "body": functools.partial(self._bounce, context),
+            "label": f"volume pair ({context.mode.name})",
+        }
 
-    def _bounce(self, context: VolumeContext, path: VolumePathState, sampler: Any, noise: Any) -> VolumePathState:
+    def _bounce(
+        self, context: VolumeContext, path: VolumePathState, sampler: Any, noise: Any
+    ) -> tuple[VolumePathState, Any, Any]:
         """Trace one segment and process the vertex at its end."""
         si = context.scene.ray_intersect(
             path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active
@@ -190,7 +195,7 @@ class VolumePair:
         continues = vertex.scatters | (vertex.meets & (vertex.may_scatter | direction.null))
         path.active = continues & carries_light(path.β) & (~roulette | (sampler.next_1d() < q))
         path.depth[moved] += 1
-        return path
+        return path, sampler, noise
 
     def _fly(
         self, context: VolumeContext, path: VolumePathState, si: mi.SurfaceInteraction3f, sampler: Any, noise: Any
@@ -316,7 +321,7 @@ class VolumePair:
         if self.radiance_field:
             path.L = [mi.Spectrum(1) for _ in path.L]  # The coefficient below is the emission, so no path is needed.
         else:
-            path = self._trace(primal, path, noise, None)
+            path, noise, _ = while_loop(**self._loop(primal, path, noise, None))
         inverse_probability = point.inverse_probability
         mei = tracking.medium_interaction(point.ray, point.t)
         with dr.resume_grad():

@@ -95,7 +95,7 @@ class CachingSession(SessionWrapper):
         if not self._fits(request):
             return self._inner.image(parameters, request)
         self._inner.set_parameters(parameters)
-        vertices = self._inner.run(self._task, request)
+        vertices = self._inner.kernel(self._task, request)()
         (radiance,) = self._radiance(vertices, (False,), request)
         paths = Paths(request, radiance, vertices=vertices, keys=self._keys)
         return Rendering(self._inner.develop(radiance, request), None, self._registered(paths))
@@ -109,7 +109,7 @@ class CachingSession(SessionWrapper):
             return replace(rendering, images=self.image(current, request).images)
         self._inner.set_parameters(current)
         self._inner.set_parameters(previous, previous=True, attach=request.both_gradients)
-        vertices = self._inner.run(self._task, request)
+        vertices = self._inner.kernel(self._task, request)()
         radiances = self._radiance(vertices, (False, True), request)
         images, before = (self._inner.develop(radiance, request) for radiance in radiances)
         paths = Paths(request, radiances[0], radiances[1], space, previous, vertices, self._keys)

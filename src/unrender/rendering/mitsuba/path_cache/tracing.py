@@ -10,7 +10,8 @@ Row r contains the emission that segment r hits and the emitter-sampling connect
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +20,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.camera_paths import CameraPaths
 from unrender.rendering.mitsuba.integrators import emitters
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32, while_loop
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex, carries_light
 from unrender.rendering.mitsuba.integrators.path import ROULETTE_FLOOR
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
@@ -81,14 +82,16 @@ class TracePass(Pass):
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> dict[str, Any]:
         return self.lookups.tables
 
-    def trace(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Any:
-        """Return the recorded vertices of the paths."""
-        return paths.recorded(self._trace)
+    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
+        context = PathContext(dr.ADMode.Primal, paths.scene, paths.tables, (), False)
+        lanes = paths.sampler.wavefront_size()  # a sensor's rays may all be equal, of width 1
+        record = _Record(self._empty(lanes), lanes, mi.Color3f(paths.weight))
+        return functools.partial(self._trace, context, record, paths.ray, paths.sampler)
 
-    def _trace(self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: Any, weight: Any) -> dict[str, Any]:
-        context = PathContext(dr.ADMode.Primal, scene, tables, (), False)
-        lanes = sampler.wavefront_size()  # a sensor's rays may all be equal, of width 1
-        record = _Record(self._empty(lanes), lanes, mi.Color3f(weight))
+    def result(self, paths: CameraPaths, found: Any) -> Any:
+        return found
+
+    def _trace(self, context: PathContext, record: _Record, ray: Any, sampler: Any) -> dict[str, Any]:
         state = _State(
             ray=mi.Ray3f(dr.detach(ray)),
             depth=mi.UInt32(0),
@@ -98,7 +101,13 @@ class TracePass(Pass):
             last=ScatteringVertex(dr.zeros(mi.SurfaceInteraction3f), mi.Float(1), mi.Bool(True)),
             active=mi.Bool(True),
         )
-        self._loop(context, record, state, sampler)
+        while_loop(
+            (state, sampler),
+            lambda state, sampler: state.active,
+            functools.partial(self._bounce, context, record),
+            max_iterations=self.depth,
+            label="cached paths",
+        )
         return record.arrays
 
     def _empty(self, lanes: int) -> dict[str, Any]:
@@ -115,12 +124,7 @@ class TracePass(Pass):
         dr.make_opaque(record)
         return record
 
-    @dr.syntax
-    def _loop(self, context: PathContext, record: _Record, state: _State, sampler: Any) -> None:
-        while dr.hint(state.active, max_iterations=self.depth, label="cached paths"):
-            state = self._bounce(context, record, state, sampler)
-
-    def _bounce(self, context: PathContext, record: _Record, path: _State, sampler: Any) -> _State:
+    def _bounce(self, context: PathContext, record: _Record, path: _State, sampler: Any) -> tuple[_State, Any]:
         """Trace one segment and the vertex at its end. It draws the random numbers of `PathPair`, so equal seeds give equal paths."""
         scene, tables, ctx = context.scene, context.tables, context.bsdf_ctx
         si = scene.ray_intersect(path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active)
@@ -169,7 +173,7 @@ class TracePass(Pass):
         active_next &= ~roulette | (sampler.next_1d() < q)
         path.depth[si.is_valid()] += 1
         path.active = active_next
-        return path
+        return path, sampler
 
     def _connect(
         self,
