@@ -5,7 +5,6 @@ A pass builds the function that is recorded. Its arguments after the first seven
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -40,7 +39,7 @@ class LaunchSize:
     hiding: bool = False
 
 
-class Pass(ABC):
+class Pass:
     """One kind of launch. Equal passes have equal kernels."""
 
     previous: bool = False  # whether the previous scene is traced
@@ -119,7 +118,6 @@ class Pass(ABC):
 
         return launch
 
-    @abstractmethod
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         """Return the call that traces the camera rays.
 
@@ -128,6 +126,7 @@ class Pass(ABC):
             size: constants that the kernel is compiled for.
             own: the pass's own arrays.
         """
+        raise NotImplementedError  # of a pass whose `function` is its own
 
     def result(self, paths: CameraPaths, found: Any) -> Any:
         """Return what the launch returns, from what `call` found."""
@@ -212,10 +211,6 @@ class MovedPairPass(Pass):
                 return dropped_together(radiance[0] * generated[0][1], radiance[1] * generated[-1][1])
 
         return launch
-
-    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
-        """Never called: `function` traces both."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -366,10 +361,6 @@ class PosesPass(Pass):
                 return L * ray_weight
 
         return launch
-
-    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
-        """Never called: `function` traces all copies."""
-        raise NotImplementedError
 
 
 def _camera_samples(
