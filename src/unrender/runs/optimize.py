@@ -95,14 +95,13 @@ def optimize(
         InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
             cannot be begun, or cannot be written in the end; another thread has a run in progress.
     """
-    named = estimator
     plan = components.resolve(problem, estimator, optimizer)
     check(plan.estimator, plan.optimizer, steps, seconds)
     if checkpoint_every is not None:
         checks.integer("optimize", "checkpoint_every", checkpoint_every, at_least=1)
     annotations = annotations or RunAnnotations()
-    if isinstance(named, str) and not annotations.method:
-        annotations = replace(annotations, method=named, choices=plan.lines)
+    if isinstance(estimator, str) and not annotations.method:
+        annotations = replace(annotations, method=estimator, choices=plan.lines)
     run, state = prepare(plan, steps, seconds, seed)
     run.last_step = last_step(seconds) if annotations.within_seconds else None
     run.warnings += advice.remarks(problem, plan.optimizer)
