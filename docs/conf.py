@@ -60,6 +60,7 @@ html_theme = "furo"
 html_title = "unrender"
 html_static_path = ["static"]
 html_css_files = ["unrender.css"]
+smartquotes_action = "qe"  # not "--", which begins options
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {

@@ -18,6 +18,7 @@ from tiers import slow
 from unrender.core.errors import InputError
 from unrender.own_loop.stream import Rendered
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.rendering.numpy.one_pixel import ExponentialRenderer
 
 CV = ur.images.RecursiveControlVariate
 Uniform, Adaptive = ur.pixels.Uniform, ur.pixels.Adaptive
@@ -454,3 +455,16 @@ def test_backward_of_another_threads_image_is_one_line() -> None:
         renderer.backward(np.ones_like(image))
     image = renderer.render(START)
     renderer.backward(np.ones_like(image))
+
+
+@pytest.mark.parametrize("framework", ["numpy", "torch"])
+def test_values_outside_their_physical_range_are_warned_of_once(framework: str) -> None:
+    """The optimizer of a loop knows no bounds. Where it leaves them, images mean nothing."""
+    make: Any = float if framework == "numpy" else pytest.importorskip("torch").tensor
+    renderer = ur.Renderer(ExponentialRenderer(lowest=0.05), ["rate"])
+    renderer(make(0.05))
+    with pytest.warns(
+        UserWarning, match="Renderer: rate is expected to be at least 0.05, and has values outside: clip"
+    ):
+        renderer(make(0.04))
+    renderer(make(-1.0))  # warnings are errors

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from unrender.app.cli.sweep_driver import equally_good
 from unrender.app.sweeps import folders, pruning
 from unrender.app.sweeps.axes import Axis, parse_axes
-from unrender.app.sweeps.record import RunOutcome, SweepPlan, SweepRecord, read_sweep, write_sweep
+from unrender.app.sweeps.record import RunOutcome, SweepPlan, SweepRecord, TrialRecord, read_sweep, write_sweep
 from unrender.app.sweeps.search import Grid, Random, Search
 from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.core.errors import InputError
@@ -271,3 +272,17 @@ def test_a_record_is_read_as_it_was_written_and_a_malformed_one_is_one_line(tmp_
     (tmp_path / "sweep.json").unlink()
     with pytest.raises(InputError, match="holds no sweep"):
         read_sweep(tmp_path)
+
+
+def test_trials_within_two_standard_errors_of_the_best_are_named() -> None:
+    def trial(number: int, error: float, standard_error: float | None) -> TrialRecord:
+        return TrialRecord(
+            number=number, settings={}, status="finished", runs=[], error=error, standard_error=standard_error
+        )
+
+    plan = SweepPlan(problem="quad", method="plain", over=["spp=2,4"], search="grid", trials=4, seed=5, seeds=1)
+    noisy = [trial(0, 0.9, 0.3), trial(1, 0.5, 0.3), trial(2, 1.5, 0.3), trial(3, 0.5, None)]
+    assert equally_good(SweepRecord(plan=plan, trials=noisy, best=1)) == [0, 3]
+    exact = [trial(0, 0.9, None), trial(1, 0.5, None)]
+    assert equally_good(SweepRecord(plan=plan, trials=exact, best=1)) == []
+    assert equally_good(SweepRecord(plan=plan, trials=exact)) == []

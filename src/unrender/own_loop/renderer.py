@@ -278,6 +278,7 @@ class Renderer:
     def _render(self, values: Any, sensor: int | None) -> tuple[Given, list[tuple[Stream, Rendered]], tuple[Any, ...]]:
         given = self._exchange.read(values)
         parameters = self._exchange.tree(given)
+        self._exchange.warn_outside(parameters)
         key, records, images = Key(self._options.seed, self._step), [], []
         for name in self._names(sensor):
             stream = self._stream(name)

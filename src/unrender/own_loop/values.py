@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -51,6 +52,7 @@ class Exchange:
         self._renderer, self._keys = renderer, keys
         self._info: dict[str, ParameterInfo] = {key: renderer.parameters()[key] for key in keys}
         self._on_device = arrays.is_drjit(renderer.array(np.zeros(1)))
+        self._warned: set[str] = set()
 
     def read(self, values: Any) -> Given:
         """Read the loop's parameters, and check the keys. Raises `InputError`.
@@ -98,6 +100,20 @@ class Exchange:
             dr.make_opaque(tree)
             return tree
         return {key: self._renderer.array(self._host(key, value)) for key, value in given.values.items()}
+
+    def warn_outside(self, tree: Tree) -> None:
+        """Warn once per parameter whose values leave their physical range. An optimizer of the loop knows no bounds."""
+        for key, values in tree.items():
+            low, high = self._info[key].lowest, self._info[key].highest
+            below = low is not None and not arrays.all_true(values >= low)
+            above = high is not None and not arrays.all_true(values <= high)
+            if (below or above) and key not in self._warned:
+                self._warned.add(key)
+                limits = ", ".join(
+                    f"{word} {limit:g}" for word, limit in (("at least", low), ("at most", high)) if limit is not None
+                )
+                text = f"Renderer: {key} is expected to be {limits}, and has values outside: clip it after each step"
+                warnings.warn(text, stacklevel=5)
 
     def attached(self, given: Given) -> Tree:
         """Return the parameters as Dr.Jit arrays that are still attached to the loop's derivative graph."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import secrets
 import shlex
 import time
@@ -73,7 +74,28 @@ def show(console: Console, record: SweepRecord) -> None:
         )
     if record.best_line:
         console.print(f"best: {record.best_line}", markup=False, highlight=False, soft_wrap=True)
+        if others := equally_good(record):
+            which = ", ".join(map(str, others[:_SHOWN])) + (", …" if len(others) > _SHOWN else "")
+            console.print(
+                f"not distinguished from it (two standard errors): trial {which}; more --final-spp or --seeds may decide",
+                highlight=False,
+                soft_wrap=True,
+            )
         console.print(f"to run it: {run_command(record)}", markup=False, highlight=False, soft_wrap=True)
+
+
+def equally_good(record: SweepRecord) -> list[int]:
+    """Return the other finished trials whose error is within two standard errors of the difference from the best one's."""
+    known = {t.number: t for t in record.trials if t.status == "finished" and t.error is not None}
+    best = known.pop(record.best, None) if record.best is not None else None
+    if best is None:
+        return []
+    return [
+        number
+        for number, trial in known.items()
+        if (noise := math.hypot(best.standard_error or 0.0, trial.standard_error or 0.0)) > 0
+        and abs((trial.error or 0.0) - (best.error or 0.0)) <= 2 * noise
+    ]
 
 
 def run_command(record: SweepRecord) -> str:
