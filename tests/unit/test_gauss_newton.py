@@ -13,7 +13,7 @@ from unrender.core.random import Key
 from unrender.estimators import gauss_newton as module
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Hessian, HessianNoise, Smoothing
-from unrender.optimizers import AveragedNewton
+from unrender.optimizers import AveragedNewton, averaged_newton
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder import reader
 
@@ -26,6 +26,13 @@ def problem(loss: Any = None, noise: float = 0.6) -> ur.Problem:
     renderer = AnalyticRenderer(TRUTH, MATRIX, 0.1, noise, grain=0.3, shape=(4, 5))
     unknown = [ur.Parameter(key, initial=value) for key, value in START.items()]
     return ur.Problem(renderer, unknown, [ur.View(renderer.exact(TRUTH))], loss or ur.losses.L2(), truth=TRUTH)
+
+
+def problem_of(matrix: np.ndarray) -> ur.Problem:
+    """The problem with another derivative of the image, without grain."""
+    renderer = AnalyticRenderer(TRUTH, matrix, 0.1, 0.6, shape=(4, 5))
+    unknown = [ur.Parameter(key, initial=value) for key, value in START.items()]
+    return ur.Problem(renderer, unknown, [ur.View(renderer.exact(TRUTH))], ur.losses.L2(), truth=TRUTH)
 
 
 def estimates(
@@ -135,6 +142,8 @@ def test_what_it_refuses() -> None:
         ur.GaussNewton(spp=1)
     with pytest.raises(ur.InputError, match="shift must be a finite number > 0, got 0"):
         ur.GaussNewton(shift=0)
+    with pytest.raises(ur.InputError, match="noise_limit must be a finite number > 0, got 0"):
+        ur.GaussNewton(noise_limit=0.0)
     with pytest.raises(ur.InputError, match="damping must be"):
         AveragedNewton(damping=0)
     made = problem()
@@ -251,6 +260,62 @@ def test_models_from_far_away_are_forgotten_and_those_that_are_not_finite_left_o
     broken, same = optimizer.update(model(HESSIAN, away, away, np.nan), after, {"x": away})
     assert not broken["x"].any()
     assert same is after
+
+
+@pytest.mark.parametrize(("shrink", "averages"), [(None, True), (1.0, False)])
+def test_averaging_begins_where_noise_alone_moves_the_minimum_by_more_than_the_region(
+    monkeypatch: pytest.MonkeyPatch, shrink: float | None, averages: bool
+) -> None:
+    """Noise of the gradient moves the minimum of one model by 3 units. A region that does not shrink never averages."""
+    if shrink is not None:
+        monkeypatch.setattr(averaged_newton, "_SHRINK", shrink)
+    most, wander = [], []
+    for seed in range(6):
+        optimizer, rng, tree = AveragedNewton(), np.random.default_rng(seed), {"x": np.zeros(3)}
+        state, counts, places = optimizer.init(tree), [], []
+        for _ in range(60):
+            noise = np.linalg.cholesky(HESSIAN) @ rng.normal(size=3) * 3.0
+            steps, state = optimizer.update(model(HESSIAN, MINIMUM, tree["x"], noise), state, tree)
+            tree = {"x": tree["x"] + steps["x"]}
+            counts.append(state.counts.min())
+            places.append(tree["x"] - MINIMUM)
+        most.append(max(counts[30:]))
+        wander.append(np.sqrt(np.mean(np.square(places[30:]))))
+    assert bool(np.median(most) > 12.0) is averages
+    assert bool(np.mean(wander) < 1.2) is averages
+
+
+def test_a_region_that_shrank_grows_again_while_the_loss_falls() -> None:
+    optimizer, x = AveragedNewton(trust_radius=2.0), {"x": np.array([40.0, 0.0, 0.0])}
+    state = replace(optimizer.init(x), radii=np.full(3, 0.1))
+    for _ in range(12):
+        steps, state = optimizer.update(model(HESSIAN, np.zeros(3), x["x"]), state, x)
+        x = {"x": x["x"] + steps["x"]}
+    assert state.radii[0] == 2.0
+
+
+def test_few_noisy_pixels_do_not_outweigh_the_others() -> None:
+    """Noise of √c times the usual halves the weight; a noisier half of the gradient has less scatter than with equal weights."""
+    variance = np.array([[0.0, 1.0, 1.0, 1.0, 3.0, 300.0]])[..., None]
+    np.testing.assert_allclose(
+        module.noise_weights(variance, 3.0)[0, :, 0], [1.0, 0.75, 0.75, 0.75, 0.5, 1 / 101], rtol=1e-12
+    )
+    assert (module.noise_weights(np.zeros((1, 2, 1)), 3.0) == 1.0).all()
+    lamp = np.ones(MATRIX.shape)
+    lamp[:6] = 40.0
+    made = problem_of(lamp * MATRIX)
+    scatter = {}
+    for limit in (None, 3.0):
+        estimator, state = ur.GaussNewton(2, 2, noise_limit=limit), module.GaussNewtonState({"a": 0.02, "b": 0.03})
+        found = []
+        for seed in range(80):
+            estimate, state = estimator.estimate(made, START, state, Key(seed))
+            matrix = np.asarray(estimate.require("test", Hessian).matrix)
+            gradient = np.concatenate([estimate.gradient[key] for key in START])
+            found.append(np.linalg.solve(matrix, gradient))
+        away = np.concatenate([START[key] - TRUTH[key] for key in START])
+        scatter[limit] = float(np.median(np.abs(np.stack(found[8:]) - away)))
+    assert scatter[3.0] < 0.8 * scatter[None]
 
 
 @pytest.mark.mitsuba  # which a run folder asks for its version

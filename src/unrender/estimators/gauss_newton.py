@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -30,6 +30,8 @@ _SETTLED = 0.5
 """Longest step, in units of the widths, after which differences become sharper."""
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
 """Stream of the trial of a start; eigenvalues of its matrix, relative to the largest, that count as 0."""
+_MEMORY = 0.3
+"""Weight of the latest image in the running mean of the variance."""
 _IMAGE = 2
 """Stream of a view's key: of the image. Those below are of the two halves of the derivative images."""
 
@@ -42,11 +44,13 @@ class GaussNewtonState:
         widths: of the differences, {key: in units of the parameter}; {} before the first estimate.
         shift: in pixels, of the differences.
         point: the parameters of the last estimate, (n,); None before the first.
+        variances: running mean of the variance of each view's image, (H, W, 1); () without `noise_limit` and before the first estimate.
     """
 
     widths: dict[str, float]
     shift: float = 0.0
     point: np.ndarray | None = None
+    variances: tuple[np.ndarray, ...] = ()
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
         """See `Upsamplable`: widths are measured anew."""
@@ -83,6 +87,8 @@ class GaussNewton:
             a start that is several pixels away takes few steps.
         largest: {key: largest width, > 0}; no limit for the others. A pose of one shape needs it: the shape covers a part of the picture,
             so no shift of it differs from the picture by as much as a shift of the whole.
+        noise_limit: a pixel of variance σ² has the weight 1 / (1 + σ² / (c m)), with this c and the median m over pixels with noise, so a
+            few noisy pixels, such as those of a visible lamp, do not outweigh the others; > 0. None for equal weights.
     """
 
     spp: int = 256
@@ -92,6 +98,7 @@ class GaussNewton:
     tolerance: float = 2.0
     coarse: float | None = None
     largest: Mapping[str, float] = field(default_factory=dict)
+    noise_limit: float | None = None
 
     def __post_init__(self):
         for key, width in self.largest.items():
@@ -100,6 +107,8 @@ class GaussNewton:
             checks.integer("GaussNewton", name, getattr(self, name), at_least=2)
         for name in ("shift", "width", "tolerance"):
             checks.number("GaussNewton", name, getattr(self, name), above=0.0)
+        if self.noise_limit is not None:
+            checks.number("GaussNewton", "noise_limit", self.noise_limit, above=0.0)
         if self.coarse is not None and checks.number("GaussNewton", "coarse", self.coarse, above=0.0) < self.shift:
             raise InputError(f"GaussNewton: coarse must be at least shift, {self.shift:g}, got {self.coarse:g}")
 
@@ -149,7 +158,7 @@ class GaussNewton:
         moved = np.abs(point - state.point) / vectors.repeat_per_element(state.widths, parameters)
         settled = 0.0 < moved.max(initial=0.0) < _SETTLED
         shift = max(0.5 * state.shift, self.shift) if settled else state.shift
-        return GaussNewtonState(state.widths, shift, point)
+        return replace(state, shift=shift, point=point)
 
     def _next(self, state: GaussNewtonState, found: _System, parameters: Tree, change: float) -> GaussNewtonState:
         """With the widths at which renders differ from the picture as a shift by so many pixels does, root mean square over the elements of
@@ -160,7 +169,7 @@ class GaussNewton:
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
             wanted = state.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
             widths[key] = float(np.clip(wanted, width / change, min(width * change, self.largest.get(key, math.inf))))
-        return GaussNewtonState(widths, state.shift, state.point)
+        return replace(state, widths=widths, variances=tuple(found.variances) or state.variances)
 
 
 def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
@@ -199,6 +208,7 @@ class _System:
         squares: of the derivative images, summed over their pixels, (n,).
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
         images: by view.
+        variances: running mean of the variance of each view's image.
     """
 
     loss: float
@@ -208,6 +218,7 @@ class _System:
     squares: np.ndarray
     slopes: np.ndarray
     images: dict[int, Array]
+    variances: list[np.ndarray] = field(default_factory=list)
 
     @classmethod
     def zero(cls, n: int) -> _System:
@@ -240,6 +251,8 @@ class _Point:
             image, variance = self._image(view, own) if derivatives else (None, None)
             if derivatives:
                 found.images[view] = image
+                if self.options.noise_limit is not None:
+                    found.variances.append(_running(state.variances, view, arrays.numpy(variance)))
                 found.loss += arrays.number(self.problem.loss_value(view, image))
             if not elements.size:
                 continue
@@ -247,6 +260,10 @@ class _Point:
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
             slope = _slope(halves)
             weights = None if image is None else self._weights(view, image, variance)
+            if weights is not None and found.variances:
+                # After the first step they come from earlier images too, so they hardly correlate with the noise of this one.
+                factor = noise_weights(found.variances[view], self.options.noise_limit or math.inf)
+                weights = weights[0] * factor, weights[1] * factor
             gradient, hessian, noise, squares = _products(halves, distances, weights, int(state.shift))
             found.gradient[elements] += gradient
             found.hessian[np.ix_(elements, elements)] += hessian
@@ -295,6 +312,21 @@ class _Point:
         derivative = derivative * damping(residual, smoothed_variance(variance), self.options.tolerance)
         secant = derivative * residual / (residual * residual + 1e-12)
         return arrays.numpy(derivative), arrays.numpy(secant)
+
+
+def noise_weights(variance: np.ndarray, limit: float) -> np.ndarray:
+    """Return the weight 1 / (1 + σ² / (c m)) of each pixel, with c = `limit` and the median m of the variances σ² above 0.
+
+    It is 1 where no pixel has noise.
+    """
+    noisy = variance[variance > 0.0]
+    return 1.0 / (1.0 + variance / (limit * float(np.median(noisy)))) if noisy.size else np.ones_like(variance)
+
+
+def _running(before: tuple[np.ndarray, ...], view: int, variance: np.ndarray) -> np.ndarray:
+    """Return the running mean of a view's variance (H, W, 1), from those of all views and the new one (H, W, 3)."""
+    new = variance.astype(np.float64).mean(axis=-1, keepdims=True)
+    return before[view] + _MEMORY * (new - before[view]) if before else new
 
 
 def _slope(halves: list[np.ndarray]) -> float:

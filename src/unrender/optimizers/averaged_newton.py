@@ -18,6 +18,9 @@ from unrender.optimizers.newton import trust_region_step
 
 _FEWEST_MODELS = 8.0
 """Number of models from which their scatter gives a standard error."""
+_USED, _SHRINK, _GROW = 0.5, 0.7, 1 / 0.7
+"""Share of the radius from which a step counts as one that used the region, and the factors of the radius after such steps. Their product
+is 1, so noise alone neither closes the region nor opens it."""
 _WEAK_SHARE = 0.01
 """Squared share of an element in damped directions above which it has no standard error."""
 
@@ -36,6 +39,8 @@ class AveragedNewtonState:
         lengths: length of the last step of the elements that moved together, in units of the trust region, (n,).
         scatter: covariance of `target` from noise, (n, n): the sum over models of the squared weight times the squared difference between
             the model's gradient and that of the previous mean.
+        radii: radius of the trust region of each element, (n,), in its units.
+        step: last step, in units of the parameters, (n,).
     """
 
     learning_rates: dict[str, float]
@@ -46,6 +51,8 @@ class AveragedNewtonState:
     counts: np.ndarray
     lengths: np.ndarray
     scatter: np.ndarray
+    radii: np.ndarray
+    step: np.ndarray
 
 
 @register
@@ -67,13 +74,15 @@ class AveragedNewton:
     are in coordinates x / η with each parameter's learning rate η, times the σ of smoothed derivatives or the widths of differences
     (`Estimate.sigma`).
 
+    Δ shrinks after a long step if the new gradient shows that the loss rises along it, and grows while the loss falls. So averaging
+    begins even where noise moves the minimum by more than the region.
+
     An estimate that is not finite is ignored. Takes O(n³) time and O(n²) memory for n parameters in total.
 
     Args:
         learning_rate: η, in units of the parameter, > 0, for the parameters without their own.
         averaging: r, >= 0.
-        trust_radius: Δ, > 0; None for no limit. If noise moves the minimum by more than 1, nothing is averaged; a Δ below 1, such as 0.3,
-            averages even then.
+        trust_radius: Δ of the first step and upper limit of the later ones, > 0; None for no limit.
         damping: smallest eigenvalue relative to the largest, in (0, 1).
     """
 
@@ -98,7 +107,8 @@ class AveragedNewton:
         own = rates.per_parameter("AveragedNewton", parameters, self.learning_rate, learning_rates)
         n = vectors.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
-        return AveragedNewtonState(own, square, row, square, row, row, row, square)
+        radii = np.full(n, np.inf if self.trust_radius is None else self.trust_radius)
+        return AveragedNewtonState(own, square, row, square, row, row, row, square, radii, row)
 
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
@@ -118,7 +128,7 @@ class AveragedNewton:
         scale = coordinate_scales(estimate, state, parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
         noise, shares, counts = state.noise.copy(), state.shares.copy(), state.counts.copy()
-        lengths, scatter = np.zeros_like(x), state.scatter.copy()
+        lengths, scatter, radii = np.zeros_like(x), state.scatter.copy(), state.radii.copy()
         for block in _blocks((matrix != 0.0) | (hessian != 0.0)):
             both = np.ix_(block, block)
             weight = self._weight(counts[block].min(), state.lengths[block].max())
@@ -132,13 +142,15 @@ class AveragedNewton:
             shares[block] = (1.0 - weight) ** 2 * shares[block] + weight**2
             target[block] += weight * (hessian[both] @ x[block] - gradient[block] - target[block])
             own = scale[block]
+            radius = self._radius(radii[block].min(), state.step[block] / own, own * gradient[block])
+            radii[block] = radius
             slope = matrix[both] @ x[block] - target[block]
             damped = matrix[both] + shares[block].max() * noise[both]
-            moved = self._solve(own[:, None] * damped * own, own * slope)
+            moved = self._solve(own[:, None] * damped * own, own * slope, radius)
             lengths[block] = np.linalg.norm(moved)
             step[block] = own * moved
         return vectors.unravel(step, parameters), AveragedNewtonState(
-            state.learning_rates, matrix, target, noise, shares, counts, lengths, scatter
+            state.learning_rates, matrix, target, noise, shares, counts, lengths, scatter, radii, step
         )
 
     def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:
@@ -171,7 +183,18 @@ class AveragedNewton:
         usual = (1.0 + self.averaging) / (count + 1.0 + self.averaging)
         return max(usual, length * length / (1.0 + length * length))
 
-    def _solve(self, matrix: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    def _radius(self, radius: float, step: np.ndarray, gradient: np.ndarray) -> float:
+        """Return the next radius of a block's trust region, from the gradient at the end of its last step.
+
+        If the loss rises there, along a step that used the region, the radius shrinks. If it still falls, the radius grows again.
+        """
+        length = float(np.linalg.norm(step))
+        if self.trust_radius is None or length < _USED * radius:
+            return radius
+        change = _SHRINK if float(step @ gradient) > 0.0 else _GROW
+        return min(change * radius, self.trust_radius)
+
+    def _solve(self, matrix: np.ndarray, gradient: np.ndarray, radius: float) -> np.ndarray:
         """Return the step of one block, in units of the trust region."""
         units = np.sqrt(np.abs(np.diag(matrix)))
         if not units.all():
@@ -182,7 +205,7 @@ class AveragedNewton:
         hessian = units[:, None] * (eigenvectors * curvatures) @ eigenvectors.T * units
         curvatures, eigenvectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
         return eigenvectors @ trust_region_step(
-            np.maximum(curvatures, 0.0), eigenvectors.T @ gradient, self.trust_radius
+            np.maximum(curvatures, 0.0), eigenvectors.T @ gradient, None if np.isinf(radius) else radius
         )
 
 

@@ -12,10 +12,12 @@ from unrender.runs.sensitivity import seen_cells, sensitivity
 from unrender.runs.verification import FreshPictures
 from unrender.scene.problem import Problem
 
-__all__ = ["FEW_STEPS", "further_from_truth"]
+__all__ = ["FEW_NEWTON_STEPS", "FEW_STEPS", "further_from_truth"]
 
 FEW_STEPS = 32
 """Number of steps below which a run whose picture has improved is unfinished, and its parameters may still be on their way."""
+FEW_NEWTON_STEPS = 8
+"""The same number for Gauss-Newton steps of all unknowns."""
 _FURTHER, _FURTHER_EARLY = 1.1, 1.5
 """Ratio of a parameter's last error to its first from which on a warning says so; the second one for runs of few steps."""
 _MAP_AXES = 3

@@ -12,12 +12,13 @@ import numpy as np
 
 from unrender.core import phases
 from unrender.display import formatting
+from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import phase_times
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.hooks import Hook
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
-from unrender.runs.truth_check import FEW_STEPS, further_from_truth
+from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
 from unrender.runs.verification import (
     FreshPictures,
     Picture,
@@ -131,7 +132,8 @@ class Verify(Hook):
         disagrees = memory is not None and memory.disagrees
         kept = places[best][0] if places else last
         lines = self._residual(problem, result)
-        few = result.steps < FEW_STEPS
+        # A Gauss-Newton step solves for all unknowns, so a run of few steps is no unfinished one.
+        few = result.steps < (FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else FEW_STEPS)
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
             lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds)

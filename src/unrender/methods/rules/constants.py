@@ -120,6 +120,11 @@ class Constants:
     """First shift of the differences of poses, as a share of the smallest picture's side. Source: a block in a room .25 away."""
     pose_reach: float = 2.0
     """Largest width of the differences of poses over `sigma`. Source: as for `pose_shift`."""
+    light_reach: float = 0.5
+    """Likewise, of poses of lights alone. Source: `stage-lights`, error of seven numbers after 60 steps."""
+    noise_limit: float = 3.0
+    """Variance of a pixel over the median, from which on it counts less in Gauss-Newton steps. Source: `stage-lights`: error 0.04 of the
+    start's instead of 0.29, since the softbox's visible edge is noisier than all else."""
     pose_averaging: float = 3.0
     """`averaging` of poses, whose first models are of far away. Source: as for `pose_shift`."""
     pose_images: float = 2.0

@@ -67,7 +67,7 @@ def few_numbers(traits: Traits) -> Plan | None:
         return None
     estimator = _estimator(traits, keys, constants.pose_images)
     if traits.poses:
-        trial = replace(estimator, derivative_spp=constants.trial_spp, coarse=None)
+        trial = replace(estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None)
         trial = replace(trial, largest=widths_of(traits.options.sigma, traits.poses))
         least = constants.explained if shapes else constants.explained_light
         if not problem.loss.linear or not explained(problem, trial) > least:
@@ -126,13 +126,14 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
     paths = max(paths, round(2 * elements * differences * images)) if poses else paths
     spp = traits.options.spp or sampling.within(constants.number_spp, paths)
     side = min(min(size) for size in problem.sizes)
-    reach = constants.pose_reach if poses else 1.0
+    reach = constants.pose_reach if poses else constants.light_reach
     return GaussNewton(
         max(spp, 2),
         differences,
         tolerance=_damping(traits),
         coarse=max(constants.pose_shift * side, 1.0) if poses else None,
         largest={key: reach * width for key, width in widths_of(traits.options.sigma, moved).items()},
+        noise_limit=constants.noise_limit,
     )
 
 
