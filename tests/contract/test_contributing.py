@@ -18,6 +18,8 @@ ROOT = Path(__file__).resolve().parents[2]
 TEXT = "\n".join(page.read_text() for page in sorted((ROOT / "docs" / "extending").glob("*.md")))
 SHOWN = re.findall(r"^```\{literalinclude\} \.\./\.\./examples/(\w+)\.py$", TEXT, re.MULTILINE)
 FILES = {path.stem: path.read_text() for path in sorted((ROOT / "examples").glob("*.py"))}
+PLAN = re.findall(r"^```toml\n(\[estimator\].*?)^```$", TEXT, re.DOTALL | re.MULTILINE)[0]
+"""The plan file that the pages show."""
 REGISTERED = {
     "loss": "Charbonnier",
     "schedule": "InverseTime",
@@ -38,6 +40,7 @@ import json, sys
 import numpy as np
 import unrender as ur
 from unrender.core import registry, tables
+from unrender.io.toml_lines import tomllib
 from unrender.methods import method
 
 sys.path.insert(0, sys.argv[1])
@@ -81,6 +84,8 @@ whole = ur.optimize(problem(), ur.PathGradient(spp=2), chain, 9).parameters
 ur.optimize(problem(), ur.PathGradient(spp=2), chain, 4, run_directory=sys.argv[3])
 again = ur.resume(sys.argv[3], problem(), steps=9).parameters
 found["resumed"] = all(np.array_equal(whole[key], again[key]) for key in whole)
+parts = tomllib.loads(sys.argv[4])
+found["plan file"] = error(problem(), tables.component(parts["estimator"]), tables.component(parts["optimizer"]))
 found["method"] = error(problem(), *method("momentum").start({"learning_rate": "0.05"}))
 for each in (loss, grey, sampler, averaged, chain):
     assert tables.component(json.loads(json.dumps(tables.table(each)))) == each
@@ -126,7 +131,7 @@ def found(tmp_path_factory: pytest.TempPathFactory, mitsuba_variant: str) -> dic
     package(folder, FILES)
     source = Path(unrender.__file__).parents[1]
     process = subprocess.run(
-        [sys.executable, "-W", "error", "-c", DRIVER, str(Path(__file__).parent), mitsuba_variant, str(folder / "run")],
+        [sys.executable, "-W", "error", "-c", DRIVER, str(Path(__file__).parent), mitsuba_variant, str(folder / "run"), PLAN],
         env={**os.environ, "PYTHONPATH": f"{source}{os.pathsep}{folder}"}, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert process.returncode == 0, process.stderr
@@ -152,7 +157,7 @@ def test_each_is_found_by_its_kind(found: dict[str, Any], kind: str) -> None:
     "name",
     [
         *("loss", "preconditioner", "pixel sampler", "image estimator", "estimator", "optimizer", "step transform"),
-        *("method", "gallery problem", "renderer", "BSDF"),
+        *("method", "plan file", "gallery problem", "renderer", "BSDF"),
     ],
 )
 def test_each_recovers_a_known_truth(found: dict[str, Any], name: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from html.parser import HTMLParser
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from unrender import optimizers
 from unrender.core import phases
+from unrender.core.errors import InputError
 from unrender.display import notebook_bar
 from unrender.display.notebook_bar import NotebookBar
 from unrender.estimators.path import PathGradient
@@ -170,3 +172,19 @@ def test_a_bar_is_not_replaced_oftener_than_one_sees(monkeypatch: pytest.MonkeyP
 def test_a_bar_on_a_terminal_on_request(capsys: pytest.CaptureFixture[str]) -> None:
     optimize(problem(), PathGradient(), optimizers.Adam(0.05), steps=2, progress=True)
     assert "compiling" in capsys.readouterr().out
+
+
+def test_an_error_in_a_notebook_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A chain of causes too. Where IPython is not installed, by what it would print."""
+    assert InputError("no such key")._render_traceback_() == ["InputError: no such key"]
+    shells = pytest.importorskip("IPython.core.interactiveshell", reason="needs IPython: pip install 'unrender[docs]'")
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path))
+    shell = shells.InteractiveShell()
+    shell.run_cell("from unrender.core.errors import InputError")
+    shell.run_cell(
+        "try:\n    1 / 0\nexcept ZeroDivisionError as error:\n    raise InputError('no such key') from error"
+    )
+    shell.history_manager.end_session()
+    assert capsys.readouterr().out.strip() == "InputError: no such key"

@@ -12,6 +12,10 @@ class UnrenderError(Exception):
     def __init__(self, *arguments: object):
         super().__init__(*(one_line(part) if isinstance(part, str) else part for part in arguments))
 
+    def _render_traceback_(self) -> list[str]:
+        """Return what a notebook prints in place of a traceback: one line. IPython looks for this name."""
+        return [f"{type(self).__name__}: {self}"]
+
 
 class InputError(UnrenderError, ValueError):
     """Invalid input from the user: a file, a field, a name or a value. The command line exits with 2."""
