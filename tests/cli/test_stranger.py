@@ -202,3 +202,78 @@ def test_it_is_killed_and_ends_as_if_undisturbed(site: Path, tmp_path: Path) -> 
     ends = [path / checkpoint.FOLDER / f"{STEPS:08d}" / STATE for path in (whole, folder)]
     assert ends[0].read_bytes() == ends[1].read_bytes()
     assert (whole / "parameters.npz").exists()
+
+
+ENDLESS = '''
+import hashlib, os, pathlib
+from dataclasses import dataclass
+
+import unrender as ur
+from unrender.estimators.base import Estimator
+from unrender.methods import Options
+
+
+@ur.register
+@dataclass(frozen=True)
+class Endless(Estimator):
+    """Prints 100 MB, and computes for ever in compiled code."""
+
+    provides = frozenset({"gradient"})
+
+    def init(self, problem, parameters):
+        return ()
+
+    def estimate(self, problem, parameters, state, key):
+        for _ in range(10_000):
+            print("x" * 10_000)
+        pathlib.Path(os.environ["ENDLESS"], str(os.getpid())).touch()
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 2_000_000_000)
+
+
+@ur.register(name="endless")
+class EndlessMethod(Options):
+    """never ends"""
+
+    spp: int = 1
+
+    def build(self):
+        return Endless(), ur.optimizers.Adam()
+'''
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [0, 2])
+def test_trials_that_print_much_and_never_end_are_interrupted(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    """On workers by one signal; in this process by a second one, since no handler runs during compiled code."""
+    install(site, "endless", ENDLESS)
+    (tmp_path / "marks").mkdir()
+    monkeypatch.setenv("ENDLESS", str(tmp_path / "marks"))
+    monkeypatch.setenv("RAY_worker_niceness", "0")
+    if workers:
+        pytest.importorskip("ray")
+    words = ["sweep", "exponential", "-m", "endless", "--over", "spp=1,2", "--steps", 3, "--out", tmp_path / "sweep"]
+    with (tmp_path / "out").open("wb") as out:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "unrender", *map(str, words), *(["--workers", str(workers)] if workers else [])],
+            env={**os.environ, "PYTHONPATH": f"{SOURCE}{os.pathsep}{site}"},
+            stdout=out,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        until = time.monotonic() + 200
+        while len(list((tmp_path / "marks").iterdir())) < max(workers, 1):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < until
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        if not workers:
+            time.sleep(1)
+            process.send_signal(signal.SIGINT)
+        error = process.communicate(timeout=60)[1]
+    assert (process.returncode, error.splitlines()[-1]) == (130, "unrender: interrupted")
+    assert "Traceback" not in error
+    assert len(error) < 1000
+    assert (workers == 0) is ((tmp_path / "out").stat().st_size > 1 << 20)
+    assert json.loads((tmp_path / "sweep" / "sweep.json").read_text())["trials"] == []

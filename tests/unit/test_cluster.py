@@ -159,10 +159,14 @@ class Raised(Died):
     cause = InputError("no such file")
 
 
+class Alone(Died):
+    """As of Ray: its node on this machine is gone."""
+
+
 class FakeRay:
     """Answers in the place of Ray; `deaths` of the first attempts at a task end with the worker's death."""
 
-    exceptions = SimpleNamespace(RayError=Died, RayTaskError=Raised)
+    exceptions = SimpleNamespace(RayError=Died, RayTaskError=Raised, LocalRayletDiedError=Alone)
 
     def __init__(self, deaths: dict[str, int]):
         self.deaths, self.begun, self.cancelled = deaths, [], []
@@ -182,6 +186,8 @@ class FakeRay:
         name = reference[1][0]
         if name == "bad":
             raise Raised
+        if name == "alone":
+            raise Alone
         if self.cancelled and name != "fine":
             raise Died("cancelled")
         if self.begun.count(name) <= self.deaths.get(name, 0):
@@ -203,6 +209,13 @@ def test_a_death_costs_its_task_alone_which_is_begun_again_twice() -> None:
     assert ended["doomed"].message == "its worker died 3 times: The worker died unexpectedly"
     assert ended["bad"] == Ended("bad", None, "no such file", 1)
     assert [ray.begun.count(name) for name in ("fine", "unlucky", "doomed", "bad")] == [1, 2, 3, 1]
+
+
+def test_a_lost_node_ends_the_command_and_fails_no_task() -> None:
+    executor = OnWorkers(Cluster(FakeRay({}), "llvm_ad_rgb", Share(4, 1.0, 0.0), None), str)
+    executor.start(1, "alone")
+    with pytest.raises(InputError, match=r"Ray's node on this machine is lost; .*unrender sweep DIR goes on"):
+        executor.wait(0.1)
 
 
 def test_after_an_interrupt_only_tasks_that_ended_in_good_order_are_told() -> None:

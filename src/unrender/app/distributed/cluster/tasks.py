@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from unrender.app.distributed.cluster.connection import Cluster
-from unrender.core.errors import UnrenderError
+from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line
 
 _ATTEMPTS = 3
@@ -157,6 +157,11 @@ class OnWorkers:
             return Ended(task.key, self._ray.get(reference), "", task.attempts)
         except errors.RayTaskError as error:
             return Ended(task.key, None, _reason(error.cause or error), task.attempts)
+        except errors.LocalRayletDiedError as error:  # nothing can be begun any more
+            raise InputError(
+                "workers: Ray's node on this machine is lost; start the command again: what had ended is kept, and "
+                "unrender sweep DIR goes on"
+            ) from error
         except errors.RayError as error:
             if task.attempts < _ATTEMPTS:
                 self._start(_Begun(task.key, task.arguments, task.attempts + 1))
