@@ -21,7 +21,7 @@ __all__ = ["campaign"]
 
 _KINDS = {"worker": "ray::", "node": "raylet/raylet", "store": "gcs_server", "command": "-m unrender"}
 """What is killed, and the words that its command line holds."""
-_SWEEP = ["sweep", "exponential", "-m", "plain", "--over", "learning_rate=0.001,0.003,0.01,0.03", "--steps", 3000]
+_SWEEP = ["sweep", "exponential", "-m", "plain", "--over", "learning_rate=0.001,0.003,0.01,0.03", "--steps", 1500]
 _SWEEP += ["--final-spp", 1, "--threads", 1, "--workers", 2, "--out", "sweep"]
 
 

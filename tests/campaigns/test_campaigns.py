@@ -21,7 +21,11 @@ from tests.campaigns.machine import Victims
 COUNT = int(os.environ.get("UNRENDER_CAMPAIGN", "0"))
 STEPS = 60
 SEED = 0
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(not COUNT, reason="set UNRENDER_CAMPAIGN to the number of faults")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(0),
+    pytest.mark.skipif(not COUNT, reason="set UNRENDER_CAMPAIGN to the number of faults"),
+]
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
 
 

@@ -30,6 +30,22 @@ MISTAKES = [
     (["run", "problem.toml", "--set", "=3"], "--set =3: expected NAME=VALUE"),
     (["run", "problem.toml", "--set", "spp=2", "--set", "spp=4"], "--set spp=4: spp is given twice"),
     (["run", "problem.toml", "--set", "spp=-2"], "option spp: expected a whole number above 0 or none, got '-2'"),
+    (
+        ["run", "problem.toml", "--set", f"spp={2**31}"],
+        "option spp: expected a whole number above 0 or none and below 2**31",
+    ),
+    (["run", "problem.toml", "--set", f"spp={10**30}"], "option spp: expected a whole number above 0 or none"),
+    (["run", "problem.toml", "--final-spp", str(10**23)], "Invalid value for '--final-spp'"),
+    (["run", "problem.toml", "--checkpoint-every", str(10**23)], "Invalid value for '--checkpoint-every'"),
+    (["compare", "problem.toml", "--seeds", str(10**11)], "Invalid value for '--seeds'"),
+    (
+        ["sweep", "problem.toml", "--over", "learning_rate=0.1,0.2", "--seeds", str(2**30)],
+        "Invalid value for '--seeds'",
+    ),
+    (
+        ["sweep", "problem.toml", "--over", "learning_rate=0.1:1:log", "--trials", str(2**30)],
+        "Invalid value for '--trials'",
+    ),
     (["run", "problem.toml", "--set", "sp=2"], "method auto has no option sp; did you mean spp?"),
     (
         ["run", "problem.toml", "-m", "rcv", "--set", "schedule=cosin(9)"],
@@ -48,6 +64,9 @@ MISTAKES = [
     (["run", "indirect-room", "-p", "resolutoin=8"], "no option resolutoin; did you mean resolution?"),
     (["run", "indirect-room", "-p", "resolution=-8"], "resolution"),
     (["run", "indirect-room", "-p", "resolution=big"], "resolution"),
+    (["run", "indirect-room", "-p", "resolution=1000000000"], "resolution must be at most 8192, got 1000000000"),
+    (["run", "indirect-room", "-p", "reference_spp=1000000000"], "reference_spp must be at most 16777216"),
+    (["run", "exponential", "-p", f"max_depth={10**30}"], "max_depth"),
     (["run", "problem.toml", "--out", "problem.toml"], "--out problem.toml: a file, expected a folder"),
     (["run", "problem.toml", "--out", "problem.toml/run"], "--out problem.toml/run: Not a directory"),
     (["run", "problem.toml", "--out", "."], "--out .: the folder is not empty and holds no earlier results"),

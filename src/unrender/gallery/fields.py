@@ -12,6 +12,9 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.losses import Loss
 
+_LONGEST_SIDE = 1 << 13
+"""Pixels along a side of an image with the largest number of values that is read from a file."""
+
 
 @dataclass(frozen=True)
 class Option:
@@ -30,12 +33,12 @@ class Option:
     about: str
 
 
-def integer(default: int, about: str, at_least: int = 1, at_most: int | None = None) -> Any:
+def integer(default: int, about: str, at_least: int = 1, at_most: int = 2**31 - 1) -> Any:
     """A dataclass field: a whole number in [at_least, at_most]."""
 
     def check(owner: str, name: str, value: Any) -> int:
         number = checks.integer(owner, name, value, at_least)
-        if at_most is not None and number > at_most:
+        if number > at_most:
             raise InputError(f"{owner}: {name} must be at most {at_most}, got {number}")
         return number
 
@@ -44,22 +47,22 @@ def integer(default: int, about: str, at_least: int = 1, at_most: int | None = N
 
 def resolution(default: int) -> Any:
     """The field `resolution`."""
-    return integer(default, "pixels along a side of each view", at_least=4)
+    return integer(default, "pixels along a side of each view", at_least=4, at_most=_LONGEST_SIDE)
 
 
 def texture_resolution(default: int) -> Any:
     """The field `texture_resolution`."""
-    return integer(default, "texels along a side of each unknown map", at_least=2)
+    return integer(default, "texels along a side of each unknown map", at_least=2, at_most=_LONGEST_SIDE)
 
 
 def reference_spp(default: int) -> Any:
     """The field `reference_spp`."""
-    return integer(default, "samples per pixel of the reference images")
+    return integer(default, "samples per pixel of the reference images", at_most=1 << 24)
 
 
 def max_depth(default: int, at_least: int) -> Any:
     """The field `max_depth`."""
-    return integer(default, "longest light path in segments", at_least=at_least)
+    return integer(default, "longest light path in segments", at_least=at_least, at_most=1 << 20)
 
 
 def _check_loss(owner: str, name: str, value: Any) -> Loss:

@@ -21,6 +21,8 @@ from unrender.scene.problem import Problem
 from unrender.schedules.functions import Schedule
 
 SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
+_TOO_LARGE = 1 << 31
+"""Whole numbers from which on no array of so many samples or steps can be made."""
 
 
 class Options(BaseModel):
@@ -70,12 +72,17 @@ class Method:
                 raise InputError(f"method {self.name} has no option {name}{hint}")
         none = {name: None for name, value in settings.items() if isinstance(value, str) and value.lower() == "none"}
         try:
-            return self.options.model_validate({**settings, **none})
+            options = self.options.model_validate({**settings, **none})
         except pydantic.ValidationError as error:
             detail = error.errors()[0]
             name = str(detail["loc"][0])
             expected = f"expected {self.expected(name)}, got {detail['input']!r}"
             raise InputError(f"method {self.name}: option {name}: {expected}") from error
+        for name, value in options:
+            if isinstance(value, int) and value >= _TOO_LARGE:
+                expected = f"expected {self.expected(name)} and below 2**31, got {value}"
+                raise InputError(f"method {self.name}: option {name}: {expected}")
+        return options
 
     def options_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """Return all options by name, with `settings` in place of defaults. Raises `InputError`."""

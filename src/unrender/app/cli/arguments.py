@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from unrender.scene.problem import Problem
 
 DEFAULT_STEPS = 300
+MOST_SAMPLES, MOST_SEEDS, MOST_TRIALS = 1 << 24, 10_000, 100_000
+"""Largest samples per pixel of a picture, runs of one method or trial, and trials of a sweep. More would take years."""
 
 ProblemName = Annotated[
     str, typer.Argument(metavar="PROBLEM", help="A problem file (TOML), or a name from the gallery.")
@@ -45,12 +47,15 @@ Threads = Annotated[
     typer.Option(min=1, help="Threads of the processor. With 1, runs repeat bit for bit.", show_default=False),
 ]
 CheckpointEvery = Annotated[
-    int | None, typer.Option(min=1, help="Steps between checkpoints. Default: 50 or so.", show_default=False)
+    int | None,
+    typer.Option(min=1, max=2**31 - 1, help="Steps between checkpoints. Default: 50 or so.", show_default=False),
 ]
 FinalSpp = Annotated[
     int | None,
     typer.Option(
-        min=1, help="Samples per pixel of the final pictures. Default: as many as a twentieth of the time allows."
+        min=1,
+        max=MOST_SAMPLES,
+        help="Samples per pixel of the final pictures. Default: as many as a twentieth of the time allows.",
     ),
 ]
 

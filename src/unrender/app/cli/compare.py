@@ -14,6 +14,7 @@ import typer
 
 from unrender.app.cli import arguments
 from unrender.app.cli.arguments import (
+    MOST_SEEDS,
     AllowOutside,
     FinalSpp,
     Insecure,
@@ -65,7 +66,7 @@ def compare(
         ),
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="Time for each run, without compilation. [default: 20]")] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="How many runs of each method.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="How many runs of each method.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="The first run's seed.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Where the results go. Default: a new folder in out/.")] = None,
     problem_settings: ProblemSettings = None,

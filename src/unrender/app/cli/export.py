@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.cli.arguments import AllowOutside, Variant
+from unrender.app.cli.arguments import MOST_SAMPLES, AllowOutside, Variant
 from unrender.core.errors import InputError
 from unrender.display.terminal import Console
 
@@ -33,7 +33,7 @@ def export(
         ),
     ] = "mitsuba",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,
-    spp: Annotated[int, typer.Option(min=1, help="Samples per pixel that the scene asks for.")] = 256,
+    spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel that the scene asks for.")] = 256,
     variant: Variant = "auto",
     allow_outside: AllowOutside = False,
 ) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.cli.arguments import AllowOutside, Variant
+from unrender.app.cli.arguments import MOST_SAMPLES, AllowOutside, Variant
 
 if TYPE_CHECKING:
     from unrender.app.evaluation.judge import Judgement
@@ -26,7 +26,7 @@ def judge(
     environment: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Another light: a picture of all directions (.exr, .hdr).")
     ] = None,
-    spp: Annotated[int, typer.Option(min=1, help="Samples per pixel.")] = 64,
+    spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel.")] = 64,
     out: Annotated[Path | None, typer.Option(help="The folder. Default: judge in DIR.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier judgement.")] = False,
     variant: Variant = "auto",

@@ -10,6 +10,8 @@ import typer
 
 from unrender.app.cli import arguments
 from unrender.app.cli.arguments import (
+    MOST_SEEDS,
+    MOST_TRIALS,
     AllowOutside,
     FinalSpp,
     Insecure,
@@ -56,17 +58,20 @@ _SearchName = Annotated[
     str | None,
     typer.Option(metavar="grid|random|tpe", help="Which settings to try. [default: grid; random with open ranges]"),
 ]
-_Trials = Annotated[int | None, typer.Option(min=1, help="How many settings to try by random or tpe. [default: 16]")]
+_Trials = Annotated[
+    int | None, typer.Option(min=1, max=MOST_TRIALS, help="How many settings to try by random or tpe. [default: 16]")
+]
 _Prune = Annotated[
     bool,
     typer.Option("--prune", help="Give up runs whose error is, and would end, above the median of earlier trials'."),
 ]
 _Window = Annotated[
-    int | None, typer.Option(min=1, help="Trials under way at most. [default: 4, or two for each worker]")
+    int | None,
+    typer.Option(min=1, max=MOST_TRIALS, help="Trials under way at most. [default: 4, or two for each worker]"),
 ]
 _Steps = Annotated[int | None, typer.Option(help="Of each run. [default: 300, or --seconds]")]
 _Seconds = Annotated[float | None, typer.Option(help="Time for each run, without compilation.")]
-_Seeds = Annotated[int, typer.Option(min=1, help="How many runs of each trial.")]
+_Seeds = Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="How many runs of each trial.")]
 _Seed = Annotated[int, typer.Option(min=0, help="Of the search, and of each trial's first run.")]
 _Out = Annotated[Path | None, typer.Option(help="Where the results go. Default: a new folder in out/.")]
 

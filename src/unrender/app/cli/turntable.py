@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.cli.arguments import AllowOutside, Variant
+from unrender.app.cli.arguments import MOST_SAMPLES, AllowOutside, Variant
 from unrender.core.errors import InputError
 
 
@@ -19,10 +19,10 @@ def turntable(
     environment: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The light: a picture of all directions (.exr, .hdr).")
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, help="Of one turn.")] = 48,
+    frames: Annotated[int, typer.Option(min=1, max=100_000, help="Of one turn.")] = 48,
     rate: Annotated[float, typer.Option(help="Frames a second.")] = 24.0,
     size: Annotated[int, typer.Option(help="Pixels a side.")] = 320,
-    spp: Annotated[int, typer.Option(min=1, help="Samples per pixel.")] = 64,
+    spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel.")] = 64,
     elevation: Annotated[float, typer.Option(help="Of the camera, in degrees.")] = 15.0,
     up: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="The axis. Default: the cameras' mean.")] = None,
     background: Annotated[str, typer.Option(help="light, black, grey or white.")] = "light",

@@ -43,9 +43,9 @@ class SweepPlan(BaseModel):
     settings: dict[_Text, _Text] = {}
     over: list[_Text]
     search: Literal["grid", "random", "tpe"]
-    trials: _Positive | None = None
+    trials: Annotated[StrictInt, Field(ge=1, le=100_000)] | None = None
     seed: _Count = 0
-    seeds: _Positive = 1
+    seeds: Annotated[StrictInt, Field(ge=1, le=10_000)] = 1
     steps: _Positive | None = None
     seconds: Annotated[FiniteFloat, Field(gt=0)] | None = None
     prune: StrictBool = False
