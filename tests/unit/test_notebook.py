@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ import pytest
 from unrender import optimizers
 from unrender.core import phases
 from unrender.core.errors import InputError
-from unrender.display import notebook_bar
+from unrender.display import formatting, notebook_bar
 from unrender.display.notebook_bar import NotebookBar
 from unrender.estimators.path import PathGradient
 from unrender.rendering.numpy.linear import AnalyticRenderer
@@ -84,6 +85,13 @@ def test_html_is_complete_in_itself_with_pictures_and_curves(result: Result) -> 
         assert all(source.startswith("data:image/png;base64,") for source in outline.sources)
     assert outline.tags.count("svg") == 2
     assert result._repr_html_().count("<path") >= 3  # two parameters' errors and the loss
+
+
+def test_numbers_are_shown_with_the_standard_errors_of_the_runs_noise(result: Result) -> None:
+    shown = replace(result, standard_error={"number": np.array(0.012)})._repr_html_()
+    value = formatting.number(float(result.parameters["number"]))
+    assert f"{value} ± 0.012 (truth {formatting.number(float(result.truth['number']))})" in shown
+    assert f"{value} (truth" in result._repr_html_()
 
 
 def test_names_cannot_bring_code_along() -> None:

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    import numpy as np
+
+LISTED = 4
+"""Elements of an array that are listed one by one."""
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNKNOWN = "–"
 
@@ -42,6 +48,18 @@ def duration(seconds: float | None) -> str:
     if rounded < 3600:
         return f"{rounded // 60} min {rounded % 60:02d} s"
     return f"{rounded // 3600} h {rounded % 3600 // 60:02d} min"
+
+
+def values(array: np.ndarray, standard_error: Sequence[float] | None = None) -> str:
+    """Format an array's elements, few of them with their standard errors; of many the least and the largest."""
+    if array.size == 0:
+        return ""
+    if array.size > LISTED:
+        return " … ".join(number(float(value)) for value in (array.min(), array.max()))
+    texts = [number(float(value)) for value in array.reshape(-1)]
+    if standard_error is not None and len(standard_error) == len(texts):
+        texts = [f"{text} ± {number(error)}" for text, error in zip(texts, standard_error, strict=True)]
+    return ", ".join(texts)
 
 
 def with_error(value: float, error: float) -> str:

@@ -103,7 +103,7 @@ def html(result: Result) -> str:
         chart(error_title(result), lines, "seconds", end),
         chart("Loss, of the steps' samples", [Line("loss", seconds, loss)], "seconds", end) if len(loss) else None,
     ]
-    rows = {"image error": _image_error(result), "time": formatting.phases(result.phases)}
+    rows = _numbers(result) | {"image error": _image_error(result), "time": formatting.phases(result.phases)}
     return notebook.block(
         f"Result of {result.name}, {_told(result)}",
         notebook.picture_row(shown_pictures(result)),
@@ -168,6 +168,19 @@ def _told(result: Result) -> str:
         unit = "".join(units)
         words += f", parameter error {formatting.number(float(first))}{unit} → {formatting.number(float(now))}{unit}"
     return f"{words}, {result.status}"
+
+
+def _numbers(result: Result) -> dict[str, str]:
+    """{key: its values, with the standard errors of the run's noise, and the truth} of the parameters that are no maps."""
+    rows = {}
+    for key, recovered in result.parameters.items():
+        if recovered.size > formatting.LISTED:
+            continue
+        error = result.standard_error.get(key)
+        text = formatting.values(recovered, None if error is None else [float(each) for each in np.ravel(error)])
+        truth = result.truth.get(key)
+        rows[key] = text if truth is None else f"{text} (truth {formatting.values(np.asarray(truth))})"
+    return rows
 
 
 def _image_error(result: Result) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +76,6 @@ STOP_REASONS = {
     "non-finite": "failed, given up: gradients were not finite; this is what was finite",
 }
 """How a run may end, in words."""
-_LISTED_VALUES = 4
 
 
 def ending(record: RunRecord) -> str:
@@ -193,9 +192,9 @@ def parameter_row(run: RunFolder, key: str) -> ParameterRow:
     return ParameterRow(
         key,
         " × ".join(str(n) for n in run.shape(key)) or "number",
-        _values(truth) if truth is not None else "",
-        _values(initial),
-        _values(result, run.record.standard_error.get(key)),
+        formatting.values(truth) if truth is not None else "",
+        formatting.values(initial),
+        formatting.values(result, run.record.standard_error.get(key)),
         _swatch(result),
         run.error_before.get(key),
         run.error_after.get(key),
@@ -203,18 +202,6 @@ def parameter_row(run: RunFolder, key: str) -> ParameterRow:
         None if told is None or truth is None else measure.error(result, truth, seen_cells(told)),
         None if told is None or (where := seen_cells(told)) is None else float(where.mean()),
     )
-
-
-def _values(array: np.ndarray, standard_error: Sequence[float] | None = None) -> str:
-    """Return an array's elements as text, few of them with their standard errors; of many the least and the largest."""
-    if array.size == 0:
-        return ""
-    if array.size > _LISTED_VALUES:
-        return " … ".join(formatting.number(float(value)) for value in (array.min(), array.max()))
-    values = [formatting.number(float(value)) for value in array.reshape(-1)]
-    if standard_error is not None and len(standard_error) == len(values):
-        values = [f"{value} ± {formatting.number(error)}" for value, error in zip(values, standard_error, strict=True)]
-    return ", ".join(values)
 
 
 def _swatch(array: np.ndarray) -> str:
