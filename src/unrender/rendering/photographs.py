@@ -9,6 +9,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.camera_poses import POSES, PosedCameras
 from unrender.rendering.exposure import EXPOSURE, ExposedRenderer
+from unrender.rendering.expressions import ExpressionRenderer
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import Renderer
 from unrender.rendering.response import RESPONSE, RespondingRenderer
@@ -39,16 +40,19 @@ def check_response(names: Collection[str]) -> None:
 
 
 def scene_renderer(renderer: Renderer) -> Renderer:
-    """Return what renders the scene alone, without ties, parameters of photographs and worlds of single views."""
-    renderer = _without_photographs(renderer)
-    renderer = renderer.inner if isinstance(renderer, TiedRenderer) else renderer
-    return renderer.inner if isinstance(renderer, WorldsRenderer) else renderer
+    """Return the renderer of the scene alone, without ties, expressions, parameters of photographs and worlds of single views."""
+    while isinstance(renderer, (WithParameter, TiedRenderer, ExpressionRenderer, WorldsRenderer)):
+        renderer = renderer.inner
+    return renderer
 
 
 def member_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the values with each tie replaced by its members."""
+    """Return the values with each tie replaced by its members, and unknowns of expressions by the parameters that depend on them."""
     base = _without_photographs(renderer)
-    return base.scene_values(values) if isinstance(base, TiedRenderer) else dict(values)
+    found = dict(values)
+    while isinstance(base, (TiedRenderer, ExpressionRenderer)):
+        found, base = base.scene_values(found), base.inner
+    return found
 
 
 def _without_photographs(renderer: Renderer) -> Renderer:
@@ -106,4 +110,4 @@ def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[s
         if isinstance(renderer, PosedCameras) and POSES in values:
             scene |= renderer.corrections.poses(np.asarray(values[POSES]))
         renderer = renderer.inner
-    return renderer.scene_values(scene) if isinstance(renderer, TiedRenderer) else scene
+    return member_values(renderer, scene)

@@ -12,6 +12,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.io import scene_files
+from unrender.rendering.expressions import expression_layer
 from unrender.scene.parameter import ties_of
 from unrender.scene.problem import Problem
 
@@ -77,6 +78,8 @@ def _take(problem: Problem) -> dict[str, str]:
         parts[f"view {index}: weight"] = str(view.weight)
         parts[f"view {index}: reference"] = _of_array(np.asarray(view.reference))
         parts[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
+    if (layer := expression_layer(problem.renderer)) is not None:
+        parts |= {f"expression of {one.key}": one.text or "a function" for one in layer.expressions}
     for index, view in enumerate(problem.given_views):
         known = {} if view.known is None else dict(sorted(view.known.items()))
         fields = {

@@ -17,6 +17,7 @@ from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.losses import L2, Loss
 from unrender.preconditioners.mesh import MeshTopology
+from unrender.rendering.expressions import ExpressionError, are_storable, with_expressions
 from unrender.rendering.photographs import with_photographs
 from unrender.rendering.renderer import Renderer
 from unrender.scene import notebook
@@ -70,6 +71,10 @@ class Problem(ViewLosses):
             and channels of mask * loss.
         max_depth: maximum path length in segments, >= 1 (1: directly visible emitters, 2: direct illumination). None takes the value of
             the scene's integrator: 64 if that is unlimited, 6 if there is no integrator.
+        expressions: {key of the scene: text or function}: parameters of the scene that are differentiable functions of unknowns which the
+            scene does not have, such as {"left.intensity.value": "strength * [1, 0.8, 0.6]"}. A function takes {key of an unknown: Dr.Jit
+            tensor} and returns a tensor. `rendering.expression_texts.parse` describes texts. Such an unknown needs an `initial` value,
+            whose shape is its own.
         truth: {key: value} of parameters with a known true value, to measure the error; values as for `Parameter.initial`.
         name: name for display; None takes the name of the scene file.
         surfaces: {key: `scene.surfaces.Surface`} of vertex positions whose true surface is known, but not the true position of each
@@ -121,13 +126,14 @@ class Problem(ViewLosses):
         truth: Mapping[str, Any] | None = None,
         name: str | None = None,
         surfaces: Mapping[str, Surface] | None = None,
+        expressions: Mapping[str, str | Callable[..., Any]] | None = None,
     ):
         check_max_depth(max_depth)
         checked_loss = check_loss(L2() if loss is None else loss)
         given: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         given_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
-        renderer, located = _opened(scene, max_depth, given, given_views)
+        renderer, located = _opened(scene, max_depth, given, given_views, expressions or {})
         unknowns = _unknowns(given, renderer, truth or {}, surfaces or {})
         checked_views, view_notices = check_views(located, renderer, checked_loss)
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))
@@ -140,7 +146,7 @@ class Problem(ViewLosses):
             loss=checked_loss,
             max_depth=max_depth or longest_path(renderer),
             name=name or (path.stem if path else "problem"),
-            origin={"scene": str(path.resolve())} if path else {},
+            origin={"scene": str(path.resolve())} if path and are_storable(renderer) else {},
             notices=[*renderer_notices(renderer), *told, *view_notices],
             references=References(checked_views, renderer.array),
             executor=LOCAL,
@@ -309,11 +315,15 @@ class Problem(ViewLosses):
 
 
 def _opened(
-    scene: Any, max_depth: int | None, parameters: Sequence[Parameter], views: Sequence[View]
+    scene: Any,
+    max_depth: int | None,
+    parameters: Sequence[Parameter],
+    views: Sequence[View],
+    expressions: Mapping[str, Any],
 ) -> tuple[Renderer, tuple[View, ...]]:
     """Return the renderer of a scene, with unknowns that photographs have, and the views by its sensors. Raises `FieldError`."""
     keys = [parameter.key for parameter in parameters if isinstance(parameter.key, str)]
-    renderer = open_scene(scene, max_depth, parameters, known_keys(views))
+    renderer = open_scene(scene, max_depth, parameters, known_keys(views), expressions)
     members = scene_keys(parameters)
     renderer, located = of_views(
         renderer, views, members, lambda of: open_renderer(of, max_depth, [*members, *known_keys(views)])
@@ -346,12 +356,29 @@ def _unknowns(
 
 
 def open_scene(
-    scene: Any, max_depth: int | None, parameters: Sequence[Parameter], others: Sequence[str] = ()
+    scene: Any,
+    max_depth: int | None,
+    parameters: Sequence[Parameter],
+    others: Sequence[str] = (),
+    expressions: Mapping[str, Any] | None = None,
 ) -> Renderer:
     """Return the renderer of a scene in which the ties of these parameters are unknowns. Raises `FieldError`.
 
     Args:
         scene, max_depth, parameters: As for `Problem`.
         others: Further parameters that will be asked for.
+        expressions: Parameters of the scene that are functions of unknowns.
     """
-    return tied(open_renderer(scene, max_depth, [*scene_keys(parameters), *others]), parameters, ties_of(parameters))
+    functions = expressions or {}
+    renderer = open_renderer(scene, max_depth, [*scene_keys(parameters), *others, *functions])
+    try:
+        renderer = with_expressions(
+            renderer, functions, {p.key: p.initial for p in parameters if isinstance(p.key, str)}
+        )
+    except ExpressionError as error:
+        raise FieldError(("expressions", error.key), str(error), f"expression of {error.key}") from error
+    except InputError as error:
+        name, _, what = str(error).partition(": ")
+        index = [parameter.key for parameter in parameters].index(name)
+        raise FieldError(("parameters", index, "key"), what, f"parameter {name}") from error
+    return tied(renderer, parameters, ties_of(parameters))

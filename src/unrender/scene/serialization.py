@@ -17,6 +17,7 @@ import tomli_w
 
 from unrender.core import tables
 from unrender.io import files, toml_lines
+from unrender.rendering.expressions import expression_layer
 from unrender.scene.problem import Problem
 from unrender.scene.unknown import Unknown
 
@@ -66,7 +67,9 @@ def _described(problem: Problem, folder: Path) -> dict[str, Any]:
         views.append(table)
     scene = {"scene": problem.origin["scene"]} if rebuilt else {}
     head = {"name": problem.name, **scene, "max_depth": problem.max_depth, "loss": _component(problem.loss)}
-    return {**head, "parameters": parameters, "views": views}
+    layer = expression_layer(problem.renderer)
+    texts = {} if layer is None else {one.key: one.text for one in layer.expressions if one.text is not None}
+    return {**head, **({"expressions": texts} if texts else {}), "parameters": parameters, "views": views}
 
 
 def _parameter(index: int, unknown: Unknown, store: _Arrays) -> dict[str, Any]:

@@ -5,6 +5,9 @@
     max_depth = 6                              # default: that of the scene's integrator
     loss = "L1"                                # or { type = "Huber", delta = 0.1 }
 
+    [expressions]
+    "lamp.intensity.value" = "2 * strength"    # a parameter as a function of unknowns that the scene does not have
+
     [[parameters]]
     key = "wall.bsdf.reflectance.data"         # or keys = [...] for parameters that share one value; { "a" = 1, "b" = 0.5 } for factors
     initial = 0.5                              # a number, a colour [r, g, b], an image, a grid (.vol), a mesh, an array (.npy)
@@ -108,6 +111,9 @@ class _Problem(Table):
     views: list[_View] = Field(description="at least one [[views]] table", min_length=1)
     name: StrictStr | None = Field(None, description="a string of at most 200 characters", max_length=200)
     max_depth: StrictInt | None = Field(None, description="a whole number of at least 1")
+    expressions: dict[str, StrictStr] | None = Field(
+        None, description='a table of texts by key of the scene, such as { "lamp.intensity.value" = "2 * strength" }'
+    )
     loss: StrictStr | dict[str, Any] = Field(
         "L2", description='a name such as "L1", or a table such as { type = "Huber", delta = 0.1 }'
     )
@@ -149,6 +155,7 @@ def _build(model: _Problem, file: Path) -> Problem:
         model.max_depth,
         truth={p.key: _value(truth, folder) for p, truth in truths if truth is not None},
         name=model.name or file.stem,
+        expressions=model.expressions,
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.rendering.expressions import expression_layer
 from unrender.rendering.photographs import scene_renderer, sensors_with_rows, with_photographs
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem, open_scene
@@ -31,6 +32,7 @@ class _Parts(NamedTuple):
     max_depth: int
     name: str
     sensors: tuple[int, ...] | None
+    expressions: Any
 
 
 def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
@@ -47,7 +49,20 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     given = [_located(problem.given_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
     sensors = sensors_with_rows(problem.renderer)
-    parts = _Parts(_scene(problem), parameters, given, problem.loss, problem.max_depth, problem.name, sensors)
+    if sensors is not None and any(view.known is not None or view.scene is not None for view in problem.given_views):
+        raise InputError(
+            f"workers: {problem.name} has parameters of photographs beside views of different worlds; leave --workers out"
+        )
+    parts = _Parts(
+        _scene(problem),
+        parameters,
+        given,
+        problem.loss,
+        problem.max_depth,
+        problem.name,
+        sensors,
+        _expressions(problem),
+    )
     buffer = io.BytesIO()
     try:
         _pickler(ray)(buffer).dump(parts)
@@ -68,8 +83,22 @@ def unpacked(blob: bytes, ray: Any) -> Problem:
     scene = parts.scene
     if parts.sensors is not None:
         keys = [parameter.key for parameter in parts.parameters]
-        scene = with_photographs(open_scene(scene, parts.max_depth, parts.parameters), keys, parts.sensors)
-    return Problem(scene, parts.parameters, parts.views, parts.loss, parts.max_depth, name=parts.name)
+        scene = open_scene(scene, parts.max_depth, parts.parameters, (), parts.expressions)
+        scene = with_photographs(scene, keys, parts.sensors)
+    return Problem(
+        scene,
+        parts.parameters,
+        parts.views,
+        parts.loss,
+        parts.max_depth,
+        name=parts.name,
+        expressions=parts.expressions,
+    )
+
+
+def _expressions(problem: Problem) -> dict[str, Any]:
+    layer = expression_layer(problem.renderer)
+    return {} if layer is None else {one.key: one.text or one.function for one in layer.expressions}
 
 
 def _scene(problem: Problem) -> Any:
@@ -90,7 +119,11 @@ def _scene(problem: Problem) -> Any:
 def _located(given: _Given, *names: str) -> _Given:
     """The same, its files named in full: workers have folders of their own."""
     found = {name: value for name in names if isinstance(value := getattr(given, name), (str, Path))}
-    return replace(given, **{name: Path(value).absolute() for name, value in found.items()})
+    located: dict[str, Any] = {name: Path(value).absolute() for name, value in found.items()}
+    if isinstance(given, View) and given.known is not None:
+        known = given.known.items()
+        located["known"] = {k: Path(x).absolute() if isinstance(x, (str, Path)) else x for k, x in known}
+    return replace(given, **located)
 
 
 def _pickler(ray: Any) -> Any:

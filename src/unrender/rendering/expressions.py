@@ -1,0 +1,347 @@
+"""Parameters of a scene as functions of unknowns that the scene does not have: a renderer around another one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from unrender.core import arrays, trees
+from unrender.core.arrays import Array
+from unrender.core.errors import InputError
+from unrender.core.suggestions import did_you_mean
+from unrender.core.trees import Tree
+from unrender.io import bounded_files
+from unrender.rendering.expression_texts import ExpressionError, Function, parse
+from unrender.rendering.renderer import (
+    ParameterInfo,
+    Renderer,
+    RenderSession,
+    SampleRequest,
+    Space,
+    differentiated,
+)
+from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
+
+__all__ = [
+    "Expression",
+    "ExpressionError",
+    "ExpressionRenderer",
+    "are_storable",
+    "expression_layer",
+    "with_expressions",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Expression:
+    """A parameter of the scene as a differentiable function of unknowns.
+
+    Attributes:
+        key: Parameter of the scene.
+        function: Maps {name: Dr.Jit tensor of the unknown's shape} to a tensor that broadcasts to the parameter's shape.
+        text: The text form; None for a Python function.
+    """
+
+    key: str
+    function: Function
+    text: str | None = None
+
+    @classmethod
+    def of(cls, key: str, given: Any) -> Expression:
+        """Return the expression that a user gives: a function, or a text. Raises `ExpressionError`."""
+        if isinstance(given, str):
+            return cls(key, parse(key, given), given)
+        if not callable(given):
+            raise ExpressionError(key, f"expected a function or a text such as '2 * strength', got {given!r:.60}")
+        return cls(key, given)
+
+
+class _Reads(Mapping[str, Any]):
+    """The values of unknowns by name, at least one, and which of them were read.
+
+    Attributes:
+        names: Names that were read, in their order.
+        like: One of the values, not counted as read.
+    """
+
+    def __init__(self, values: Mapping[str, Any]):
+        self._values, self.names = values, dict[str, None]()
+        self.like = next(iter(values.values()))
+
+    def __getitem__(self, name: str) -> Any:
+        self.names[name] = None
+        return self._values[name]
+
+    def __iter__(self):
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
+class ExpressionRenderer(RendererWrapper):
+    """A renderer with unknowns of their own, of which parameters of the scene are functions.
+
+    Images and gradients are as unbiased as the inner renderer's: the gradient by an unknown is that by the parameters times the
+    derivatives of the functions.
+
+    Args:
+        inner: Renders the scene with Dr.Jit arrays.
+        expressions: One for each parameter that is a function.
+        unknowns: {name: initial value} of the unknowns that the functions may read.
+
+    Raises:
+        ExpressionError: A function reads what is no unknown, fails, or its result does not suit the parameter.
+        InputError: No function reads one of the unknowns.
+    """
+
+    def __init__(self, inner: Renderer, expressions: Iterable[Expression], unknowns: Mapping[str, np.ndarray]):
+        super().__init__(inner)
+        self.expressions = tuple(expressions)
+        self.max_depth = getattr(inner, "max_depth", 6)
+        self.unknowns = {name: np.array(value, np.float32) for name, value in unknowns.items()}
+        known = inner.parameters()
+        start = {name: inner.array(value) for name, value in self.unknowns.items()}
+        self.reads = {one.key: self._checked(one, known, start) for one in self.expressions}
+        if unread := next((name for name in start if not any(name in names for names in self.reads.values())), None):
+            raise InputError(f"{unread}: neither a parameter of the scene nor read by an expression")
+        targets = {name: [key for key, names in self.reads.items() if name in names] for name in self.unknowns}
+        infos = {name: _info(self.unknowns[name].shape, [known[key] for key in keys]) for name, keys in targets.items()}
+        taken = set(self.reads)
+        self._info = {**{key: info for key, info in known.items() if key not in taken}, **infos}
+        self._targets = targets
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """See `Renderer.parameters`. Parameters that are functions are none of their own."""
+        return self._info
+
+    def values(self, keys: list[str]) -> Tree:
+        """See `Renderer.values`: of an unknown, its initial value."""
+        scene = self.inner.values([key for key in keys if key not in self.unknowns])
+        own = {key: self.array(self.unknowns[key]) for key in keys if key in self.unknowns}
+        return {key: own[key] if key in own else scene[key] for key in keys}
+
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> RenderSession:
+        """See `Renderer.prepare`."""
+        wanted = differentiated(keys, derivatives)
+        inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(wanted)))
+        return _ExpressionSession(self, inner, wanted)
+
+    def expanded(self, keys: Iterable[str]) -> list[str]:
+        """Return the parameters of the scene that depend on these."""
+        return list(dict.fromkeys(member for key in keys for member in self._targets.get(key, [key])))
+
+    def around(self, inner: Renderer) -> ExpressionRenderer:
+        """Return the same functions around another renderer."""
+        return ExpressionRenderer(inner, self.expressions, self.unknowns)
+
+    def evaluated(self, values: Mapping[str, Any]) -> Tree:
+        """Return the scene's parameters that depend on any of `values`; unknowns that are not among these have their initial values."""
+        missing = {name: self.array(x) for name, x in self.unknowns.items() if name not in values}
+        whole, shapes = _Reads({**missing, **values}), self.inner.parameters()
+        needed = {key for name in values if name in self.unknowns for key in self._targets[name]}
+        return {one.key: _shaped(one, whole, shapes[one.key].shape) for one in self.expressions if one.key in needed}
+
+    def scene_values(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return {key of the scene: value} for values of unknowns and of the scene's parameters."""
+        own = {name: self.array(np.asarray(x, np.float32)) for name, x in values.items() if name in self.unknowns}
+        rest = {key: value for key, value in values.items() if key not in self.unknowns}
+        return rest | ({key: arrays.numpy(x) for key, x in self.evaluated(own).items()} if own else {})
+
+    def _checked(self, one: Expression, known: Mapping[str, ParameterInfo], start: Tree) -> tuple[str, ...]:
+        """Return the names that an expression reads."""
+        if one.key not in known:
+            raise ExpressionError(one.key, f"the scene has no parameter {one.key}{did_you_mean(one.key, known)}")
+        info = known[one.key]
+        if info.welded or not (info.perturbable or info.differentiable):
+            raise ExpressionError(one.key, f"{one.key} cannot be a function: {info.reason or 'it is a moving mesh'}")
+        reads = _Reads(start)
+        try:
+            found = arrays.numpy(_shaped(one, reads, info.shape))
+        except KeyError as error:
+            hint = did_you_mean(str(error.args[0]), start)
+            raise ExpressionError(one.key, f"no parameter is called {error.args[0]}{hint}") from error
+        except ExpressionError:
+            raise
+        except Exception as error:  # a function of the user's, or shapes that do not go together
+            words = " ".join(str(error).split())[:200]
+            raise ExpressionError(one.key, f"it cannot be evaluated at the initial values: {words}") from error
+        if not np.isfinite(found).all():
+            raise ExpressionError(one.key, "it is not finite at the initial values")
+        low, high = info.lowest, info.highest
+        if (low is not None and (found < low).any()) or (high is not None and (found > high).any()):
+            raise ExpressionError(one.key, f"at the initial values it is outside of the range {low} to {high}")
+        if not reads.names:
+            raise ExpressionError(one.key, "it reads no unknown; set the value in the scene")
+        return tuple(reads.names)
+
+
+def with_expressions(renderer: Renderer, given: Mapping[str, Any], unknowns: Mapping[str, Any]) -> Renderer:
+    """Return the renderer with expressions, or itself where it has those already or there are none.
+
+    Args:
+        renderer: Renders the scene.
+        given: {key of the scene: function or text}.
+        unknowns: {key: initial value} of all unknowns; those that are parameters of the scene stay so.
+
+    Raises:
+        ExpressionError: See `ExpressionRenderer`.
+        InputError: An unknown without a finite initial value.
+    """
+    layer = expression_layer(renderer)
+    held = {} if layer is None else {one.key: one.text or one.function for one in layer.expressions}
+    if not given or held == dict(given):
+        return renderer
+    known, starts = renderer.parameters(), dict[str, np.ndarray]()
+    for name, value in unknowns.items():
+        if name in known:
+            continue
+        try:
+            given_value = bounded_files.read_array(Path(value)) if isinstance(value, (str, Path)) else value
+            starts[name] = np.atleast_1d(np.asarray(given_value, np.float32))
+        except (TypeError, ValueError):
+            starts[name] = np.full(1, np.nan, np.float32)
+        if value is None or not np.isfinite(starts[name]).all():
+            raise InputError(
+                f"{name}: an unknown of expressions needs an initial value: a number, or a list or array of these"
+            )
+    if not starts:
+        first = next(iter(given))
+        raise ExpressionError(first, "there is no unknown to read; name one that is no parameter of the scene")
+    return ExpressionRenderer(renderer, [Expression.of(key, one) for key, one in given.items()], starts)
+
+
+def expression_layer(renderer: Any) -> ExpressionRenderer | None:
+    """Return the `ExpressionRenderer` among nested wrappers; None where there is none."""
+    while isinstance(renderer, RendererWrapper):
+        if isinstance(renderer, ExpressionRenderer):
+            return renderer
+        renderer = renderer.inner
+    return None
+
+
+def are_storable(renderer: Any) -> bool:
+    """Return whether all expressions of a renderer have a text form."""
+    layer = expression_layer(renderer)
+    return layer is None or all(one.text is not None for one in layer.expressions)
+
+
+def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo:
+    """Return what a renderer says of an unknown on which these parameters depend."""
+    sensors = {info.sensor for info in targets}
+    return ParameterInfo(
+        shape,
+        differentiable=all(info.differentiable for info in targets),
+        shares_paths=all(info.shares_paths for info in targets),
+        reason=next((info.reason for info in targets if info.reason), ""),
+        perturbable=all(info.perturbable for info in targets),
+        rigid=any(info.rigid for info in targets),
+        viewpoint=any(info.viewpoint for info in targets),
+        sensor=sensors.pop() if len(sensors) == 1 else None,
+        nonlinear=any(info.nonlinear for info in targets),
+    )
+
+
+def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:
+    """Return the value of an expression, of the parameter's shape and of the kind of the unknowns' arrays."""
+    like = values.like
+    found = one.function(values)
+    if not arrays.is_drjit(found) or not dr.is_tensor_v(found):
+        found = type(like)(found)
+    if tuple(found.shape) == shape:
+        return found
+    try:
+        spread = np.broadcast_shapes(tuple(found.shape), shape)
+    except ValueError:
+        spread = ()
+    if spread != shape:
+        raise ExpressionError(one.key, f"its result has the shape {tuple(found.shape)}, {one.key} has {shape}")
+    return found + dr.zeros(type(like), shape)
+
+
+class _ExpressionSession(SessionWrapper):
+    """Images and derivatives with respect to unknowns that parameters of the scene depend on. See `RenderSession`."""
+
+    def __init__(self, renderer: ExpressionRenderer, inner: RenderSession, wanted: frozenset[str]):
+        super().__init__(inner)
+        self._renderer, self._wanted = renderer, wanted
+        self._known: list[tuple[Tree, Tree]] = []
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
+        """See `RenderSession.image_batch`."""
+        own, rest = self._split(parameters)
+        if not own:
+            return self._inner.image_batch(rest, request)
+        states = [
+            self._renderer.scene_values({k: x[n] for k, x in own.items()}) for n in range(len(next(iter(own.values()))))
+        ]
+        together = {key: np.stack([state[key] for state in states]) for key in states[0]}
+        for key, x in together.items():
+            if (x == x[:1]).all():  # shared by all, see `RenderSession.image_batch`
+                together[key] = np.broadcast_to(x[0], x.shape)
+        return self._inner.image_batch({**rest, **together}, request)
+
+    def _split(self, tree: Tree) -> tuple[Tree, Tree]:
+        unknowns = self._renderer.unknowns
+        return {k: x for k, x in tree.items() if k in unknowns}, {k: x for k, x in tree.items() if k not in unknowns}
+
+    def _state(self, parameters: Tree) -> Tree:
+        """Return the values of the scene's parameters: the same arrays for the same unknowns, which the scene need not set again."""
+        own, rest = self._split(parameters)
+        if not own:
+            return rest
+        for given, values in self._known:
+            if given.keys() == own.keys() and all(given[key] is x for key, x in own.items()):
+                return {**rest, **values}
+        with dr.suspend_grad():
+            values = self._renderer.evaluated(own)
+        arrays.evaluate(values)
+        self._known = [*self._known[-1:], (own, values)]
+        return {**rest, **values}
+
+    def _tangents(self, parameters: Tree, tangents: Tree) -> Tree:
+        """Return the tangents of the scene's parameters: the functions' derivatives along those of the unknowns."""
+        own, _ = self._split(parameters)
+        moved, rest = self._split(tangents)
+        leaves = _leaves(own)
+        found = self._renderer.evaluated(leaves)
+        for key, leaf in leaves.items():
+            dr.set_grad(leaf, moved[key])
+        dr.forward_to(*found.values())
+        along = {key: type(x)(dr.grad(x)) for key, x in found.items()}
+        arrays.evaluate(along)
+        return {**rest, **along}
+
+    def _gradient(self, parameters: Tree, found: Tree, paths: Any) -> Tree:
+        """Return the gradient by the unknowns: the functions' derivatives, transposed, times that by the scene's parameters."""
+        own, rest = self._split(parameters)
+        gradient = {key: found[key] for key in rest if key in found}
+        leaves = _leaves({key: x for key, x in own.items() if key in self._wanted})
+        if not leaves:
+            return gradient | trees.zeros_like(own)
+        fixed = {key: x for key, x in own.items() if key not in leaves}
+        values = self._renderer.evaluated({**fixed, **leaves})
+        products: list[Any] = [
+            dr.sum(x * dr.detach(found[key]), axis=None) for key, x in values.items() if key in found
+        ]
+        total: Any = sum(products[1:], products[0])
+        dr.backward(total)
+        own_gradient = {key: type(leaf)(dr.grad(leaf)) for key, leaf in leaves.items()}
+        arrays.evaluate(own_gradient)
+        return gradient | trees.zeros_like(fixed) | own_gradient
+
+
+def _leaves(own: Tree) -> Tree:
+    """Return copies of arrays as leaves of a derivative graph of their own."""
+    leaves = {key: type(x)(dr.detach(x)) for key, x in own.items()}
+    for leaf in leaves.values():
+        dr.enable_grad(leaf)
+    return leaves

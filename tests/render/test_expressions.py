@@ -1,0 +1,252 @@
+"""Parameters of a scene that are functions of unknowns: derivatives against differences, recoveries, files, and input that is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.core import arrays
+from unrender.core.errors import InputError
+from unrender.estimators.base import as_numpy
+from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.rendering.expression_texts import ExpressionError, parse
+from unrender.rendering.expressions import ExpressionRenderer
+from unrender.rendering.photographs import scene_values
+from unrender.scene.fingerprint import fingerprint
+
+pytestmark = pytest.mark.mitsuba
+
+PAINT, LEFT, RIGHT = "wall.bsdf.reflectance.data", "left.intensity.value", "right.intensity.value"
+LAMPS = {LEFT: "strength * [1, 0.8, 0.6]", RIGHT: "0.5 * strength * [1, 0.8, 0.6]"}
+ROWS = 4
+
+
+def scene(strength: float = 2.0, paint: Any = 0.5) -> dict[str, Any]:
+    """A wall with a texture under two lamps of one colour, the right of which is half as bright."""
+    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    texture = mi.Bitmap(np.broadcast_to(np.asarray(paint, np.float32), (ROWS, ROWS, 3)).copy())
+    colour = np.array([1, 0.8, 0.6]) * strength
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "sensor": {"type": "perspective", "fov": 35, "to_world": look, "film": film},
+        "wall": {
+            "type": "rectangle",
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": texture, "raw": True}},
+        },
+        "left": {"type": "point", "position": [-1, 0, 2], "intensity": {"type": "rgb", "value": colour.tolist()}},
+        "right": {"type": "point", "position": [1, 0, 2], "intensity": {"type": "rgb", "value": (colour / 2).tolist()}},
+    }
+
+
+def picture(**of: Any) -> np.ndarray:
+    return np.array(mi.render(mi.load_dict(scene(**of)), spp=512, seed=mi.UInt32(3)))
+
+
+def problem(
+    reference: np.ndarray, expressions: dict[str, Any], *parameters: ur.Parameter, **options: Any
+) -> ur.Problem:
+    return ur.Problem(scene, parameters, [ur.View(reference)], expressions=expressions, **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2 * a + b", [2 + 3.0, 4 + 3.0]),
+        ("a ** 2 - b / 4", [1 - 0.75, 4 - 0.75]),
+        ("-a[1] + [1, 2]", [-1.0, 0.0]),
+        ("exp(log(a)) + sqrt(b) * 0", [1.0, 2.0]),
+        ("max(a, 1.5) + min(b, 2)", [3.5, 4.0]),
+        ("mix(a, b, 0.25) + abs(sin(0)) + cos(0) - 1 + tanh(0)", [1.5, 2.25]),
+    ],
+)
+def test_texts_are_evaluated(text: str, expected: list[float]) -> None:
+    class Values(dict[str, Any]):
+        like = mi.TensorXf([0.0])
+
+    values = Values(a=mi.TensorXf([1.0, 2.0]), b=mi.TensorXf([3.0]))
+    assert np.array(parse("x", text)(values)) == pytest.approx(np.array(expected))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "a +",
+        "__import__('os').system('true')",
+        "a.real",
+        "(lambda: 1)()",
+        "a if b else c",
+        "exp(a, b)",
+        "[1, 'x']",
+        "f(a)",
+        "a @ b",
+    ]
+    + [
+        "True",
+        "'a'",
+        "a[b]",
+        "{1: 2}",
+        "exp(x=1)",
+        "+".join("a" * 900),
+        "(" * 80 + "a" + ")" * 80 + "**1" * 60,
+        "open"[:0] + "a; b",
+    ],
+)
+def test_texts_of_other_kinds_are_refused(text: str) -> None:
+    with pytest.raises(ExpressionError) as caught:
+        parse("lamp", text)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("image", ["plain", "rcv"])
+def test_gradients_by_unknowns_are_sums_over_the_parameters(image: str) -> None:
+    """Equal random numbers: the gradient by the strength is that by both lamps, times the derivatives of the functions."""
+    estimator = ur.PathGradient(RecursiveControlVariate(), spp=8) if image == "rcv" else ur.PathGradient(spp=8)
+    reference, tint = picture(strength=3.0), np.array([1, 0.8, 0.6])
+    one = problem(reference, LAMPS, ur.Parameter("strength", initial=2.0))
+    apart = ur.Problem(scene, [ur.Parameter(LEFT), ur.Parameter(RIGHT)], [ur.View(reference)])
+    gradients = []
+    for made in (one, apart):
+        point, state = made.initial(), estimator.init(made, made.initial())
+        for step in range(3):
+            estimate, state = estimator.estimate(made, point, state, ur.Key(1, step))
+        gradients.append(as_numpy(estimate).gradient)
+    expected = (gradients[1][LEFT] * tint).sum() + 0.5 * (gradients[1][RIGHT] * tint).sum()
+    assert gradients[0]["strength"] == pytest.approx([expected], rel=1e-4)
+    assert gradients[0]["strength"] != pytest.approx([1.03 * expected], rel=1e-4)
+
+
+def test_tangents_are_carried_through_functions() -> None:
+    """The squared derivative by the strength along 1 is that by both lamps along the functions' derivatives."""
+    reference, tint = picture(), np.array([1, 0.8, 0.6], np.float32)
+    one = problem(reference, LAMPS, ur.Parameter("strength", initial=2.0))
+    apart = ur.Problem(scene, [ur.Parameter(LEFT), ur.Parameter(RIGHT)], [ur.View(reference)])
+    request = ur.rendering.renderer.SampleRequest(0, 8, 5)
+    moments = []
+    for made, tangents in ((one, {"strength": np.ones(1, np.float32)}), (apart, {LEFT: tint, RIGHT: 0.5 * tint})):
+        point = made.initial()
+        session = made.renderer.prepare(list(point), None)
+        paths = session.image(point, request).paths
+        along = {key: made.renderer.array(x) for key, x in tangents.items()}
+        moments.append(arrays.numpy(session.tangent_moment(point, paths, along)))
+    assert moments[0].max() > 0
+    assert moments[0] == pytest.approx(moments[1], rel=1e-4)
+
+
+def test_two_lamps_of_one_strength_are_recovered() -> None:
+    made = problem(picture(strength=3.0), LAMPS, ur.Parameter("strength", initial=1.0), truth={"strength": 3.0})
+    result = ur.optimize(made, "auto", steps=80, progress=False)
+    assert result.parameters["strength"] == pytest.approx([3.0], rel=0.03)
+    assert result.status == "finished"
+
+
+def test_a_palette_and_its_mask_are_recovered() -> None:
+    """A texture of two colours, mixed by a mask: seven numbers and sixteen in place of 48."""
+    mask = np.zeros((ROWS, ROWS, 1), np.float32)
+    mask[:, 2:] = 1.0
+    truth = np.array([0.2, 0.3, 0.6]) * (1 - mask) + np.array([0.8, 0.5, 0.1]) * mask
+    made = problem(
+        picture(paint=truth),
+        {PAINT: "mix(palette[0], palette[1], mask)"},
+        ur.Parameter("palette", initial=[[0.4, 0.4, 0.4], [0.6, 0.6, 0.6]], bounds=(0, 1)),
+        ur.Parameter("mask", initial=0.25 + 0.5 * mask, bounds=(0, 1)),
+    )
+    result = ur.optimize(made, "auto", steps=200, progress=False)
+    found = scene_values(made.renderer, result.parameters)[PAINT]
+    assert np.sqrt(np.mean((found - truth) ** 2)) < 0.05
+
+
+def test_a_small_network_over_coordinates_is_a_texture() -> None:
+    """A Python function with Dr.Jit: a smooth texture from a layer of 16 sine units."""
+    rows, columns = (x.astype(np.float32) / ROWS for x in np.mgrid[:ROWS, :ROWS])
+    inputs = np.stack([rows.ravel(), columns.ravel(), np.ones(ROWS * ROWS, np.float32)], axis=1)
+    generator = np.random.default_rng(0)
+
+    def texture(values: Any) -> Any:
+        hidden = dr.sin(mi.TensorXf(inputs) @ values["first"])
+        return dr.reshape(mi.TensorXf, 0.5 + 0.4 * dr.tanh(hidden @ values["second"]), (ROWS, ROWS, 3))
+
+    ramp = 0.3 + 0.4 * columns[..., None] * np.ones(3)
+    made = problem(
+        picture(paint=ramp),
+        {PAINT: texture},
+        ur.Parameter("first", initial=generator.normal(size=(3, 16)), bounds=(-10, 10)),
+        ur.Parameter("second", initial=generator.normal(size=(16, 3)) * 0.1, bounds=(-10, 10)),
+    )
+    before = np.sqrt(np.mean((scene_values(made.renderer, made.initial_values())[PAINT] - ramp) ** 2))
+    result = ur.optimize(made, ur.PathGradient(spp=16), ur.optimizers.Adam(0.02), steps=200, progress=False)
+    after = np.sqrt(np.mean((scene_values(made.renderer, result.parameters)[PAINT] - ramp) ** 2))
+    assert after < 0.35 * before
+    assert not made.origin  # a function cannot be read from a file again
+
+
+# ---------------------------------------------------------------------- files
+
+XML = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="2"/></integrator>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,0,3" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/><rfilter type="box"/></film></sensor>
+<shape type="rectangle" id="wall"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
+<emitter type="point" id="lamp"><point name="position" x="0" y="0" z="2"/><rgb name="intensity" value="2"/></emitter></scene>"""
+
+
+def file(
+    folder: Path,
+    expression: str = "strength * [1, 0.5, 0.25]",
+    key: str = "lamp.intensity.value",
+    initial: str = "initial = 1.0",
+) -> Path:
+    (folder / "scene.xml").write_text(XML)
+    np.save(folder / "picture.npy", np.full((8, 8, 3), 0.05, np.float32))
+    text = (
+        f'scene = "scene.xml"\n[expressions]\n"{key}" = "{expression}"\n[[parameters]]\nkey = "strength"\n{initial}\n'
+    )
+    (folder / "problem.toml").write_text(text + '[[views]]\nreference = "picture.npy"\n')
+    return folder / "problem.toml"
+
+
+def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
+    made = ur.Problem.from_file(file(tmp_path))
+    assert isinstance(made.renderer, ExpressionRenderer)
+    assert fingerprint(made)["expression of lamp.intensity.value"] == "strength * [1, 0.5, 0.25]"
+    assert ur.render(made, spp=4)[..., 0].mean() == pytest.approx(4 * ur.render(made, spp=4)[..., 2].mean(), rel=1e-4)
+    ur.optimize(made, "auto", steps=6, run_directory=tmp_path / "run", progress=False)
+    straight = ur.optimize(made, "auto", steps=12, run_directory=tmp_path / "straight", progress=False)
+    resumed = ur.resume(tmp_path / "run", steps=12)
+    assert resumed.parameters["strength"] == pytest.approx(straight.parameters["strength"], rel=1e-5)
+    again = made.replaced(parameters=[ur.Parameter("strength", initial=2.0)])
+    assert again.initial_values()["strength"] == pytest.approx([2.0])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"expression": "power"}, r"problem.toml:3: expressions.*: no parameter is called power"),
+        ({"expression": "2.0"}, r"it reads no unknown"),
+        ({"expression": "strength +"}, r"it is no expression"),
+        ({"expression": "-strength"}, r"outside of the range"),
+        ({"expression": "1 / (strength - 1)"}, r"it is not finite at the initial values"),
+        ({"expression": "strength * [1, 2]"}, r"has the shape \(2,\), lamp.intensity.value has \(3,\)"),
+        ({"key": "lamp.colour"}, r"the scene has no parameter lamp.colour"),
+        ({"initial": ""}, r"parameters\[0\].key: an unknown of expressions needs an initial value"),
+    ],
+)
+def test_an_expression_that_cannot_be_is_refused_in_one_line(
+    tmp_path: Path, change: dict[str, str], message: str
+) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        ur.Problem.from_file(file(tmp_path, **change))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_that_nothing_reads_is_refused() -> None:
+    parameters = [ur.Parameter("strength", initial=1.0), ur.Parameter("other", initial=1.0)]
+    with pytest.raises(InputError, match="parameter other: neither a parameter of the scene nor read by an expression"):
+        problem(picture(), LAMPS, *parameters)
