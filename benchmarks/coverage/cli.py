@@ -1,4 +1,4 @@
-"""`python -m benchmarks coverage`: measure Mitsuba's plugins, and write docs/reference/coverage.md and docs/reference/ranges.md."""
+"""`python -m benchmarks coverage`: measure Mitsuba's plugins. The site makes pages of the record."""
 
 from __future__ import annotations
 
@@ -21,32 +21,21 @@ def main(arguments: Sequence[str]) -> int:
     """Do what the command line says; the exit status."""
     parser = argparse.ArgumentParser("python -m benchmarks coverage", description=__doc__)
     parser.add_argument("plugins", nargs="*", help="measure these alone; the record keeps the others")
-    parser.add_argument("--ranges", action="store_true", help="write docs/reference/ranges.md alone")
-    parser.add_argument("--page", action="store_true", help="write the pages from the record, measure nothing")
     parser.add_argument("--descents", action="store_true", help="measure the descents alone; the record keeps the rest")
     parser.add_argument("--record", type=Path, default=RECORD, help="the record's file")
     given = parser.parse_args(arguments)
     ur.use()
-    from benchmarks.coverage import coverage_page, ranges_page
     from benchmarks.coverage.plugins import IN_INSTANCES, PLUGINS
 
-    if not (given.ranges or given.page):
-        scenes = {**PLUGINS, **IN_INSTANCES}
-        record = json.loads(given.record.read_text()) if given.record.is_file() else {}
-        for name in given.plugins or scenes:
-            known = record.get(name) if given.descents else None
-            if known is not None and "parameters" not in known:
-                continue  # refused as a whole
-            record[name] = apart.call(_measure, name, known, seconds=_SECONDS)
-            print(name, json.dumps(record[name]), flush=True)
-            given.record.write_text(json.dumps({key: record[key] for key in scenes if key in record}, indent=1) + "\n")
-    if given.record != RECORD:
-        return 0
-    if not given.ranges:
-        coverage_page.PAGE.write_text(coverage_page.page(json.loads(given.record.read_text())))
-        print(f"wrote {coverage_page.PAGE}")
-    ranges_page.PAGE.write_text(ranges_page.page())
-    print(f"wrote {ranges_page.PAGE}")
+    scenes = {**PLUGINS, **IN_INSTANCES}
+    record = json.loads(given.record.read_text()) if given.record.is_file() else {}
+    for name in given.plugins or scenes:
+        known = record.get(name) if given.descents else None
+        if known is not None and "parameters" not in known:
+            continue  # refused as a whole
+        record[name] = apart.call(_measure, name, known, seconds=_SECONDS)
+        print(name, json.dumps(record[name]), flush=True)
+        given.record.write_text(json.dumps({key: record[key] for key in scenes if key in record}, indent=1) + "\n")
     return 0
 
 

@@ -22,7 +22,7 @@ NO_VALUES = ("film", "filter", "integrator", "sampler")
 """Kinds of plugins that have no parameters of their own."""
 _HEAD = """# Physical ranges
 
-Written by `python -m benchmarks coverage --ranges` from a scene of each plugin of Mitsuba {version}.
+Built from a scene of each plugin of Mitsuba {version}.
 
 Bounds that a problem leaves out are these. A range belongs to the slot that reads a value: a texture has the range of the BSDF's slot,
 also through nested textures and volumes; a mesh attribute has the range of the slot whose `mesh_attribute` texture names it, over the

@@ -3,7 +3,7 @@
 python -m benchmarks                       list them
 python -m benchmarks NAME [options]        run one; `--help` tells its options
 python -m benchmarks results               write a page per benchmark, with figures, to docs/benchmarks
-python -m benchmarks coverage [options]    every plugin of Mitsuba; writes docs/reference/coverage.md and ranges.md
+python -m benchmarks coverage [options]    every plugin of Mitsuba; the site has a page of the record
 python -m benchmarks gpu                   the plan for a GPU, in slices; `--help` tells its options
 python -m benchmarks golden                compare short descents with their record; `--record` writes it
 python -m benchmarks alarms [options]      statuses and warnings of `auto` over the suite's rows

@@ -66,7 +66,7 @@ class Descent:
             return {}
         coordinates = run.problem.coordinates
         found = optimizer.standard_errors(self.state.optimizer, coordinates.of(run.parameters))
-        slopes = coordinates.slopes(run.parameters)
+        slopes = coordinates.slopes({key: run.parameters[key] for key in found})
         by_x = {key: np.abs(arrays.numpy(slopes[key])) * x if key in slopes else x for key, x in found.items()}
         return {key: x.astype(np.float32) for key, x in by_x.items()}
 

@@ -35,7 +35,7 @@ class Coordinates:
 
     def slopes(self, parameters: Tree) -> Tree:
         """Return {key: φ'} for the parameters that have a φ."""
-        return {key: φ.slope(parameters[key]) for key, φ in self.transforms.items()}
+        return {key: φ.slope(parameters[key]) for key, φ in self.transforms.items() if key in parameters}
 
     def curvatures(self, parameters: Tree) -> Tree:
         """Return {key: φ''} for the parameters that have a φ."""

@@ -225,12 +225,10 @@ class PosedScene:
     def numbers(self, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the poses as one array, (7 per target, B), from {key: (B, *shape)} of all chosen keys."""
         count = len(next(iter(parameters.values())))
-        rows = np.zeros((len(self._centres), 7, count), np.float32)
-        rows[:, 6] = 1.0
-        names = list(self._centres)
-        for key, (target, first, size) in self._slots.items():
-            rows[names.index(target), first : first + size] = np.reshape(parameters[key], (count, size)).T
-        return rows.reshape(-1, count)
+        columns = {key: np.reshape(parameters[key], (count, -1)).T for key in self._slots}
+        ends = np.zeros(count, np.float32), np.ones(count, np.float32)
+        poses = [numbers_of(target, self._slots, columns, *ends) for target in self._centres]
+        return np.array(poses, np.float32).reshape(-1, count)
 
     def at(self, scenes: list[Any], numbers: Any, batch: Any) -> Assembly:
         """Return the scene with each lane's poses.
@@ -305,10 +303,8 @@ def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.n
     result = {}
     chosen = {key: known[key] for key in parameters}
     for target, centre in centres(scene, {key.target for key in chosen.values()}).items():
-        numbers = np.array([0, 0, 0, 0, 0, 0, 1.0])
-        for key, (owner, first, size) in slots(chosen).items():
-            if owner == target:
-                numbers[first : first + size] = np.reshape(parameters[key], -1)
+        values = {key: np.reshape(parameters[key], -1) for key in chosen}
+        numbers = np.array(numbers_of(target, slots(chosen), values, 0.0, 1.0))
         linear = numbers[6] * Rotation.from_rotvec(numbers[3:6]).as_matrix()
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = linear, centre + numbers[:3] - linear @ centre
@@ -351,6 +347,24 @@ def slots(chosen: Mapping[str, PoseKey]) -> dict[str, tuple[str, int, int]]:
             owner[key.target, slot] = name
         result[name] = (key.target, first, size)
     return result
+
+
+def numbers_of(
+    target: str, slots: Mapping[str, tuple[str, int, int]], values: Mapping[str, Any], zero: Any, one: Any
+) -> list[Any]:
+    """Return the 7 numbers of a target's pose: translation, rotation vector, scale.
+
+    Args:
+        target: id of a shape, an emitter or a sensor.
+        slots: `slots()` of all chosen keys.
+        values: {key: its numbers, one after the other}.
+        zero, one: the numbers of a pose as loaded.
+    """
+    numbers = [zero] * 6 + [one]
+    for key, (owner, first, size) in slots.items():
+        if owner == target:
+            numbers[first : first + size] = values[key]
+    return numbers
 
 
 def _scene(objects: list[Any]) -> Any:

@@ -106,12 +106,9 @@ class RigidMotions:
         result = {}
         chosen = {key: self._keys[key] for key in values}
         slots = poses.slots(chosen)
+        parts = {key: [dr.gather(mi.Float, values[key], k) for k in range(size)] for key, (_, _, size) in slots.items()}
         for target in {pose.target for pose in chosen.values()}:
-            numbers: list[Any] = [mi.Float(0)] * 6 + [mi.Float(1)]
-            for key, (owner, first, size) in slots.items():
-                if owner == target:
-                    for k in range(size):
-                        numbers[first + k] = dr.gather(mi.Float, values[key], k)
+            numbers = poses.numbers_of(target, slots, parts, mi.Float(0), mi.Float(1))
             result[target] = Pose(self._centres[target], numbers[0:3], numbers[3:6], numbers[6])
         return result
 
