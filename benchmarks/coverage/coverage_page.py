@@ -13,8 +13,8 @@ __all__ = ["PAGE", "page"]
 PAGE = ROOT / "docs" / "reference" / "coverage.md"
 _HEAD = """# Coverage of Mitsuba's plugins
 
-Built from the record of `python -m benchmarks coverage`: a scene of 16 x 16 pixels for each plugin of Mitsuba 3.9.1. The rows *in instances* have
-the plugin's shape in a `shapegroup` with two instances; one parameter of each is measured, with a quarter of the samples.
+Built from the record of `python -m benchmarks coverage`: a scene of 16 x 16 pixels for each plugin of Mitsuba 3.9.1. The rows *in
+instances* have the plugin's shape in a `shapegroup` with two instances; one parameter of each is measured, with a quarter of the samples.
 
 | column | contents |
 |---|---|

@@ -12,6 +12,7 @@ import unrender as ur
 from unrender.core import arrays
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import FreshGradient, PastWeight, Variance
+from unrender.methods.plan import bind
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.numpy.linear import AnalyticRenderer
@@ -126,7 +127,7 @@ def _on_sheet() -> Any:
     topology = _sheet(4)
     inner = ur.optimizers.ScheduleFree(0.05, preconditioner=Sobolev(), preconditioned=("vertices",))
     partitioned = ur.optimizers.Partitioned(("colour",), ur.optimizers.Adam(0.01, uniform=True), inner)
-    return partitioned.on_meshes(lambda key: topology if key == "vertices" else None)
+    return bind(partitioned, lambda key: topology if key == "vertices" else None, {})
 
 
 def _sheet(side: int) -> MeshTopology:

@@ -10,6 +10,7 @@ import pytest
 
 import unrender as ur
 from unrender.estimators.base import Estimate
+from unrender.methods.plan import bind
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.mitsuba.edges import edges_of
@@ -90,7 +91,7 @@ def test_schedule_free_smooths_values_at_vertices_where_the_problem_knows_their_
     topology = MeshTopology.of(*sheet(12), welded=False)
     count = 3 * len(topology.places)
     optimizer = ur.optimizers.ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("ball.vertex_color",))
-    bound = optimizer.on_meshes(lambda key: topology)
+    bound = bind(optimizer, lambda key: topology, {})
     assert bound == optimizer
     rng, start = np.random.default_rng(0), {"ball.vertex_color": np.zeros(count, np.float32)}
     state, values = bound.init(start), dict(start)
@@ -125,6 +126,7 @@ def mesh(points: Any, faces: Any, flat: bool = False) -> Any:
     )
 
 
+@pytest.mark.mitsuba
 def test_edges_of_closed_open_and_broken_meshes() -> None:
     closed = edges_of(mesh(POINTS, FACES), None)
     assert len(closed.ends) == 6

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import operator
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimator
 from unrender.optimizers.base import Optimizer
+from unrender.optimizers.transforms.fitted_sobolev import FittedSobolev
+from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.parameter import ParameterSettings
 from unrender.scene.problem import Problem
@@ -44,6 +47,10 @@ class Plan:
     def configured(self) -> Problem:
         """Return the problem with the settings of this plan. Raises `InputError` for a setting that does not suit."""
         return self.problem.configured(self.settings)
+
+    def bound_optimizer(self, problem: Problem) -> Optimizer:
+        """Return the optimizer for the meshes and repeated border columns of a problem's parameters."""
+        return bind(self.optimizer, problem.topology, problem.coordinates.repeated)
 
     def table(self) -> dict[str, Any]:
         """Return the plan as TOML has it: estimator, optimizer, settings by key.
@@ -81,6 +88,33 @@ class Plan:
                 raise InputError(f"{where}: {name}: {type(made[name]).__name__} is no {name}")
         settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in table.get("settings", {}).items()}
         return cls(problem, made["estimator"], made["optimizer"], settings)
+
+
+def bind(part: Any, topology: Callable[[str], MeshTopology | None], repeated: Mapping[str, int]) -> Any:
+    """Return an optimizer whose preconditioners know the neighbours of a parameter's elements.
+
+    Every `FittedSobolev` is bound, wherever it is among the fields of the optimizer and its parts.
+
+    Args:
+        part: optimizer, transform, or a tuple of these.
+        topology: function from a key to the parameter's mesh; None if it has none.
+        repeated: {key: number of repeated border columns}.
+    """
+    if isinstance(part, FittedSobolev):
+        return part.bound(topology, repeated)
+    if isinstance(part, tuple):
+        parts = tuple(bind(each, topology, repeated) for each in part)
+        return part if all(map(operator.is_, part, parts)) else parts
+    if not is_dataclass(part) or isinstance(part, type):
+        return part
+    pairs = {each.name: getattr(part, each.name) for each in fields(part)}
+    bound = {name: new for name, old in pairs.items() if (new := bind(old, topology, repeated)) is not old}
+    if not bound:
+        return part
+    result = replace(part)
+    for name, value in bound.items():  # also of fields that are no arguments
+        object.__setattr__(result, name, value)
+    return result
 
 
 def _table(component: Any) -> dict[str, Any] | str:

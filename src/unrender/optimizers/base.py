@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any, Protocol, runtime_checkable
 
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.preconditioners.mesh import MeshTopology
 
 
 class Optimizer(Protocol):
@@ -28,22 +27,6 @@ class Optimizer(Protocol):
 
     def update(self, estimate: Estimate, state: Any, parameters: Tree) -> tuple[Tree, Any]:
         """Return the steps to add to the parameters, and the next state."""
-        ...
-
-
-@runtime_checkable
-class OnMeshes(Protocol):
-    """An optimizer with preconditioners that depend on the neighbours of a parameter's elements."""
-
-    def on_meshes(
-        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
-    ) -> Optimizer:
-        """Return the optimizer for a problem's parameters.
-
-        Args:
-            topology: function from a key to the parameter's mesh; None if it has none.
-            repeated: function from a key to the number of repeated border columns; None if no parameter has any.
-        """
         ...
 
 

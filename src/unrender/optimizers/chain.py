@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -14,9 +14,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.optimizers import rates
-from unrender.optimizers.base import OnMeshes
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_transforms
-from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 from unrender.schedules.functions import Schedule
 
@@ -126,9 +124,3 @@ class Chain(Recipe):
 
     def compose(self) -> tuple[StepTransform, ...]:
         return self.transforms
-
-    def on_meshes(
-        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
-    ) -> Chain:
-        bound = (part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part for part in self.transforms)
-        return replace(self, transforms=tuple(bound))  # pyright: ignore[reportArgumentType]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,8 +14,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate, Capabilities, FreshGradient, Gradient
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.base import Choosing, Measuring, OnMeshes, Optimizer
-from unrender.preconditioners.mesh import MeshTopology
+from unrender.optimizers.base import Choosing, Measuring, Optimizer
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
 
@@ -73,15 +72,6 @@ class Partitioned:
     @property
     def _solves_block(self) -> bool:
         return self.optimizer.requires != Capabilities(Gradient)
-
-    def on_meshes(
-        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
-    ) -> Partitioned:
-        own, others = (
-            part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part
-            for part in (self.optimizer, self.others)
-        )
-        return replace(self, optimizer=own, others=others)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> PartitionedState:
         """Return the state before the first step. Raises `InputError` for an unknown key."""

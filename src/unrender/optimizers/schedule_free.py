@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from unrender.core import checks
 from unrender.core.errors import InputError
@@ -18,7 +18,6 @@ from unrender.optimizers.transforms.scale import ScaleByRms
 from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
 from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
 from unrender.preconditioners.base import Preconditioner
-from unrender.preconditioners.mesh import MeshTopology
 from unrender.schedules.functions import Schedule
 
 
@@ -94,13 +93,6 @@ class ScheduleFree(Recipe):
         object.__setattr__(self, "_smoothing", FittedSobolev(self.preconditioner, keys))
         moved = checked_keys("ScheduleFree: reparameterised", self.reparameterised)
         object.__setattr__(self, "reparameterised", moved)
-
-    def on_meshes(
-        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
-    ) -> ScheduleFree:
-        optimizer = replace(self)
-        object.__setattr__(optimizer, "_smoothing", self._smoothing.on_meshes(topology, repeated))
-        return optimizer
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
         """Return the state before the first step. Raises `InputError` for an unknown parameter, or one that S does not support."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from unrender.core import arrays, periodic
 from unrender.core.arrays import Array
@@ -41,6 +41,15 @@ class PeriodicPreconditioner(Protocol):
     def on_repeated(self, columns: int) -> Preconditioner:
         """Return the preconditioner for (H, W + 2 `columns`, C), where the left and right borders are neighbours."""
         ...
+
+
+def bound_to(preconditioner: Any, topology: MeshTopology | None, columns: int) -> Any:
+    """Return a preconditioner for values at the vertices of a mesh, or with repeated border columns; itself for other parameters."""
+    if isinstance(preconditioner, MeshPreconditioner) and topology is not None:
+        return preconditioner.on_mesh(topology)
+    if isinstance(preconditioner, PeriodicPreconditioner) and columns:
+        return preconditioner.on_repeated(columns)
+    return preconditioner
 
 
 _Inner = TypeVar("_Inner", bound=Preconditioner)

@@ -18,7 +18,7 @@ from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.estimators.coordinates import by_coordinates
 from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
-from unrender.optimizers.base import Choosing, Measuring, OnMeshes, Optimizer
+from unrender.optimizers.base import Choosing, Measuring, Optimizer
 from unrender.runs.hooks import Hook
 from unrender.runs.mesh_guard import guarded
 from unrender.runs.metadata import RunMetadata
@@ -99,15 +99,14 @@ class Descent:
 def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> tuple[Run, RunState]:
     """Return a run before its first step. Raises `InputError` for a seed that no file could hold."""
     seed = check_seed("seed", seed)
-    problem, estimator, optimizer = plan.configured(), plan.estimator, plan.optimizer
+    problem, estimator = plan.configured(), plan.estimator
+    optimizer = plan.bound_optimizer(problem)
     problem.executor.check(estimator)
     if optimizer.requires == Capabilities(LossFunction):  # a search, whose mean would not be where the loop has it
         for key in problem.coordinates.preconditioners:
             raise InputError(
                 f"{type(optimizer).__name__}: parameter {key} has a preconditioner; leave it out, a search has a covariance of its own"
             )
-    if isinstance(optimizer, OnMeshes):
-        optimizer = optimizer.on_meshes(problem.topology, lambda key: problem.coordinates.repeated.get(key, 0))
     run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
     initialize(run, state, 0)

@@ -18,7 +18,7 @@ from unrender.core.text import shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Bounds, Parameterisation, Transform
-from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
+from unrender.preconditioners.base import Preconditioner, bound_to
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
@@ -239,10 +239,7 @@ def _check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) ->
     """Return the preconditioner, bound to the parameter's mesh if there is one. Raises `InputError` if it does not suit."""
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
-    if isinstance(preconditioner, MeshPreconditioner) and (topology := mesh_topology(info)) is not None:
-        preconditioner = preconditioner.on_mesh(topology)
-    elif isinstance(preconditioner, PeriodicPreconditioner) and info.conversion.repeated:
-        preconditioner = preconditioner.on_repeated(info.conversion.repeated)
+    preconditioner = bound_to(preconditioner, mesh_topology(info), info.conversion.repeated)
     try:
         preconditioner.check(key, info.shape)
     except InputError as error:

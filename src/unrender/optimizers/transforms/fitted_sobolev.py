@@ -25,7 +25,7 @@ from unrender.optimizers.transforms.base import (
     checked_keys,
 )
 from unrender.preconditioners import Sobolev
-from unrender.preconditioners.base import MeshPreconditioner, PeriodicPreconditioner, Preconditioner
+from unrender.preconditioners.base import Preconditioner, bound_to
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler
 
@@ -296,15 +296,14 @@ class FittedSobolev(StepTransform):
         keys = checked_keys("FittedSobolev: preconditioned", self.preconditioned)
         object.__setattr__(self, "preconditioned", keys)
 
-    def on_meshes(
-        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
-    ) -> FittedSobolev:
-        smooth, bound = self.preconditioner, {}
-        for key in self.preconditioned:
-            if isinstance(smooth, MeshPreconditioner) and (mesh := topology(key)) is not None:
-                bound[key] = len(mesh.places), smooth.on_mesh(mesh)
-            elif isinstance(smooth, PeriodicPreconditioner) and repeated and (columns := repeated(key)):
-                bound[key] = 0, smooth.on_repeated(columns)
+    def bound(self, topology: Callable[[str], MeshTopology | None], repeated: Mapping[str, int]) -> FittedSobolev:
+        """Return the transform for parameters with these meshes, by key, and these numbers of repeated border columns."""
+        bound = {}
+        for key in self.preconditioned if self.preconditioner is not None else ():
+            mesh = topology(key)
+            smooth = bound_to(self.preconditioner, mesh, repeated.get(key, 0))
+            if smooth is not self.preconditioner:
+                bound[key] = 0 if mesh is None else len(mesh.places), smooth
         transform = replace(self)
         object.__setattr__(transform, "_bound", bound)
         return transform

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,9 +10,7 @@ from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.capabilities import Capability
-from unrender.optimizers.base import OnMeshes
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_keys, checked_transforms
-from unrender.preconditioners.mesh import MeshTopology
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
 _TREES = ("learning_rates", "parameters", "gradient", "direction", "factors", "smoothing", "steps")
@@ -65,15 +63,6 @@ class PerParameter(StepTransform):
     def requires(self) -> tuple[type[Capability], ...]:
         """Capabilities that the transforms require."""
         return tuple(kind for part in (*self.transforms, *self.others) for kind in part.requires)
-
-    def on_meshes(
-        self, topology: Callable[[str], MeshTopology | None], repeated: Callable[[str], int] | None = None
-    ) -> PerParameter:
-        own, others = (
-            tuple(part.on_meshes(topology, repeated) if isinstance(part, OnMeshes) else part for part in parts)
-            for parts in (self.transforms, self.others)
-        )
-        return replace(self, transforms=own, others=others)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> PerParameterState:
         """Return the states before the first step. Raises `InputError` for an unknown key."""
