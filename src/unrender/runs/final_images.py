@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core import phases
 from unrender.io.thumbnails import resize_nearest
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
+from unrender.runs.least_squares import check_numbers
 from unrender.runs.result import Result
 from unrender.runs.sensitivity import sensitivity
 from unrender.scene.problem import Problem
@@ -25,6 +26,8 @@ _SENSITIVITY_SHARE = 0.5
 """Of that time, what the sensitivity to the parameters may take besides, but one probe at least."""
 _LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
 """Of the time of the steps, what each of two looks at what the pictures do not determine may take, but a quarter of a second at least."""
+_NUMBERS_SHARE = 0.05
+"""Of the time of the steps, what the least squares of few numbers may take, but a second at least."""
 _TRIAL_PATHS = 1 << 18
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Of the pictures of views whose references are not held in memory: of each view, reference, start and result."""
@@ -44,6 +47,7 @@ class FinalImages:
         spp: samples per pixel of each.
         sensitivity: see `Result.sensitivity`.
         undetermined: see `Result.undetermined`.
+        warnings: one line for each unknown that had not settled at the end.
     """
 
     pictures: dict[str, np.ndarray]
@@ -51,6 +55,7 @@ class FinalImages:
     spp: int
     sensitivity: dict[str, np.ndarray]
     undetermined: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
@@ -95,18 +100,25 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
         seconds = _SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS)
         everything = len(chosen) == len(problem.views)
         found = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
-        lines = _undetermined(problem, result, found) if everything else []
-    return FinalImages(pictures, errors, samples, found, tuple(lines))
+        lines, warnings = _undetermined(problem, result, found) if everything else ([], [])
+    return FinalImages(pictures, errors, samples, found, tuple(lines), tuple(warnings))
 
 
-def _undetermined(problem: Problem, result: Result, found: Mapping[str, np.ndarray]) -> list[str]:
-    """What the pictures do not determine, in lines; of a run without steps nothing."""
+def _undetermined(
+    problem: Problem, result: Result, found: Mapping[str, np.ndarray]
+) -> tuple[list[str], tuple[str, ...]]:
+    """What the pictures do not determine, and which numbers had not settled, in lines; of a run without steps nothing."""
     if not result.steps:
-        return []
+        return [], ()
     lines = undetermined_cells(found)
     spp, seconds = _trial_spp(problem), max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS)
     lines += common_factor(problem, result.parameters, spp, seconds)
-    return lines + undetermined(problem, result.parameters, spp, seconds)
+    lines += undetermined(problem, result.parameters, spp, seconds)
+    allowed = max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS)
+    numbers = check_numbers(problem, result.parameters, result.initial, allowed)
+    told = "\n".join(lines)
+    lines += [line for key, line in numbers.undetermined.items() if key not in told]
+    return lines, tuple(line for key, line in numbers.unfinished.items() if key not in told)
 
 
 def _chosen(problem: Problem) -> list[int]:

@@ -169,6 +169,7 @@ class RunWriter(Hook):
                 image_errors=images.errors,
                 sensitivity=images.sensitivity,
                 undetermined=images.undetermined,
+                warnings=[*result.warnings, *images.warnings],
             )
             result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
