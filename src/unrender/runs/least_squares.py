@@ -56,10 +56,14 @@ class NumbersCheck:
     Attributes:
         undetermined: {key: line} of the numbers that the references leave open.
         unfinished: {key: line} of those that a least-squares step would still move.
+        errors: {key: standard errors} of all numbers, the references' noise included.
+        steps: {key: least-squares steps} of all numbers.
     """
 
     undetermined: Mapping[str, str] = field(default_factory=dict)
     unfinished: Mapping[str, str] = field(default_factory=dict)
+    errors: Mapping[str, np.ndarray] = field(default_factory=dict)
+    steps: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @exclusive("check_numbers")
@@ -288,11 +292,11 @@ def _directions(found: _Differences, limits: np.ndarray, wanted: float) -> np.nd
 def _judged(numbers: _Numbers, found: _Differences, residuals: np.ndarray, widths: np.ndarray) -> NumbersCheck:
     """Return the lines from differences along directions and two independent residuals (2, P, 3)."""
     matrix, (squares, errors) = found.matrix(), found.squares()
-    hidden = (
-        squares < _ERRORS * errors
-    )  # no change along these: the variance is at least that of the largest that noise may hide
+    # Along these no change is seen: the variance is at least that of the largest change that noise may hide.
+    hidden = squares <= _ERRORS * errors
     matrix[hidden, :] = matrix[:, hidden] = 0.0
-    np.fill_diagonal(matrix, np.where(hidden, np.maximum(squares, 0.0) + _ERRORS * errors + 1e-300, np.diag(matrix)))
+    least = 1e-12 * float(np.abs(squares).max()) + 1e-200
+    np.fill_diagonal(matrix, np.where(hidden, np.maximum(squares, 0.0) + _ERRORS * errors + least, np.diag(matrix)))
     units = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     inverse = np.linalg.pinv(matrix / np.outer(units, units), rcond=1e-6, hermitian=True) / np.outer(units, units)
     slopes = 0.5 * (found.one + found.other).reshape(len(units), -1)
@@ -307,11 +311,14 @@ def _judged(numbers: _Numbers, found: _Differences, residuals: np.ndarray, width
 
     whole = covariance(residual)
     error, own = (np.sqrt(np.maximum(np.diag(x), 0.0)) for x in (whole, covariance(noise)))
+    spread = np.outer(error, error)
+    freedom = residual.size - error.size
+    error = error * math.sqrt(residual.size / freedom) if freedom > 0 else np.full(error.size, np.inf)
     step = -found.directions @ (inverse @ np.where(hidden, 0.0, slopes @ residual))
     step = numbers.inside((numbers.point + step)[None])[0] - numbers.point
     posed = numbers.rigid | (numbers.sizes <= 0.0)
     sizes = np.where(posed, np.maximum(numbers.sizes, _OF_WIDTHS * widths), numbers.sizes)
-    open_, together = error > _DOUBTFUL * sizes, np.abs(whole) > _TOGETHER * np.outer(error, error)
+    open_, together = error > _DOUBTFUL * sizes, np.abs(whole) > _TOGETHER * spread
     further = np.abs(step) > np.maximum(_STEP_ERRORS * np.maximum(error, own), _FURTHER * sizes)
     shown, more = np.minimum(error, sizes), np.where(error > sizes, " or more", "")
     undetermined, unfinished = {}, {}
@@ -328,7 +335,8 @@ def _judged(numbers: _Numbers, found: _Differences, residuals: np.ndarray, width
                 f"{key}: the run ended before it settled: a least-squares step from its end moves it by {_numbers(step[of])}, with the "
                 f"standard error {_numbers(error[of])}; give more seconds, or resume the run"
             )
-    return NumbersCheck(undetermined, unfinished)
+    errors, steps = ({k: x[of] for k, of in numbers.places().items()} for x in (error, step))
+    return NumbersCheck(undetermined, unfinished, errors, steps)
 
 
 def _numbers(values: np.ndarray) -> str:

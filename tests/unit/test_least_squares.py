@@ -1,0 +1,124 @@
+"""Least squares at the end of a run, against closed forms: standard errors, steps, and what the references leave open."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs.least_squares import check_numbers
+
+SHAPE = (8, 8)
+ROWS = SHAPE[0] * SHAPE[1] * 3
+NOISE = 0.02
+NUMBERS = np.random.default_rng(3)
+MATRIX = NUMBERS.normal(0.0, 1.0, (ROWS, 4))
+TRUTH = {"a": np.array([0.6, 0.3, 0.4]), "b": np.array(0.5)}
+FAR = np.inf
+
+
+def problem(matrix: np.ndarray, reference_noise: float = NOISE, noise: float = 0.05) -> ur.Problem:
+    """Return three numbers and one, whose picture is linear in them, with a noisy reference."""
+    renderer = AnalyticRenderer(TRUTH, matrix, offset=2.0, noise=noise, shape=SHAPE)
+    added = np.random.default_rng(5).normal(0.0, reference_noise, (*SHAPE, 3))
+    view = ur.View((renderer.exact(TRUTH) + added).astype(np.float32))
+    parameters = [ur.Parameter(key, initial=0.5 * value) for key, value in TRUTH.items()]
+    return ur.Problem(renderer, parameters, [view])
+
+
+def best(made: ur.Problem, matrix: np.ndarray) -> np.ndarray:
+    """Return the least-squares solution (4,)."""
+    target = np.asarray(made.views[0].reference, np.float64).reshape(-1) - 2.0
+    return np.linalg.lstsq(matrix, target, rcond=None)[0]
+
+
+def at(flat: np.ndarray) -> dict[str, np.ndarray]:
+    return {"a": flat[:3].astype(np.float32), "b": np.asarray(flat[3], np.float32)}
+
+
+def test_standard_errors_and_steps_are_those_of_the_closed_form():
+    made = problem(MATRIX)
+    solution, away = best(made, MATRIX), np.array([0.05, -0.02, 0.0, 0.03])
+    found = check_numbers(made, at(solution + away), made.initial_values(), FAR)
+    residual = MATRIX @ away - (np.asarray(made.views[0].reference).reshape(-1) - 2.0 - MATRIX @ solution)
+    inverse = np.linalg.inv(MATRIX.T @ MATRIX)
+    expected = np.sqrt(np.diag(inverse @ (MATRIX.T * residual**2) @ MATRIX @ inverse))
+    np.testing.assert_allclose(np.concatenate([found.errors["a"], found.errors["b"]]), expected, rtol=0.1)
+    step = np.concatenate([found.steps["a"], found.steps["b"]])
+    np.testing.assert_allclose(step, -away, atol=0.1 * expected.max())
+
+
+def test_a_run_that_arrived_is_told_nothing():
+    made = problem(MATRIX)
+    found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), FAR)
+    assert not found.undetermined
+    assert not found.unfinished
+
+
+def test_a_run_that_ended_early_is_told_its_step():
+    made = problem(MATRIX)
+    found = check_numbers(made, at(best(made, MATRIX) + np.array([0.1, 0, 0, 0])), made.initial_values(), FAR)
+    assert list(found.unfinished) == ["a"]
+    assert "a least-squares step from its end moves it by −0.09" in found.unfinished["a"]
+    assert not found.undetermined
+
+
+def test_steps_are_not_told_of_losses_with_another_minimum():
+    made = problem(MATRIX)
+    made = ur.Problem(made.renderer, [u.given for u in made.unknowns.values()], made.views, loss=ur.losses.L1())
+    away = at(best(made, MATRIX) + np.array([0.1, 0, 0, 0]))
+    assert not check_numbers(made, away, made.initial_values(), FAR).unfinished
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-3])
+def test_numbers_that_the_references_know_together_only_are_named(share: float):
+    """A direction without change, and one whose change is far below the references' noise."""
+    matrix = MATRIX.copy()
+    matrix[:, 3] = matrix[:, 0] + share * matrix[:, 3]
+    made = problem(matrix)
+    values = at(np.array([0.3, 0.3, 0.4, 0.8]))
+    found = check_numbers(made, values, made.initial_values(), FAR)
+    assert set(found.undetermined) == {"a", "b"}
+    assert "together with b" in found.undetermined["a"]
+    assert "together with a" in found.undetermined["b"]
+
+
+def test_a_number_without_influence_is_open_and_the_others_are_not():
+    matrix = MATRIX.copy()
+    matrix[:, 3] = 0.0
+    made = problem(matrix)
+    found = check_numbers(made, at(np.append(best(made, MATRIX)[:3], 0.5)), made.initial_values(), FAR)
+    assert list(found.undetermined) == ["b"]
+
+
+def test_fewer_values_than_numbers_leave_all_open():
+    renderer = AnalyticRenderer(TRUTH, MATRIX[:3], 2.0, 0.0, shape=(1, 1))
+    view = ur.View(renderer.exact(TRUTH).astype(np.float32))
+    made = ur.Problem(renderer, [ur.Parameter(key, initial=0.5 * value) for key, value in TRUTH.items()], [view])
+    found = check_numbers(made, TRUTH, made.initial_values(), FAR)
+    assert set(found.undetermined) == {"a", "b"}
+    assert "± 0.6, 0.6, 0.6 or more" in found.undetermined["a"]
+
+
+def test_numbers_of_any_scale():
+    """Pictures that are 1e4 times as bright or dark, and parameters in other units."""
+    for brightness, units in ((1e4, 1.0), (1e-4, 1.0), (1.0, 1e-4), (1.0, 1e4)):
+        matrix = MATRIX * brightness / units
+        renderer = AnalyticRenderer(
+            {k: units * x for k, x in TRUTH.items()}, matrix, 2.0 * brightness, 0.05, shape=SHAPE
+        )
+        target = renderer.exact({k: units * x for k, x in TRUTH.items()})
+        target += np.random.default_rng(5).normal(0.0, NOISE * brightness, target.shape)
+        parameters = [ur.Parameter(key, initial=0.5 * units * value) for key, value in TRUTH.items()]
+        made = ur.Problem(renderer, parameters, [ur.View(target.astype(np.float32))])
+        away = {k: (units * (x + 0.1)).astype(np.float32) for k, x in TRUTH.items()}
+        found = check_numbers(made, away, made.initial_values(), FAR)
+        np.testing.assert_allclose(found.steps["a"] / units, -0.1, atol=0.02)
+        assert not found.undetermined
+
+
+def test_no_time_no_check():
+    made = problem(MATRIX)
+    found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), 0.0)
+    assert not found.errors
