@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.app import report
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
 
 SIZE = 8
@@ -80,6 +81,14 @@ def test_a_run_tells_in_its_folder(tmp_path: Any):
     made = problem(scene(material), "wall.bsdf.sheen_tint.value", "wall.bsdf.base_color.value")
     result = ur.optimize(made, steps=2, run_directory=tmp_path / "run")
     assert [line.partition(":")[0] for line in result.undetermined] == ["wall.bsdf.sheen_tint.value"]
-    page = ur.app.report.page(tmp_path / "run").read_text()
+    page = report.page(tmp_path / "run").read_text()
     assert "Not determined by the pictures" in page
     assert "wall.bsdf.sheen_tint.value: over its whole range" in page
+
+
+def test_a_run_that_ended_early_is_warned_in_its_folder(tmp_path: Any):
+    seen = ur.render(problem(scene(DIFFUSE), LIGHT), spp=64, seed=5)
+    made = ur.Problem(scene(DIFFUSE), [ur.Parameter(LIGHT, initial=[2, 2, 2])], [ur.View(seen)], max_depth=2)
+    result = ur.optimize(made, steps=2, run_directory=tmp_path / "run")
+    (line,) = [line for line in result.warnings if "ended before it settled" in line]
+    assert line.startswith(f"{LIGHT}: ")

@@ -41,7 +41,7 @@ def test_standard_errors_and_steps_are_those_of_the_closed_form():
     made = problem(MATRIX)
     solution, away = best(made, MATRIX), np.array([0.05, -0.02, 0.0, 0.03])
     found = check_numbers(made, at(solution + away), made.initial_values(), FAR)
-    residual = MATRIX @ away - (np.asarray(made.views[0].reference).reshape(-1) - 2.0 - MATRIX @ solution)
+    residual = np.asarray(made.views[0].reference).reshape(-1) - 2.0 - MATRIX @ solution
     inverse = np.linalg.inv(MATRIX.T @ MATRIX)
     expected = np.sqrt(np.diag(inverse @ (MATRIX.T * residual**2) @ MATRIX @ inverse))
     np.testing.assert_allclose(np.concatenate([found.errors["a"], found.errors["b"]]), expected, rtol=0.1)

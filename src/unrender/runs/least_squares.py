@@ -72,8 +72,8 @@ def check_numbers(
 ) -> NumbersCheck:
     """Return what least squares at `values` says about the problem's numbers, all other unknowns kept.
 
-    The derivatives J of the pictures are differences of renders, along directions of which the pictures change independently. With the
-    residual r of a fresh picture, the covariance of the numbers is (JᵀJ)⁻¹ Jᵀ diag(r²) J (JᵀJ)⁻¹. It contains the references' noise.
+    The derivatives J of the pictures are differences of renders, along directions of which the pictures change independently. The
+    covariance of the numbers is (JᵀJ)⁻¹ Jᵀ diag(r²) J (JᵀJ)⁻¹, with the residual r after the step below. It contains the references' noise.
     Where it is large beside the numbers, the references do not determine them. Where the step −(JᵀJ)⁻¹ Jᵀ r is long, the run ended early.
 
     Numbers with a prior are kept, too. Steps are told of losses with a linear derivative only: others have their minimum elsewhere.
@@ -309,13 +309,13 @@ def _judged(numbers: _Numbers, found: _Differences, residuals: np.ndarray, width
         middle += np.diag(np.where(hidden, np.mean(of**2) * units**2, 0.0))
         return share**2 * (found.directions @ inverse @ middle @ inverse @ found.directions.T)
 
-    whole = covariance(residual)
+    along = -inverse @ np.where(hidden, 0.0, slopes @ residual)
+    whole = covariance(residual + along @ slopes)  # as after the step: a run that ended early leaves more
     error, own = (np.sqrt(np.maximum(np.diag(x), 0.0)) for x in (whole, covariance(noise)))
     spread = np.outer(error, error)
     freedom = residual.size - error.size
     error = error * math.sqrt(residual.size / freedom) if freedom > 0 else np.full(error.size, np.inf)
-    step = -found.directions @ (inverse @ np.where(hidden, 0.0, slopes @ residual))
-    step = numbers.inside((numbers.point + step)[None])[0] - numbers.point
+    step = numbers.inside((numbers.point + found.directions @ along)[None])[0] - numbers.point
     posed = numbers.rigid | (numbers.sizes <= 0.0)
     sizes = np.where(posed, np.maximum(numbers.sizes, _OF_WIDTHS * widths), numbers.sizes)
     open_, together = error > _DOUBTFUL * sizes, np.abs(whole) > _TOGETHER * spread
