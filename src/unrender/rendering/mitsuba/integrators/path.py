@@ -268,7 +268,7 @@ class PathPair:
         samples = sampler.next_1d(), sampler.next_2d()
         bs, weight = bsdf.sample(bsdf_ctx, si, *samples, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        smooth = active & ~delta
+        smooth = active & ~delta & specular.on_its_side(si, bs)
         with context.resume_grad():
             f, pdf = bsdf.eval_pdf(bsdf_ctx, si, bs.wo, smooth)
             previous = [
@@ -277,7 +277,7 @@ class PathPair:
             if lobe is not None:
                 f = lobe.without(f, bs.wo)
         values = [f, *previous]
-        weights = specular.sampling_weights(values, pdf, weight, smooth, delta)
+        weights = specular.sampling_weights(values, pdf, weight, smooth, delta, bs.pdf)
         if self.changing_delta and (context.pair or not context.primal):
             lobes = specular.DeltaLobes(context.tables, bsdf, bs, samples, active, active & delta)
             lobes.follow(context, bsdfs, surfaces, values, weights)

@@ -1,4 +1,5 @@
-"""Values of perfectly specular (delta) lobes with unknown parameters, which BSDF evaluation does not return."""
+"""Sampled directions: their weights, those that a BSDF rejects, and the values of perfectly specular (delta) lobes, which no evaluation
+returns."""
 
 from __future__ import annotations
 
@@ -12,6 +13,8 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import PathContext
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
+_SAME_DENSITY = 1e-3
+"""Relative difference up to which two densities of one direction are the same, for rounding."""
 DELTA_EQUAL, DELTA_SIMPLE, DELTA_MASK = 0, 1, 2
 """Entries of `tables["delta"]`, by registry id of BSDFs: dependence of perfectly specular lobes on the BSDF's parameters. None; only by
 their value (conductor, dielectric, plastic); by the opacity of a mask."""
@@ -80,12 +83,26 @@ class DeltaLobes:
                 weights[state] = dr.select(changed, dr.detach(lobe) * inv_pdf, weights[state])
 
 
+def on_its_side(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> Bool:
+    """Whether a sampled direction is on the side of the surface that its lobe has, reflection or transmission.
+
+    A microfacet's reflection may point into the surface. Mitsuba rejects such a direction by a weight of 0, and no density counts it.
+    Other lobes may still have a value there, which their own samples bring in.
+    """
+    same = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo) > 0
+    reflected, transmitted = (
+        mi.has_flag(bs.sampled_type, kind) for kind in (mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)
+    )
+    return dr.select(reflected & ~transmitted, same, True) & dr.select(transmitted & ~reflected, ~same, True)
+
+
 def sampling_weights(
     values: Sequence[Spectrum],
     pdf: Float,
     weight: Spectrum,
     smooth: Bool,
     delta: Bool,
+    own_pdf: Float,
 ) -> list[Spectrum]:
     """Return the sampling weight of each state for a direction that the current state sampled.
 
@@ -95,9 +112,13 @@ def sampling_weights(
     Args:
         values: value of each state's BSDF (times cosine) or phase function, in the sampled direction.
         pdf: solid angle density of that direction.
-        weight: weight of a perfectly specular lobe.
+        weight: the weight that the BSDF gave its sample. It is used where the lobe is perfectly specular. Where it is 0, although value
+            and density are not, and the BSDF gave the whole density, the direction was rejected, and its weight is 0 in all states.
         smooth: lanes whose direction has a density.
         delta: lanes that sampled a perfectly specular lobe.
+        own_pdf: the density that the BSDF gave its sample: of all lobes, or of the sampled one.
     """
-    inv_pdf = dr.select(smooth & (pdf > 0), dr.rcp(pdf), 0)
+    whole = dr.abs(own_pdf - pdf) <= _SAME_DENSITY * pdf
+    rejected = whole & (dr.max(weight) <= 0) & (dr.max(dr.detach(values[0])) > 0)
+    inv_pdf = dr.select(smooth & ~rejected & (pdf > 0), dr.rcp(pdf), 0)
     return [dr.select(delta, weight, dr.detach(value) * inv_pdf) for value in values]

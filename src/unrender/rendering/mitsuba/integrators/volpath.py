@@ -257,11 +257,11 @@ class VolumePair:
         phase = vertex.media[0].phase_function()
         d, _, pdfₘ = phase.sample(context.phase_ctx, vertex.mei, *samples, scatters)
         delta = meets & mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        smooth = meets & ~delta
+        smooth = meets & ~delta & specular.on_its_side(vertex.si, bs)
         with context.resume_grad():
             values, pdf = vertex.evaluate(context, bs.wo, d, smooth, scatters)
         pdf = dr.select(scatters, pdfₘ, pdf)
-        weights = specular.sampling_weights(values, pdf, weight, smooth | scatters, delta)
+        weights = specular.sampling_weights(values, pdf, weight, smooth | scatters, delta, bs.pdf)
         if self.changing_delta and (context.pair or not context.primal):
             lobes = specular.DeltaLobes(context.tables, vertex.bsdfs[0], bs, samples, meets, delta)
             lobes.follow(context, vertex.bsdfs, vertex.surfaces, values, weights)

@@ -24,7 +24,7 @@ from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spec
 from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex, carries_light
 from unrender.rendering.mitsuba.integrators.path import ROULETTE_FLOOR
 from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
-from unrender.rendering.mitsuba.integrators.specular import sampling_weights
+from unrender.rendering.mitsuba.integrators.specular import on_its_side, sampling_weights
 from unrender.rendering.mitsuba.passes import LaunchSize, Pass
 from unrender.rendering.mitsuba.path_cache.lookups import Lookups
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -148,9 +148,9 @@ class TracePass(Pass):
         # ----------------------- BSDF sampling -----------------------
         bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active_next)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-        smooth = active_next & ~delta
+        smooth = active_next & ~delta & on_its_side(si, bs)
         f, pdf = bsdf.eval_pdf(ctx, si, bs.wo, smooth)
-        (weight,) = sampling_weights([f], pdf, weight, smooth, delta)
+        (weight,) = sampling_weights([f], pdf, weight, smooth, delta, bs.pdf)
         fixed = dr.select(surface == 0, weight, dr.select(pdf > 0, 1, 0))
         if self.lookups.textures:
             dr.scatter(record.arrays["surface"], surface, row, active_next)
