@@ -24,6 +24,7 @@ from unrender.own_loop.stream import Batch, Rendered, Stream
 from unrender.own_loop.values import Exchange, Given
 from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
+from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import render as render_view
 from unrender.scene.validation import longest_path
@@ -279,6 +280,7 @@ class Renderer:
         given = self._exchange.read(values)
         parameters = self._exchange.tree(given)
         self._exchange.warn_outside(parameters)
+        parameters = off_ends(parameters, self._exchange.known)
         key, records, images = Key(self._options.seed, self._step), [], []
         for name in self._names(sensor):
             stream = self._stream(name)

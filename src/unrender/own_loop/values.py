@@ -46,11 +46,14 @@ class Exchange:
     Args:
         renderer: renderer that makes the arrays.
         keys: keys of the parameters, in order.
+
+    Attributes:
+        known: {key: description of the parameter}.
     """
 
     def __init__(self, renderer: Renderer, keys: tuple[str, ...]):
         self._renderer, self._keys = renderer, keys
-        self._info: dict[str, ParameterInfo] = {key: renderer.parameters()[key] for key in keys}
+        self.known: dict[str, ParameterInfo] = {key: renderer.parameters()[key] for key in keys}
         self._on_device = arrays.is_drjit(renderer.array(np.zeros(1)))
         self._warned: set[str] = set()
 
@@ -104,7 +107,7 @@ class Exchange:
     def warn_outside(self, tree: Tree) -> None:
         """Warn once per parameter whose values leave their physical range. An optimizer of the loop knows no bounds."""
         for key, values in tree.items():
-            low, high = self._info[key].lowest, self._info[key].highest
+            low, high = self.known[key].lowest, self.known[key].highest
             below = low is not None and not arrays.all_true(values >= low)
             above = high is not None and not arrays.all_true(values <= high)
             if (below or above) and key not in self._warned:
@@ -123,7 +126,7 @@ class Exchange:
             if dr.is_tensor_v(value):
                 return value
             flat: Any = dr.ravel(value)
-            return mi.TensorXf(flat, self._info[key].shape)
+            return mi.TensorXf(flat, self.known[key].shape)
 
         return {
             key: tensor(key, value) if arrays.is_drjit(value) else self._renderer.array(self._host(key, value))
@@ -184,7 +187,7 @@ class Exchange:
         try:
             return to_tensor(value)
         except TypeError as error:
-            raise InputError(f"parameter {key}: expected shape {self._info[key].shape}, got {_kind(value)}") from error
+            raise InputError(f"parameter {key}: expected shape {self.known[key].shape}, got {_kind(value)}") from error
 
     def _host(self, key: str, value: Any) -> np.ndarray:
         array = frameworks.host(value, f"parameter {key}")
@@ -194,10 +197,10 @@ class Exchange:
 
     def _fit(self, key: str, value: Array) -> Array:
         """Return the value if it has the parameter's shape, or another supported resolution; else raise `InputError`."""
-        shape, expected = arrays.shape(value), self._info[key].shape
+        shape, expected = arrays.shape(value), self.known[key].shape
         if shape == expected:
             return value
-        if self._info[key].resizable and len(shape) == len(expected) and shape[-1] == expected[-1] and min(shape) > 0:
+        if self.known[key].resizable and len(shape) == len(expected) and shape[-1] == expected[-1] and min(shape) > 0:
             return value
         if expected == () and int(np.prod(shape)) == 1:
             return arrays.reshape(value, ())

@@ -50,6 +50,7 @@ class ParameterInfo:
         role: meaning of the values: numbers, normals or directions. The errors of the last two are angles.
         brightness: quantity that the picture is proportional to: "light" of an emitter, "reflectance" of a surface; else "".
         nonlinear: whether it changes the form of the picture, not its brightness: positions, lenses, skies, indices of refraction.
+        lobe: whether it decides the probability of a lobe, which is never sampled if all values are at an end of the range.
     """
 
     shape: tuple[int, ...]
@@ -72,6 +73,7 @@ class ParameterInfo:
     role: Role = "value"
     brightness: Literal["", "light", "reflectance"] = ""
     nonlinear: bool = False
+    lobe: bool = False
 
     @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:
@@ -362,7 +364,6 @@ class WithCameras(Protocol):
 
     def cameras(self) -> Mapping[int, Camera]:
         """Return {sensor: camera} of the sensors that can be moved."""
-        ...
 
 
 @runtime_checkable
@@ -371,7 +372,6 @@ class Remeshable(Protocol):
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
         """Return a renderer of the same scene with the meshes {id of a shape: mesh} replaced, for the parameters `keys`."""
-        ...
 
 
 @runtime_checkable

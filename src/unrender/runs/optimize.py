@@ -41,6 +41,7 @@ from unrender.runs.result import Result
 from unrender.runs.run import Run, terminate_if_told
 from unrender.runs.verify import Verify
 from unrender.runs.watches import BoundsWatch, InfluenceWatch, MeshWatch
+from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree
 from unrender.scene.serialization import origin
@@ -178,12 +179,13 @@ def estimate(
     Args:
         problem: what to recover.
         estimator: where gradients come from, or the name of a method.
-        parameters: {key: array} for all parameters of the problem, or None for the initial ones.
+        parameters: {key: array} for all parameters of the problem, or None for the initial ones. Values at an end of their range count
+            as 1e-4 of the range inside: no path shows the gradient by a black reflectance, or by a lobe of probability 0.
         seed: of its random numbers.
     """
     estimator = components.resolve_estimator(problem, estimator, "estimate")
     problem.executor.check(estimator)
-    point = as_tree(problem, parameters)
+    point = off_ends(as_tree(problem, parameters), problem.renderer.parameters())
     state = estimator.init(problem, point)
     found, _ = estimator.estimate(problem, point, state, Key(seed))
     return replace(as_numpy(found), info=to_numpy(found.info))

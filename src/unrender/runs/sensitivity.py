@@ -13,6 +13,7 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import RenderSession
+from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, view_request
 
@@ -63,7 +64,7 @@ def sensitivity(
         session = problem.renderer.prepare(list(problem.shapes()), None)
     except InputError:
         return {}
-    parameters = as_tree(problem, values)
+    parameters = off_ends(as_tree(problem, values), problem.renderer.parameters())
     squares = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
     made, until = 0, time.perf_counter() + seconds
     while made == 0 or (made < probes and time.perf_counter() < until):

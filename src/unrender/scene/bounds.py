@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
+from unrender.core.trees import Tree
 from unrender.parameterisations.base import Bounds
 from unrender.rendering.renderer import ParameterInfo
 
@@ -19,6 +20,8 @@ MARGIN = 1e-4
 
 At reflectance 0 no light passes a surface, so its gradient stays 0. A lobe of probability 0 is never sampled again.
 """
+_LOBE_START = 0.01
+"""Distance from an end of the range, as a fraction of it, to which a start is moved if a lobe would never be sampled."""
 _CLEARANCE = 0.01
 """Distance to a singular value that bounds keep, relative to that value; at most half of the initial distance."""
 
@@ -70,6 +73,41 @@ def project(x: Array, low: float | None, high: float | None) -> Array:
         x = arrays.maximum(x, low + margin)
     if high is not None:
         x = arrays.minimum(x, high - margin)
+    return x
+
+
+def sampled_lobe(start: np.ndarray, info: ParameterInfo) -> tuple[np.ndarray, str]:
+    """Return a start at which each lobe is sampled now and then, and a notice of the change, "" for none.
+
+    A map whose values are not all at one end stays as it is.
+    """
+    low, high = info.lowest, info.highest
+    if not info.lobe or low is None or high is None or not start.size:
+        return start, ""
+    margin, inside = MARGIN * (high - low), _LOBE_START * (high - low)
+    for end, value in ((low, low + inside), (high, high - inside)):
+        if (np.abs(start - end) <= margin).all():
+            notice = f"initial values moved from {end:g} to {value:g}: at {end:g} one of the surface's lobes is never sampled"
+            return np.full_like(start, value), notice
+    return start, ""
+
+
+def off_ends(values: Tree, known: Mapping[str, ParameterInfo]) -> Tree:
+    """Return the values, those at an end of a closed range moved inside by the margin. All others are left alone.
+
+    Gradients are wrong at an end: no light comes back from a black surface, and no path takes a lobe of probability 0.
+    """
+    found = {key: _off_ends(x, known[key].lowest, known[key].highest) for key, x in values.items()}
+    arrays.evaluate(found)
+    return found
+
+
+def _off_ends(x: Array, low: float | None, high: float | None) -> Array:
+    if low is None or high is None:
+        return x
+    margin = MARGIN * (high - low)
+    for end, inside in ((low, low + margin), (high, high - margin)):
+        x = arrays.where(arrays.absolute(x - end) < margin, x * 0.0 + inside, x)
     return x
 
 

@@ -24,6 +24,7 @@ class Range:
         singular: value between `low` and `high` at which images are singular; values stay on one side of it.
         above: another parameter of the same object whose value in the scene is a lower limit; "" for none.
         below: another parameter of the same object whose value in the scene is an upper limit; "" for none.
+        lobe: whether the value decides the probability with which a lobe is sampled. At an end that probability is 0.
     """
 
     low: float | None = None
@@ -32,6 +33,7 @@ class Range:
     singular: float | None = None
     above: str = ""
     below: str = ""
+    lobe: bool = False
 
     def scaled(self, factor: float) -> Range:
         """Return the range of x such that factor · x is in this range."""
@@ -51,13 +53,14 @@ class Range:
         if low is not None and high is not None and low >= high:
             return self
         singular = other.singular if self.singular is None else self.singular
-        return replace(self, low=low, high=high, singular=singular)
+        return replace(self, low=low, high=high, singular=singular, lobe=self.lobe or other.lobe)
 
 
 UNKNOWN = Range(unit="")
 """Range of a slot without an entry, such as a slot of a third-party plugin."""
 
 _SHARE = Range(0.0, 1.0)
+_LOBE = Range(0.0, 1.0, lobe=True)
 _ROUGHNESS = Range(0.02, 1.0)
 _IOR = Range(0.2, 5.0, "ratio of indices", singular=1.0)
 _COMPLEX_IOR = Range(0.0, None, "index")
@@ -73,11 +76,11 @@ KINDS: dict[str, dict[str, Range]] = {
             (
                 "reflectance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance",
                 "diffuse_transmittance", "transmittance", "base_color", "metallic", "specular", "anisotropic",
-                "spec_tint", "sheen", "sheen_tint", "clearcoat", "clearcoat_gloss", "spec_trans", "flatness",
-                "opacity", "weight",
+                "spec_tint", "sheen", "sheen_tint", "clearcoat", "clearcoat_gloss", "flatness",
             ),
             _SHARE,
         ),
+        **dict.fromkeys(("spec_trans", "opacity", "weight"), _LOBE),
         **dict.fromkeys(("alpha", "alpha_u", "alpha_v", "roughness"), _ROUGHNESS),
         "eta": _IOR,
         "normalmap": Range(0.0, 1.0, "(direction + 1) / 2"),
@@ -134,11 +137,15 @@ _ELLIPSOIDS = {
     "sh_coeffs": Range(unit="radiance"),
 }
 
+_PLASTIC = {"specular_reflectance": _LOBE, "diffuse_reflectance": _LOBE}
+
 CLASSES: dict[str, dict[str, Range]] = {
+    "SmoothPlastic": _PLASTIC,
+    "RoughPlastic": _PLASTIC,
     "SmoothConductor": _CONDUCTOR,
     "RoughConductor": _CONDUCTOR,
     "LinearRetarder": {"delta": _ANGLE},
-    "PrincipledThin": {"diff_trans": Range(0.0, 2.0)},
+    "PrincipledThin": {"diff_trans": Range(0.0, 2.0, lobe=True)},
     "Hair": {
         "longitudinal_roughness": _ROUGHNESS,
         "azimuthal_roughness": _ROUGHNESS,

@@ -333,8 +333,8 @@ class ScenePair:
         """Return `info` with the role, brightness, linearity and file conversion of the parameter."""
         conversion = scene_loading.conversion(self.current_parameters, key, self.description)
         kinds = role(self.current_parameters, key, info.shape), brightness(self.current_parameters, key)
-        form = is_nonlinear(self.current_parameters, key, info.singular)
-        return replace(info, conversion=conversion, role=kinds[0], brightness=kinds[1], nonlinear=form)
+        form, lobe = is_nonlinear(self.current_parameters, key, info.singular), self.physical_range(key).lobe
+        return replace(info, conversion=conversion, role=kinds[0], brightness=kinds[1], nonlinear=form, lobe=lobe)
 
     def _info(self, key: str) -> ParameterInfo:
         flags = self.current_parameters.flags(key)
