@@ -340,6 +340,57 @@ def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, count: in
         assert result.status == "finished"
 
 
+class Folded(AnalyticRenderer):
+    """Linear in x³ - 3 x, which has two extrema."""
+
+    def image(self, parameters: Any, request: Any) -> Any:
+        return super().image({"x": folded(parameters["x"])}, request)
+
+    def adjoint(self, parameters: Any, paths: Any, weights: Any) -> Any:
+        found = super().adjoint({"x": folded(parameters["x"])}, paths, weights)
+        return {"x": found["x"] * (3 * parameters["x"] ** 2 - 3)}
+
+
+def folded(x: Any) -> Any:
+    return x**3 - 3 * x
+
+
+def tiny(side: int, start: float, seed: int, grain: float = 0.0, known: bool = True) -> ur.Problem:
+    """Few pixels of one number, 2.6; `grain` is the relative noise of the references."""
+    generator = np.random.default_rng(seed)
+    matrix = generator.uniform(0.5, 1.5, (side * side * 3, 1))
+    renderer = Folded({"x": np.full(1, start)}, matrix, noise=0.3, shape=(side, side))
+    truth = np.full(1, 2.6)
+    reference = (matrix @ folded(truth)) * (1 + grain * generator.normal(size=len(matrix)))
+    views = [ur.View(reference.reshape(side, side, 3))]
+    return ur.Problem(renderer, [ur.Parameter("x")], views, truth={"x": truth} if known else None)
+
+
+@pytest.mark.parametrize("side", [1, 2, 5, 9])
+@pytest.mark.parametrize("known", [False, True])
+def test_a_local_minimum_of_few_pixels_is_told(side: int, known: bool) -> None:
+    """From below the maximum at -1 the descent ends there."""
+    for seed in range(2):
+        problem = tiny(side, -2.0, seed, 0.02, known)
+        result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.02), steps=300, seed=seed)
+        assert abs(result.parameters["x"][0] + 1) < 0.1
+        assert any(UNEXPLAINED in line for line in result.warnings), (seed, result.verification)
+        assert result.status == "finished"
+
+
+@pytest.mark.parametrize("count", [2, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("grain", "known"), [(0.0, False), (0.05, False), (0.0, True), (0.3, True)])
+@pytest.mark.parametrize("side", [1, 4])
+def test_few_pixels_that_have_converged_have_nothing_unexplained(
+    side: int, grain: float, known: bool, count: int
+) -> None:
+    for seed in range(count):
+        problem = tiny(side, 2.0, seed, grain, known)
+        result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.02), steps=200, seed=seed)
+        assert not any(UNEXPLAINED in line for line in result.warnings), (seed, result.warnings)
+        assert result.status == "finished"
+
+
 # ---------------------------------------------------------------------- thirty runs that cannot succeed
 
 

@@ -41,6 +41,9 @@ _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
 _SCORE, _OF_RESIDUAL, _OF_PICTURE = 4.5, 0.1, 0.02
 """Least score of a memory's error; its least share of the mean square residual; its least size, in units of the picture's."""
+_FEW_PIXELS, _OF_FEW, _OF_TRUTH = 96, 0.2, 4.0
+"""Number of pixels below which a residual is judged pixel by pixel, too, which counts the references' noise. Its least size then, in
+units of the picture's, and where the truth is known the least ratio of its mean square to that at the truth."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which on a warning says that these are kept."""
 _FIRST_CANDIDATE = 64
@@ -131,7 +134,7 @@ class Verify(Hook):
         memory = _memory(descent, pictures, last)
         disagrees = memory is not None and memory.disagrees
         kept = places[best][0] if places else last
-        lines = self._residual(problem, result)
+        lines = self._residual(problem, result, last)
         # A Gauss-Newton step solves for all unknowns, so a run of few steps is no unfinished one.
         few = result.steps < (FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else FEW_STEPS)
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
@@ -157,8 +160,11 @@ class Verify(Hook):
             warnings=[*result.warnings, *lines],
         )
 
-    def _residual(self, problem: Problem, result: Result) -> list[str]:
-        """The warning that the pictures have stopped to improve, and still differ from the references by more than noise."""
+    def _residual(self, problem: Problem, result: Result, end: Picture) -> list[str]:
+        """The warning that the pictures have stopped to improve, and still differ from the references by more than noise.
+
+        `end`: the last picture, of other random numbers than those of earlier steps.
+        """
         earlier = next((one for one in reversed(self._earlier) if one.step <= _EARLIER * result.steps), None)
         if self._pictures is None or earlier is None:
             return []
@@ -173,10 +179,20 @@ class Verify(Hook):
         total = max(float(weights.sum()) * 3, 1e-300)
         size = math.sqrt(float((weights[:, None] * references**2).sum()) / total)
         error = math.sqrt(max(found.mean_square, 0.0))
-        if found.score <= _SCORE or error <= _OF_PICTURE * size:
-            return []
+        if not found.score > _SCORE or error <= _OF_PICTURE * size:
+            if np.count_nonzero(weights) >= _FEW_PIXELS:
+                return []
+            others = np.concatenate(end.images, axis=1) - references
+            found = paired_losses.repeated(last.residuals, others, weights)
+            error = math.sqrt(max(found.mean_square, 0.0))
+            if not found.score > _SCORE or error <= _OF_FEW * size:
+                return []
+            if problem.has_truth and found.mean_square <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
+                return []
         noise = math.sqrt(max(float((weights[:, None] * residual**2).sum()) / total - found.mean_square, 0.0))
-        cause = "light, depth or something else that is not among the unknowns may be wrong"
+        cause = (
+            "light, depth or something else that is not among the unknowns may be wrong, or another start leads further"
+        )
         if any(unknown.prior is not None for unknown in problem.unknowns.values()):
             cause = f"a prior may be too strong, or {cause}"
         times = f", {error / noise:.1f} times its noise" if noise > 0 else ""
@@ -193,19 +209,29 @@ class _Earlier:
     Attributes:
         step: how many steps were done.
         loss: without noise.
-        residual: (N, 3), the picture minus the references.
+        residuals: (K, N, 3), independent images minus the references.
     """
 
     step: int
     loss: float
-    residual: np.ndarray
+    residuals: np.ndarray
+
+    @property
+    def residual(self) -> np.ndarray:
+        """(N, 3), the picture minus the references."""
+        return self.residuals.mean(axis=0)
 
     @classmethod
     def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> _Earlier:
         """Render the parameters of a step."""
         found = pictures.picture(values)
-        mean = np.concatenate([images.mean(axis=0) for images in found.images])
-        return cls(step, found.loss[0], mean - pictures.references)
+        return cls(step, found.loss[0], np.concatenate(found.images, axis=1) - pictures.references)
+
+
+def _at_truth(problem: Problem, pictures: FreshPictures, result: Result) -> float:
+    """The mean square difference of the picture at the truth from the references."""
+    truth = {**result.parameters, **{key: value for key, value in problem.truth.items() if key in result.parameters}}
+    return pictures.residual(pictures.images(truth))
 
 
 def compare_memory(

@@ -102,6 +102,25 @@ def difference(first: np.ndarray, second: np.ndarray, sampled: bool = False) -> 
     return Difference(value, math.sqrt(total), degrees)
 
 
+def repeated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> SystematicDifference:
+    """Return the part of two pictures' differences from one reference that both share, pixel by pixel.
+
+    For pictures of few pixels, of which `systematic` makes too few tiles. Noise of the reference is shared too, and counts.
+
+    Args:
+        one, other: (K, N, C), differences of K independent images of each picture.
+        weights: (N,), how much each pixel counts, in [0, 1].
+    """
+    means, errors = [], []
+    for images in (one, other):
+        means.append(images.mean(axis=0) * weights[:, None])
+        errors.append(images.std(axis=0, ddof=1) / math.sqrt(len(images)) * weights[:, None])
+    products = (means[0] * means[1]).sum(axis=1)
+    noise = float(np.sqrt(((errors[0] * errors[1]).sum(axis=1) ** 2).sum()))
+    total, count = float(products.sum()), max(float(weights.sum()) * one.shape[2], 1e-300)
+    return SystematicDifference(total / count, total / noise if noise > 0 else math.inf * np.sign(total))
+
+
 def systematic(
     values: np.ndarray, weights: np.ndarray | None = None, earlier: np.ndarray | None = None
 ) -> SystematicDifference:
