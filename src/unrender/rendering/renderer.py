@@ -39,8 +39,7 @@ class ParameterInfo:
         singular: value between these limits where images are singular, such as an index of refraction of 1; it is never crossed.
         perturbable: whether it can be rendered at other values, as `image_batch` requires.
         compiled: whether it is a plain number that is compiled into kernels: neither differentiable nor perturbable.
-        rigid: whether it moves a shape, light or sensor rigidly: few numbers, with plateaus and many minima of the loss.
-        light: whether the rigidly moved object is a light.
+        rigid, light: whether it moves a shape, light or sensor rigidly, with many minima of the loss; whether that is a light.
         viewpoint: whether it is a sensor's pose or lens parameter.
         sensor: index of the only sensor whose images it changes; None if it may change others'.
         mesh: for values (n V,) at the V vertices of a mesh, function that returns its loaded positions (V, 3) and faces (F, 3); else None.
@@ -126,9 +125,8 @@ class Rendering:
 
 def differentiated(keys: Iterable[str], derivatives: bool | AbstractSet[str]) -> frozenset[str]:
     """Return the keys for which `Renderer.prepare` is asked for derivatives."""
-    if isinstance(derivatives, bool):
-        return frozenset(keys) if derivatives else frozenset()
-    return frozenset(keys) & frozenset(derivatives)
+    known = frozenset(keys)
+    return known & (derivatives if not isinstance(derivatives, bool) else known if derivatives else frozenset())
 
 
 class RenderSession(Protocol):
@@ -364,6 +362,7 @@ class WithCameras(Protocol):
 
     def cameras(self) -> Mapping[int, Camera]:
         """Return {sensor: camera} of the sensors that can be moved."""
+        ...
 
 
 @runtime_checkable
@@ -372,6 +371,7 @@ class Remeshable(Protocol):
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
         """Return a renderer of the same scene with the meshes {id of a shape: mesh} replaced, for the parameters `keys`."""
+        ...
 
 
 @runtime_checkable

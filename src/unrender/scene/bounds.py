@@ -76,7 +76,14 @@ def project(x: Array, low: float | None, high: float | None) -> Array:
     return x
 
 
-def sampled_lobe(start: np.ndarray, info: ParameterInfo) -> tuple[np.ndarray, str]:
+def move_inside(start: np.ndarray, bounds: Bounds, info: ParameterInfo) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return a start inside the bounds at which each lobe is sampled, and notices of the changes."""
+    start, moved = _sampled_lobe(start, info)
+    start, clipped = clip_to_bounds(start, bounds)
+    return start, tuple(filter(None, (moved, clipped)))
+
+
+def _sampled_lobe(start: np.ndarray, info: ParameterInfo) -> tuple[np.ndarray, str]:
     """Return a start at which each lobe is sampled now and then, and a notice of the change, "" for none.
 
     A map whose values are not all at one end stays as it is.

@@ -24,7 +24,7 @@ from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene import coarse_to_fine, prior
-from unrender.scene.bounds import check_bounds, clip_to_bounds, project, sampled_lobe
+from unrender.scene.bounds import check_bounds, move_inside, project
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
 from unrender.scene.key_hints import instead_of, near_key
@@ -122,8 +122,7 @@ def check_parameter(
             preconditioner = _check_preconditioner(key, parameter.preconditioner, info)
     with checking("coarse_to_fine"):
         schedule = _coarse_to_fine(parameter, info)
-    start, moved = sampled_lobe(start, info)
-    initial, clipped = clip_to_bounds(start, bounds)
+    initial, moved = move_inside(start, bounds, info)
     initial.flags.writeable = False
     with checking("parameterisation"):
         if parameter.parameterisation is not None:
@@ -137,7 +136,7 @@ def check_parameter(
         remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
     with checking("self_intersection"):
         check_self_intersection(parameter.self_intersection, mesh)
-    changes = (f"initial {notice}" if notice else "", narrowed, moved, clipped)
+    changes = (f"initial {notice}" if notice else "", narrowed, *moved)
     notices = [f"parameter {key}: {line}" for line in changes if line]
     notices += _at_bounds(key, parameterisation, transform, initial, bounds)
     notices += [] if mesh is None else mesh_notices(key, *mesh)
