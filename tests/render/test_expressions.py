@@ -188,6 +188,51 @@ def test_a_small_network_over_coordinates_is_a_texture() -> None:
     assert not made.origin  # a function cannot be read from a file again
 
 
+def box(size: float = 1.0) -> dict[str, Any]:
+    """A box under a lamp and a sky."""
+    look = mi.ScalarTransform4f().look_at([1, 2, 5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sensor": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "box": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(size), "bsdf": {"type": "diffuse"}},
+        "sky": {"type": "constant"},
+        "lamp": {"type": "point", "position": [2, 3, 4], "intensity": 10.0},
+    }
+
+
+def test_a_mesh_may_follow_a_number_silhouettes_included() -> None:
+    """Vertices are a function of the box's size: the gradient against differences of pictures, and the size from one picture."""
+    key = "box.vertex_positions"
+    base = np.array(mi.traverse(mi.load_dict(box()))[key])  # pyright: ignore
+
+    def shot(size: float, spp: int, seed: int) -> np.ndarray:
+        return np.array(mi.render(mi.load_dict(box(size)), spp=spp, seed=mi.UInt32(seed)))
+
+    reference = shot(1.2, 256, 9)
+    made = ur.Problem(
+        box,
+        [ur.Parameter("size", initial=1.0, bounds=(0.3, 2.0))],
+        [ur.View(reference)],
+        expressions={key: lambda values: values["size"] * mi.TensorXf(base)},
+    )
+    estimator, point, found = ur.PathGradient(spp=32), made.initial(), []
+    for seed in range(12):
+        estimate = estimator.estimate(made, point, estimator.init(made, point), ur.Key(seed))[0]
+        found.append(float(as_numpy(estimate).gradient["size"][0]))
+    mean, error = np.mean(found), np.std(found, ddof=1) / np.sqrt(len(found))
+    slopes = []
+    for seed in range(6):
+        ends = [np.mean((shot(1 + step, 2048, seed) - reference) ** 2) for step in (0.02, -0.02)]
+        slopes.append((ends[0] - ends[1]) / 0.04)
+    noise = np.hypot(error, np.std(slopes, ddof=1) / np.sqrt(len(slopes)))
+    assert abs(mean - np.mean(slopes)) < 4 * noise + 0.02 * abs(mean)
+    assert abs(1.2 * mean - np.mean(slopes)) > 4 * noise + 0.02 * abs(mean)
+    result = ur.optimize(made, "auto", steps=60, progress=False)
+    assert result.parameters["size"] == pytest.approx([1.2], abs=0.01)
+
+
 # ---------------------------------------------------------------------- files
 
 XML = """<scene version="3.0.0"><integrator type="path"><integer name="max_depth" value="2"/></integrator>

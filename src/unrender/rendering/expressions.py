@@ -161,8 +161,8 @@ class ExpressionRenderer(RendererWrapper):
         if one.key not in known:
             raise ExpressionError(one.key, f"the scene has no parameter {one.key}{did_you_mean(one.key, known)}")
         info = known[one.key]
-        if info.welded or not (info.perturbable or info.differentiable):
-            raise ExpressionError(one.key, f"{one.key} cannot be a function: {info.reason or 'it is a moving mesh'}")
+        if not (info.perturbable or info.differentiable):
+            raise ExpressionError(one.key, f"{one.key} cannot be a function: {info.reason}")
         reads = _Reads(start)
         try:
             found = arrays.numpy(_shaped(one, reads, info.shape))
