@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.methods.plan import Plan
 from unrender.protocols import Callback
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import budget, loop
 from unrender.runs.metadata import RunAnnotations
+from unrender.runs.resume import load_run, resume_run
 
 TRUTH = {"gain": np.full(2, 0.5)}
 
@@ -52,6 +55,7 @@ def test_a_budget_may_cover_more_than_the_steps(
         return warm_up(descent)
 
     monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(budget, "slowdown", lambda: 1.0)
 
     class Seconds(Callback):
         def on_step(self, run: Any, record: Any) -> None:
@@ -71,7 +75,32 @@ def test_a_budget_of_few_steps_is_told_after_the_first() -> None:
     assert not ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), steps=5).warnings
 
 
-def test_the_end_of_the_steps_leaves_time_for_the_final_pictures() -> None:
-    for seconds, left in ((10.0, 8.0), (1.0, 0.5)):
-        assert (budget.last_step(seconds) or 0.0) - time.perf_counter() == pytest.approx(left, abs=0.1)
-    assert budget.last_step(None) is None
+@pytest.mark.parametrize(
+    ("seconds", "slowdown", "left"), [(10.0, 1.0, 8.0), (1.0, 1.0, 0.5), (30.0, 2.0, 22.0), (30.0, 9.0, 18.0)]
+)
+def test_the_end_of_the_steps_leaves_time_for_the_final_pictures(
+    seconds: float, slowdown: float, left: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tenth and a second, times the slowdown of a busy machine, up to 3; but half of the budget at most."""
+    monkeypatch.setattr(budget, "slowdown", lambda: slowdown)
+    run, _ = loop.prepare(Plan(problem(), ur.PathGradient(), ur.optimizers.Adam(0.01)), None, seconds, 0)
+    run.deadline = time.perf_counter() + seconds
+    budget.Budget()._set_last_step(run)
+    assert (run.last_step or 0.0) - time.perf_counter() == pytest.approx(left, abs=0.1)
+
+
+def test_a_resumed_run_has_what_is_left_of_its_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[float] = []
+    check = budget.Budget._check
+    monkeypatch.setattr(
+        budget.Budget, "_check", lambda self, descent: (seen.append(descent.run.time_left()), check(self, descent))[1]
+    )
+    parts = ur.PathGradient(), ur.optimizers.Adam(0.01)
+    clock = ur.optimize(problem(), *parts, steps=5, run_directory=tmp_path / "run").seconds
+    seen.clear()
+    resume_run(load_run(tmp_path / "run", seconds=clock + 0.5), problem(), within_seconds=True)
+    assert seen[0] <= 0.5
+
+
+def test_slowdown_is_at_least_one() -> None:
+    assert 1.0 <= budget.slowdown() < 1e3

@@ -69,8 +69,8 @@ def test_final_pictures_take_a_twentieth_of_the_time(
 ) -> None:
     made, now, per_path, asked = problem(views=views), [0.0], 2e-4, []
 
-    def render(problem, values, view, spp, seed=0):
-        del problem, values, seed
+    def render(problem, values, view, spp, seed=0, per_pass=None):
+        del problem, values, seed, per_pass
         now[0] += spp * 256 * per_path + (20.0 if not asked else 0.0)  # the first time, kernels are compiled
         asked.append((view, spp))
         return np.zeros((*SHAPE, 3), np.float32)
@@ -82,9 +82,21 @@ def test_final_pictures_take_a_twentieth_of_the_time(
     allowed = max(seconds / 20, 1.0)
     taken = 2 * views * found.spp * 256 * per_path
     assert found.spp & (found.spp - 1) == 0
-    assert taken <= allowed or found.spp == 2
+    assert taken <= allowed or found.spp == 2 * final_images._pass_spp(made)
     assert 2 * taken > max(seconds / 20, 1.0) or found.spp == 512
     assert {view for view, _ in asked} == set(range(views))
+
+
+def test_a_machine_without_time_left_makes_the_least_pictures_and_looks_no_further(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = problem()
+    monkeypatch.setattr(final_images, "sensitivity", lambda *_, **__: pytest.fail("there is no time for it"))
+    values = {"wall": np.full(3, 0.4, np.float32)}
+    found = final_images.render_final_images(made, Result(values, values, [{}], 30.0, 0.0, "steps"), left=lambda: -1.0)
+    assert found.spp == 2 * final_images._pass_spp(made)
+    assert set(found.errors) == {"view0/initial", "view0/result"}
+    assert not found.sensitivity
 
 
 def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:

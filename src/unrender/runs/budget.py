@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import glob
+import math
 import time
 from typing import TYPE_CHECKING
 
@@ -19,6 +21,8 @@ _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning says so, and the steps whose time tells it."""
 _END_SHARE, _END_SECONDS = 0.1, 1.0
 """Time of verification and final pictures: a share of the budget, and seconds besides."""
+_LOOK_SECONDS, _MOST_SLOWDOWN = 0.5, 3.0
+"""Seconds between two looks at how busy the machine is, and the largest factor that is allowed for."""
 _LEAST_SHARE = 0.5
 """Share of the budget that steps have, however long kernels take to compile."""
 _MOST_STEPS = 1 << 63
@@ -28,10 +32,14 @@ _MOST_STEPS = 1 << 63
 class Budget(Hook):
     """Stops a run that has used up its steps or seconds, or whose last twenty steps were not finite."""
 
+    def __init__(self) -> None:
+        self._least = self._looked = -math.inf
+
     def on_start(self, descent: Descent) -> None:
         run = descent.run
-        if run.last_step is not None and run.seconds is not None:
-            run.last_step = max(run.last_step, time.perf_counter() + _LEAST_SHARE * run.seconds)
+        if run.deadline is not None:
+            run.deadline -= run.clock  # of a resumed run, before
+        self._least = time.perf_counter() + _LEAST_SHARE * max((run.seconds or 0.0) - run.clock, 0.0)
         self._check(descent)
 
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
@@ -40,6 +48,7 @@ class Budget(Hook):
 
     def _check(self, descent: Descent) -> None:
         run = descent.run
+        self._set_last_step(run)
         if run.steps is not None and run.step >= run.steps:
             run.stop("steps")
         if run.seconds is not None and run.clock >= run.seconds:
@@ -54,13 +63,28 @@ class Budget(Hook):
             if line not in run.warnings:
                 run.warnings.append(line)
 
+    def _set_last_step(self, run: Run) -> None:
+        """Set when the steps end: before the deadline by the time of verification and pictures, longer on a busy machine."""
+        now = time.perf_counter()
+        if run.deadline is None or run.seconds is None or now - self._looked < _LOOK_SECONDS:
+            return
+        self._looked = now
+        end = min((_END_SHARE * run.seconds + _END_SECONDS) * min(slowdown(), _MOST_SLOWDOWN), 0.5 * run.seconds)
+        run.last_step = max(run.deadline - end, self._least)
 
-def last_step(seconds: float | None) -> float | None:
-    """Return when the steps of a run that begins now should end, so that its final pictures are done within these seconds; None for no
-    limit."""
-    if seconds is None:
-        return None
-    return time.perf_counter() + seconds - min(_END_SHARE * seconds + _END_SECONDS, 0.5 * seconds)
+
+def slowdown() -> float:
+    """Return the time that this process takes over the time that it would take alone, >= 1, from how long its threads waited for a
+    processor; 1 where the system does not tell."""
+    running = waiting = 0
+    for path in glob.glob("/proc/self/task/*/schedstat"):
+        try:
+            with open(path) as file:
+                ran, waited, _ = (int(word) for word in file.read().split())
+        except (OSError, ValueError):
+            continue
+        running, waiting = running + ran, waiting + waited
+    return 1.0 + waiting / running if running else 1.0
 
 
 def _warn_of_few_steps(run: Run) -> None:

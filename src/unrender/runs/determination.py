@@ -49,7 +49,9 @@ class Change:
         return self.square + _ERRORS * self.error < share**2 * (self.scale if scale is None else scale)
 
 
-def undetermined(problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf) -> list[str]:
+def undetermined(
+    problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf, per_pass: int | None = None
+) -> list[str]:
     """Return a line for each parameter that hardly changes the pictures over its whole range.
 
     Parameters of materials and media are looked at, one after the other, as long as there is time. All elements of a parameter move
@@ -60,6 +62,7 @@ def undetermined(problem: Problem, values: Mapping[str, np.ndarray], spp: int, s
         values: {key: array}, where the other parameters stay.
         spp: samples per pixel of each of four renderings per view.
         seconds: after which no further parameter is looked at; the first one always is.
+        per_pass: see `render`.
     """
     known, lines = problem.renderer.parameters(), []
     until, longest = time.perf_counter() + seconds, 0.0
@@ -74,7 +77,7 @@ def undetermined(problem: Problem, values: Mapping[str, np.ndarray], spp: int, s
             {**values, key: project(np.full(values[key].shape, end, np.float32), low, high)} for end in (low, high)
         )
         try:
-            change = _change(problem, first, last, spp)
+            change = _change(problem, first, last, spp, per_pass)
         except InputError:  # the renderer refuses an end of the range
             continue
         longest = max(longest, time.perf_counter() - started)
@@ -101,7 +104,9 @@ def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
     return lines
 
 
-def common_factor(problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf) -> list[str]:
+def common_factor(
+    problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf, per_pass: int | None = None
+) -> list[str]:
     """Return one line where the pictures determine lights and reflectances up to a common factor only; none elsewhere.
 
     Lights become brighter by a factor and reflectances darker by the same; the pictures tell the two apart if they change.
@@ -111,19 +116,20 @@ def common_factor(problem: Problem, values: Mapping[str, np.ndarray], spp: int, 
         values: {key: array}, the parameters at which it is looked.
         spp: samples per pixel of each of eight renderings per view.
         seconds: what it may take; nothing is looked at where one rendering shows that it would take longer.
+        per_pass: see `render`.
     """
     known = problem.renderer.parameters()
     lights, colours = ([k for k in values if known[k].brightness == kind] for kind in ("light", "reflectance"))
     if not lights or not colours:
         return []
     started = time.perf_counter()
-    render(problem, values, 0, spp, _SEEDS[0])
+    render(problem, values, 0, spp, _SEEDS[0], per_pass)
     if _RENDERINGS * len(_views(problem)) * (time.perf_counter() - started) > seconds:
         return []
     brighter = {key: x * np.float32(_FACTOR) if key in lights else x for key, x in values.items()}
     darker = {key: x / np.float32(_FACTOR) if key in colours else x for key, x in brighter.items()}
-    alone = _change(problem, values, brighter, spp)
-    together = _change(problem, values, darker, spp)
+    alone = _change(problem, values, brighter, spp, per_pass)
+    together = _change(problem, values, darker, spp, per_pass)
     if alone.square <= 0.0 or not together.is_below(_LEAST_OF_FACTOR, alone.square):
         return []
     line = f"{listed(lights)} and {listed(colours)}: determined up to a common factor only"
@@ -155,13 +161,15 @@ def _views(problem: Problem) -> list[int]:
     return sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
 
 
-def _change(problem: Problem, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], spp: int) -> Change:
+def _change(
+    problem: Problem, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], spp: int, per_pass: int | None
+) -> Change:
     """Between two states. The product of two independent differences has no bias by noise; each is of equal random numbers."""
     products, squares = [], []
     for view in _views(problem):
         differences = []
         for seed in _SEEDS:
-            first, second = (render(problem, state, view, spp, seed) for state in (before, after))
+            first, second = (render(problem, state, view, spp, seed, per_pass) for state in (before, after))
             differences.append((second - first).astype(np.float64))
             squares.append(np.mean(np.square(first, dtype=np.float64)))
         products.append(np.mean(differences[0] * differences[1], axis=-1).reshape(-1))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from unrender.runs.least_squares import check_numbers
 from unrender.runs.result import Result
 from unrender.runs.sensitivity import sensitivity
 from unrender.scene.problem import Problem
-from unrender.scene.render import render
+from unrender.scene.render import MANY_SENSORS, render
 from unrender.statistics import debiased
 
 _PICTURE_PATHS = 1 << 22
@@ -29,6 +30,10 @@ _LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
 _NUMBERS_SHARE = 0.05
 """Of the time of the steps, what the least squares of few numbers may take, but a second at least."""
 _TRIAL_PATHS = 1 << 18
+_PASS_PATHS, _MOST_PASS = 1 << 18, 16
+"""Paths of one pass over all views, and its most samples per pixel."""
+_PICTURES_SHARE = 0.5
+"""Share of the time that is left at the end that final pictures may take."""
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Of the pictures of views whose references are not held in memory: of each view, reference, start and result."""
 
@@ -63,7 +68,19 @@ def render_pictures(problem: Problem, result: Result, spp: int | None = None) ->
     return render_final_images(problem, result, spp).pictures
 
 
-def render_final_images(problem: Problem, result: Result, spp: int | None = None) -> FinalImages:
+def warm_up(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
+    """Compile the kernels of `render_final_images`, by a picture of one pass and one probe of the sensitivity of one view."""
+    pass_spp, count = _pass_spp(problem), len(problem.views)
+    own = count if count < MANY_SENSORS else 1  # more of them share their kernels
+    for view in range(own):
+        render(problem, values, view, pass_spp, per_pass=pass_spp)
+    if len(_chosen(problem)) == count:
+        sensitivity(problem, values, probes=1, views=own)
+
+
+def render_final_images(
+    problem: Problem, result: Result, spp: int | None = None, left: Callable[[], float] = lambda: math.inf
+) -> FinalImages:
     """Reference, initial and final picture of each view, the control weight and the probability of pixels where there are any; and how
     much the views tell of each element of the parameters. Of many large views, whose references are not held in memory, pictures of some.
 
@@ -75,12 +92,14 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
         result: its outcome.
         spp: samples per pixel. None for as many as a twentieth of the time of the run's steps allows, or one second where that is longer,
             but no more than some four million paths per picture: a power of two, at least 2. Compiling is no part of that time.
+        left: returns the seconds that are left for all of this. Pictures have fewer samples, and what the pictures do not determine is
+            left out, if they are few.
     """
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
     pictures: dict[str, np.ndarray] = {}
     errors: dict[str, tuple[float, float]] = {}
     with phases.phase("final pictures") as advance:
-        samples = spp or _affordable(problem, result)
+        samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
         chosen = _chosen(problem)
         for place, index in enumerate(chosen):
             reference = np.asarray(problem.views[index].reference, np.float32)
@@ -97,24 +116,30 @@ def render_final_images(problem: Problem, result: Result, spp: int | None = None
             if index in probabilities:
                 density = np.asarray(probabilities[index], np.float32)
                 pictures[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
-        seconds = _SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS)
-        everything = len(chosen) == len(problem.views)
+        seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * left())
+        everything = len(chosen) == len(problem.views) and seconds > 0.0
         found = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
-        lines, warnings = _undetermined(problem, result, found) if everything else ([], [])
+        lines, warnings = _undetermined(problem, result, found, 0.25 * left()) if everything else ([], ())
     return FinalImages(pictures, errors, samples, found, tuple(lines), tuple(warnings))
 
 
 def _undetermined(
-    problem: Problem, result: Result, found: Mapping[str, np.ndarray]
+    problem: Problem, result: Result, found: Mapping[str, np.ndarray], most: float
 ) -> tuple[list[str], tuple[str, ...]]:
-    """What the pictures do not determine, and which numbers had not settled, in lines; of a run without steps nothing."""
+    """What the pictures do not determine, and which numbers had not settled, in lines; of a run without steps nothing.
+
+    Each look takes `most` seconds, or few more.
+    """
     if not result.steps:
         return [], ()
     lines = undetermined_cells(found)
-    spp, seconds = _trial_spp(problem), max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS)
-    lines += common_factor(problem, result.parameters, spp, seconds)
-    lines += undetermined(problem, result.parameters, spp, seconds)
-    allowed = max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS)
+    spp, seconds = _trial_spp(problem), min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
+    if seconds <= 0.0:
+        return lines, ()
+    per_pass = _pass_spp(problem)
+    lines += common_factor(problem, result.parameters, spp, seconds, per_pass)
+    lines += undetermined(problem, result.parameters, spp, seconds, per_pass)
+    allowed = min(max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed)
     told = "\n".join(lines)
     lines += [line for key, line in numbers.undetermined.items() if key not in told]
@@ -143,28 +168,38 @@ def _picture(
     first = spp // 2
     if first == 0:
         return render(problem, values, view, spp, seed), None
-    one, other = (render(problem, values, view, first, seed + offset) for offset in (0, _SECOND_HALF))
+    pass_spp = _pass_spp(problem)
+    per_pass = pass_spp if first % pass_spp == 0 else None
+    one, other = (
+        render(problem, values, view, first, seed + offset, per_pass=per_pass) for offset in (0, _SECOND_HALF)
+    )
     seen = problem.views[view]
     mask = None if seen.mask is None else np.asarray(seen.mask)
     return (one + other) / 2, debiased.rmse(one, other, np.asarray(seen.reference), mask)
 
 
-def _affordable(problem: Problem, result: Result) -> int:
+def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
     """Samples per pixel that final pictures may have: what they take is measured on a few samples of the first view."""
     sizes = [height * width for height, width in problem.sizes]
-    most, trial = _most_spp(problem), _trial_spp(problem)
+    most, trial = _most_spp(problem), _pass_spp(problem)
     seconds = 0.0
     for seed in (0, 1):  # the first time, kernels are compiled
         started = time.perf_counter()
-        render(problem, result.parameters, 0, trial, seed)
+        render(problem, result.parameters, 0, trial, seed, per_pass=trial)
         seconds = time.perf_counter() - started
-    allowed = max(_SHARE * result.seconds, _LEAST_SECONDS)
+    allowed = min(max(_SHARE * result.seconds, _LEAST_SECONDS), most_seconds)
     paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
-    return max(2, _power_of_two(int(min(most, paths / (2 * sum(sizes))))))
+    return max(2, 2 * trial, _power_of_two(int(min(most, max(paths, 0.0) / (2 * sum(sizes))))))
 
 
 def _most_spp(problem: Problem) -> int:
     return min(min(max(_PICTURE_PATHS // (height * width), _FEWEST), _MOST) for height, width in problem.sizes)
+
+
+def _pass_spp(problem: Problem) -> int:
+    """Return the samples per pixel of one pass, few enough for the least pictures of all views. All passes share one kernel."""
+    pixels = sum(height * width for height, width in problem.sizes)
+    return _power_of_two(min(_PASS_PATHS // pixels, _MOST_PASS, _most_spp(problem) // 2))
 
 
 def _trial_spp(problem: Problem) -> int:

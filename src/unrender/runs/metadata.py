@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from typing import Any
@@ -33,6 +34,7 @@ class RunAnnotations:
         final_spp: samples per pixel of the final pictures; None chooses.
         phases: {phase: seconds} of what came before, such as loading.
         within_seconds: Whether the budget in seconds covers compilation and final pictures too, not the steps alone.
+        spent: Seconds of that budget that are gone before the run, such as those of loading.
     """
 
     method: str = ""
@@ -42,6 +44,11 @@ class RunAnnotations:
     final_spp: int | None = None
     phases: Mapping[str, float] = field(default_factory=dict)
     within_seconds: bool = False
+    spent: float = 0.0
+
+    def deadline(self, seconds: float | None) -> float | None:
+        """Return when a run that begins now and has this budget should be done, see `Run.deadline`; None where the steps alone count."""
+        return time.perf_counter() + seconds - self.spent if self.within_seconds and seconds is not None else None
 
 
 def first_values(run: Run) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.runs import advice, components
-from unrender.runs.budget import Budget, check_budget, last_step
+from unrender.runs.budget import Budget, check_budget
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import method_file
 from unrender.runs.folder.writer import RunWriter
@@ -104,7 +104,7 @@ def optimize(
     if isinstance(estimator, str) and not annotations.method:
         annotations = replace(annotations, method=estimator, choices=plan.lines)
     run, state = prepare(plan, steps, seconds, seed)
-    run.last_step = last_step(seconds) if annotations.within_seconds else None
+    run.deadline = annotations.deadline(seconds)
     run.warnings += advice.remarks(problem, plan.optimizer)
     log = RunMetadata(describe_run(run, annotations), first_values(run))
     with _progress(progress) as shown, _folder(run, log, annotations, run_directory, checkpoint_every) as writers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,13 +98,16 @@ def resume_run(
     estimator: Estimator | None = None,
     optimizer: Optimizer | None = None,
     earlier: Mapping[str, float] | None = None,
+    within_seconds: bool = False,
 ) -> Result:
-    """Resume the run. See `unrender.resume`; `earlier` is the seconds of phases before."""
+    """Resume the run. See `unrender.resume`; `earlier` is the seconds of phases before, for `within_seconds` see `RunAnnotations`."""
     folder, method = stored.folder, stored.method
     plan = Plan.from_table(problem, method.model_dump(), str(folder / METHOD), estimator, optimizer)
     check(plan.estimator, plan.optimizer, method.steps, method.seconds)
     run, state = prepare(plan, method.steps, method.seconds, method.seed)
     run.folder = folder
+    if within_seconds and method.seconds is not None:
+        run.deadline = time.perf_counter() + method.seconds - sum((earlier or {}).values())
     initial, fingerprint = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
         for source in _sources(stored):

@@ -43,6 +43,7 @@ class Run:
         ahead: steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
         warnings: one line each.
         stopped: why it ends after the present step; "" while it goes on.
+        deadline: when all should be done, final pictures included, on the clock of `time.perf_counter`; None without such a budget.
         last_step: when the steps should end, on the clock of `time.perf_counter`, so that all is done within the budget; None where the
             budget is of the steps alone.
     """
@@ -64,6 +65,11 @@ class Run:
     warnings: list[str] = field(default_factory=list)
     stopped: str = ""
     last_step: float | None = None
+    deadline: float | None = None
+
+    def time_left(self) -> float:
+        """Return the seconds until the deadline, which may be below 0; infinity without one."""
+        return math.inf if self.deadline is None else self.deadline - time.perf_counter()
 
     def stop(self, reason: str = "callback") -> None:
         """End the run after the present step."""

@@ -31,6 +31,7 @@ def sensitivity(
     spp: int | None = None,
     seconds: float = np.inf,
     seed: int = 0,
+    views: int | None = None,
 ) -> dict[str, np.ndarray]:
     """√diag(JᵀJ) with J the derivative of all views' pixels by the parameters: by how much, as the root of the sum of squares over pixels
     and channels, the images change per unit of each element.
@@ -49,6 +50,7 @@ def sensitivity(
         spp: samples per pixel of each adjoint, >= 1; None for 4, or fewer where the views have more than 2¹⁸ pixels together.
         seconds: after which no further probe is begun; there is one at least.
         seed: of all random numbers.
+        views: how many views to render, the first ones, >= 1; None for all.
 
     Returns:
         {key: array} of the parameters' shapes, float32; {} where path gradients do not reach a parameter.
@@ -68,7 +70,9 @@ def sensitivity(
     squares = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
     made, until = 0, time.perf_counter() + seconds
     while made == 0 or (made < probes and time.perf_counter() < until):
-        one, other = (_projections(problem, session, parameters, spp, Key(seed, made), half) for half in range(2))
+        one, other = (
+            _projections(problem, session, parameters, spp, Key(seed, made), half, views) for half in range(2)
+        )
         for key, square in squares.items():
             square += one[key] * other[key]
         made += 1
@@ -110,12 +114,12 @@ def seen_cells(found: np.ndarray) -> np.ndarray | None:
 
 
 def _projections(
-    problem: Problem, session: RenderSession, parameters: Tree, spp: int, key: Key, half: int
+    problem: Problem, session: RenderSession, parameters: Tree, spp: int, key: Key, half: int, views: int | None
 ) -> dict[str, np.ndarray]:
     """{key: Jᵀs}: of the signs s of a probe, on one of its two halves' paths."""
     found = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
     signs = np.random.default_rng(key.uint32())
-    for view in range(len(problem.views)):
+    for view in range(len(problem.views))[:views]:
         rendering = session.image(parameters, view_request(problem, view, spp, key.fold(2 * view + half).uint32()))
         weights = signs.choice(np.array([-1, 1], np.float32), size=arrays.shape(rendering.images))
         for name, value in session.adjoint(parameters, rendering.paths, problem.renderer.array(weights)).items():

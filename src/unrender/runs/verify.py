@@ -91,6 +91,13 @@ class Verify(Hook):
     _pictures: FreshPictures | None = field(default=None, init=False)
     _earlier: list[_Earlier] = field(default_factory=list, init=False)
 
+    def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+        """Compile the kernels of fresh pictures, so that nothing compiles after the last step."""
+        del fresh, warm
+        run = descent.run
+        with phases.phase(phase_times.COMPILING):
+            FreshPictures(run.problem, run.seed, 0, _END).images(run.full())
+
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
         """See `Hook.on_step`."""
         del record

@@ -16,7 +16,7 @@ from unrender.scene.problem import Problem
 
 _PATHS_PER_PASS = 1 << 21
 """Maximum number of paths per pass, within the memory of a small machine."""
-_MANY_SENSORS = 4
+MANY_SENSORS = 4
 """Number of sensors from which all views share one kernel: recording one per sensor would take longer than rendering."""
 
 
@@ -27,6 +27,7 @@ def render(
     view: int = 0,
     spp: int = 64,
     seed: int = 0,
+    per_pass: int | None = None,
 ) -> np.ndarray:
     """Render one view, in as many passes as memory requires. Unbiased, with the film's reconstruction filter.
 
@@ -36,6 +37,7 @@ def render(
         view: index of the view.
         spp: samples per pixel, >= 1.
         seed: seed of the random numbers.
+        per_pass: most samples per pixel of a pass, >= 1. Passes of equal counts share one kernel. None for the most that memory allows.
 
     Returns:
         float32 (H, W, 3), linear RGB.
@@ -48,7 +50,7 @@ def render(
     session = problem.renderer.prepare(list(point), None, derivatives=False)
     sensor = problem.views[view].sensor
     height, width = problem.renderer.resolutions()[sensor]
-    per_pass = max(1, min(spp, _PATHS_PER_PASS // (height * width)))
+    per_pass = max(1, min(spp, _PATHS_PER_PASS // (height * width), per_pass or spp))
     total, done, key = np.zeros((height, width, 3)), 0, Key(seed)
     while done < spp:
         take = min(per_pass, spp - done)
@@ -66,7 +68,7 @@ def view_request(problem: Problem, view: int, spp: int, seed: int) -> SampleRequ
     """
     sensor, sensors = problem.views[view].sensor, {other.sensor for other in problem.views}
     known = problem.renderer.parameters()
-    if len(sensors) < _MANY_SENSORS or any(known[parameter.key].rigid for parameter in problem.parameters):
+    if len(sensors) < MANY_SENSORS or any(known[parameter.key].rigid for parameter in problem.parameters):
         return SampleRequest(sensor, spp, seed)
     height, width = problem.renderer.resolutions()[sensor]
     like = problem.renderer.array(np.zeros(1))

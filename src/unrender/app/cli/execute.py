@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -45,6 +46,7 @@ class RunOrder:
         problem_settings: of a gallery problem, to be saved with the results.
         checkpoint_every: see `optimize`.
         within_seconds: whether `seconds` covers compilation and final pictures too; where methods are compared it is for steps alone.
+        began: when the budget began, on the clock of `time.perf_counter`; None for when the run begins.
     """
 
     method: Method | PlanFile
@@ -57,6 +59,7 @@ class RunOrder:
     problem_settings: Mapping[str, Any]
     checkpoint_every: int | None = None
     within_seconds: bool = False
+    began: float | None = None
 
 
 @contextmanager
@@ -81,8 +84,9 @@ def execution(
     for line in advice.remarks(problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
+    spent = 0.0 if order.began is None else time.perf_counter() - order.began
     annotations = RunAnnotations(
-        order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, order.within_seconds
+        order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, order.within_seconds, spent
     )
     live = Live(directory, problem.name, order.method.name, order.command)
     yield {

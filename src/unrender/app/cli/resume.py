@@ -68,6 +68,6 @@ def resume(
         live = Live(directory, problem.name, found.record.method, found.record.command)
         theirs = dealing.variant_again(variant, found.record)
         with dealing.dealt(problem, processes, compress, theirs, threads or alone, console) as dealt:
-            result = resume_run(found, dealt, force, [progress, live], earlier=progress.seconds)
+            result = resume_run(found, dealt, force, [progress, live], earlier=progress.seconds, within_seconds=True)
         live.clear()
         conclude(console, problem, result, directory, progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -102,8 +103,9 @@ def run(
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
+                began = time.perf_counter() - progress.elapsed
                 task = RunOrder(
-                    chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every, True
+                    chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every, True, began
                 )
                 with execution(dealt, task, folder, console, progress) as order:
                     result = optimize(**order)

@@ -235,7 +235,7 @@ def _run_stage(
         problem = runs.problem_of(folder)
         introduce(console, problem, run.variant)
         live = Live(folder, problem.name, found.record.method, found.record.command)
-        result = resume_run(found, problem, False, [progress, live], earlier=progress.seconds)
+        result = resume_run(found, problem, False, [progress, live], earlier=progress.seconds, within_seconds=True)
         live.clear()
         return problem, result
     with phases.phase("loading"):
@@ -247,7 +247,7 @@ def _run_stage(
     last = index == len(stages.stages) - 1
     spp = run.options.final_spp or (None if last else 1)  # those of many views take minutes
     every = run.options.checkpoint_every
-    order = RunOrder(chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every)
+    order = RunOrder(chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every, True)
     with execution(problem, order, folder, console, progress) as arguments_of_run:
         return problem, optimize(**arguments_of_run)
 

@@ -16,11 +16,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import files
 from unrender.runs import phase_times
-from unrender.runs.final_images import render_final_images
+from unrender.runs.final_images import render_final_images, warm_up
 from unrender.runs.folder import checkpoint, method_file
 from unrender.runs.folder.history import MOST_KEPT, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
@@ -143,6 +144,13 @@ class RunWriter(Hook):
         except OSError as error:
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
 
+    def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+        """Compile the kernels of the final pictures, so that nothing compiles after the last step."""
+        del fresh, warm
+        if self.final_spp != 1 and not descent.run.stopped:
+            with phases.phase(phase_times.COMPILING):
+                warm_up(descent.run.problem, descent.run.full())
+
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
         """Append the step to the history; write a checkpoint where one is due."""
         self.append(record)
@@ -162,7 +170,7 @@ class RunWriter(Hook):
                 # What took long is safe, and how it ended is known, before what takes seconds more.
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
-            images = render_final_images(descent.run.problem, result, self.final_spp)
+            images = render_final_images(descent.run.problem, result, self.final_spp, descent.run.time_left)
             result = replace(
                 result,
                 pictures=images.pictures,
