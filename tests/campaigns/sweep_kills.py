@@ -19,8 +19,13 @@ from tests.campaigns.cuts import leftovers
 
 __all__ = ["campaign"]
 
-_KINDS = {"worker": "ray::", "node": "raylet/raylet", "store": "gcs_server", "command": "-m unrender"}
-"""What is killed, and the words that its command line holds."""
+_KINDS = {
+    "worker": ("ray::unrender", "ray::IDLE"),
+    "node": ("raylet/raylet",),
+    "store": ("gcs_server",),
+    "command": ("-m unrender",),
+}
+"""What is killed, and words of which its command line holds one."""
 _SWEEP = ["sweep", "exponential", "-m", "plain", "--over", "learning_rate=0.001,0.003,0.01,0.03", "--steps", 1500]
 _SWEEP += ["--final-spp", 1, "--threads", 1, "--workers", 2, "--out", "sweep"]
 
@@ -59,7 +64,9 @@ def campaign(folder: Path, number: int, dice: random.Random) -> list[dict[str, A
         place.mkdir(exist_ok=True)
         process, moment = _start(place, *_SWEEP), dice.uniform(0, seconds)
         time.sleep(moment)
-        found = [pid for pid, words in processes_below(process.pid).items() if _KINDS[kind] in words]
+        found = [
+            pid for pid, words in processes_below(process.pid).items() if any(word in words for word in _KINDS[kind])
+        ]
         beside = sorted(set(processes_below(process.pid)) - {process.pid})
         if not found or process.poll() is not None:  # too early or too late for this kind
             process.kill()

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from unrender.app.cli import memory
+from unrender.app.cli import memory, signals
 from unrender.backend import limits
 from unrender.core.errors import InputError
 from unrender.estimators.path import PathGradient
@@ -78,7 +78,7 @@ def start(folder: Path, words: list[str], limit: int | None = None, before: str 
 
 def ended(process: subprocess.Popen[str], seconds: float = 120) -> tuple[int, str]:
     _, said = process.communicate(timeout=seconds)
-    return process.returncode, said
+    return process.returncode, said.removeprefix(f"unrender: {signals.WAITING}\n")
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def ended(process: subprocess.Popen[str], number: signal.Signals) -> float:
     if process.returncode == 0:  # it came too late
         assert said == ""
     else:
-        waited = f"unrender: {handled._WAITING}\n"
+        waited = f"unrender: {handled.WAITING}\n"
         assert (process.returncode, said.removeprefix(waited)) == (128 + number, f"unrender: {WORDS[number]}\n")
     return seconds
 
@@ -95,7 +95,7 @@ def test_compiled_code_that_goes_on_says_why_nothing_happens(tmp_path: Path, aga
     code = textwrap.dedent("""
         import hashlib, os, signal, sys, threading, time
         from unrender.app.cli import signals
-        signals._SILENT = 0.2
+        signals._SILENT = signals._STUCK = 0.2
         rounds, again = int(sys.argv[1]), sys.argv[2] == "True"
         threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
         if again:
@@ -109,7 +109,7 @@ def test_compiled_code_that_goes_on_says_why_nothing_happens(tmp_path: Path, aga
     rounds = 2_000_000_000 if again else 6_000_000
     words = [sys.executable, "-c", code, str(rounds), str(again)]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120)
-    waiting = f"unrender: {handled._WAITING}\n"
+    waiting = f"unrender: {handled.WAITING}\n"
     if again:
         assert (done.returncode, done.stderr) == (143, waiting + "unrender: terminated\n")
     else:

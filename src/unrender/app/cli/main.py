@@ -7,6 +7,7 @@ Whatever is wrong is one line on standard error.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import sys
@@ -16,7 +17,7 @@ from importlib import metadata
 from typing import Any
 
 from unrender.app.cli import memory
-from unrender.app.cli.signals import ENVIRONMENT, INPUT, INTERRUPTED, WORDS, Signals
+from unrender.app.cli.signals import ENVIRONMENT, INPUT, INTERRUPTED, TERMINATED, WORDS, Signals
 from unrender.backend import limits, variant
 from unrender.core.checks import encode_text
 from unrender.core.errors import UnrenderError, VariantError
@@ -49,7 +50,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise
             status = ended
         status = signals.status or status
-        return _complain(WORDS[status], status) if status in WORDS else status
+        if status in WORDS:
+            _complain(WORDS[status], status)
+        if is_process and status in (INTERRUPTED, TERMINATED):
+            # The interpreter's end would wait for kernels that nobody needs.
+            with contextlib.suppress(OSError):
+                sys.stdout.flush()
+            os._exit(status)
+        return status
     except Exception as error:
         if not memory.exhausted(error):
             raise

@@ -5,6 +5,7 @@ second time, the command is interrupted where it is; while it is still busy with
 written remains, as after a kill.
 
 Python's handlers wait for the end of compiled code. A thread says so where that takes long, and lets a second signal end the process.
+Nothing waits for the rest of what was launched: all that is to remain is written before.
 """
 
 from __future__ import annotations
@@ -35,9 +36,11 @@ WORDS = {
 
 _LATER, _LONGEST = 0.02, 1.5
 """Seconds until a signal comes again that came during an import, and until the command ends at once though the import goes on."""
-_SILENT = 1.5
-"""Seconds after which a signal that compiled code holds back is acknowledged."""
-_WAITING = "a kernel is compiled or a picture rendered: the command ends after that, and at once when told again"
+_SILENT, _STUCK = 1.5, 0.5
+"""Seconds for which compiled code may hold back a signal before that is said, and a second signal before the process ends."""
+WAITING = (
+    "the command ends when what is under way has ended (a kernel, a picture, a worker), and at once when told again"
+)
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
@@ -123,23 +126,26 @@ class _Watch:
         os.close(self._write)
 
     def _run(self) -> None:
-        held: tuple[int, int] | None = None  # where the main thread was when a signal came
-        silent = False
+        signals, number, said, last = 0, 0, False, (0, 0)
         while True:
-            heard = select.select([self._read], [], [], _SILENT if silent else None)[0]
+            again = signals > 1
+            waits = signals and (again or not said)
+            heard = select.select([self._read], [], [], (_STUCK if again else _SILENT) if waits else None)[0]
+            place = self._place()
             if not heard:
-                silent = False
-                if held == self._place():
-                    os.write(2, f"unrender: {_WAITING}\n".encode())
+                if place == last and again:
+                    _leave(128 + number)
+                if place == last and not said:
+                    said = True
+                    os.write(2, f"unrender: {WAITING}\n".encode())
+                last = place
             elif not (data := os.read(self._read, 1)):
                 os.close(self._read)
                 return
             elif self.own:
                 self.own -= 1
             elif data[0] in (signal.SIGINT, signal.SIGTERM):
-                if held is not None and held == self._place():
-                    _leave(128 + data[0])
-                held, silent = self._place(), True
+                signals, number, last = signals + 1, data[0], place
 
     def _place(self) -> tuple[int, int]:
         """Return the instruction at which the main thread is."""
