@@ -122,3 +122,24 @@ def test_no_time_no_check():
     made = problem(MATRIX)
     found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), 0.0)
     assert not found.errors
+
+
+@pytest.mark.parametrize("units", [1e-6, 1e6])
+def test_gauss_newton_steps_arrive_in_any_units(units: float):
+    """Widths of differences and the margin of a bound follow the size of the values."""
+    renderer = AnalyticRenderer({k: units * x for k, x in TRUTH.items()}, MATRIX / units, 2.0, 0.05, shape=SHAPE)
+    seen = renderer.exact({k: units * x for k, x in TRUTH.items()}).astype(np.float32)
+    start = [ur.Parameter(key, initial=0.5 * units * value, bounds=(0, None)) for key, value in TRUTH.items()]
+    made = ur.Problem(renderer, start, [ur.View(seen)])
+    result = ur.optimize(made, ur.GaussNewton(4, 4), ur.optimizers.AveragedNewton(), steps=12)
+    np.testing.assert_allclose(result.parameters["a"], units * TRUTH["a"], rtol=0.02)
+    np.testing.assert_allclose(result.parameters["b"], units * TRUTH["b"], rtol=0.02)
+
+
+def test_small_values_have_a_small_margin_at_an_open_bound():
+    for scale, expected in ((1e-5, 1e-9), (0.0, 1e-4), (50.0, 1e-4)):
+        renderer = AnalyticRenderer(TRUTH, MATRIX, 2.0, shape=SHAPE)
+        view = ur.View(renderer.exact(TRUTH).astype(np.float32))
+        parameter = ur.Parameter("a", initial=[scale, 0.0, 0.0], bounds=(0, None))
+        unknown = ur.Problem(renderer, [parameter], [view]).unknowns["a"]
+        np.testing.assert_allclose(unknown.project(np.zeros(3)), expected, rtol=1e-5)

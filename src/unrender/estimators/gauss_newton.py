@@ -18,7 +18,6 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise, Smoothing
 from unrender.estimators.gradient_sum import damping, smoothed_variance
 from unrender.rendering.renderer import RenderSession, SampleRequest
-from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
@@ -80,7 +79,8 @@ class GaussNewton:
         spp: samples per pixel of the image, >= 2.
         derivative_spp: of the renders that differences are made of, >= 2.
         shift: in pixels, > 0. Smaller ones are sharper, with more noise at edges.
-        width: of the differences before the first estimate finds better ones, in units of the parameter, > 0.
+        width: of the differences before the first estimate finds better ones, > 0: a share of a parameter's largest value, or in its units
+            if all values are 0.
         tolerance: κ > 0 of the damping, for losses whose derivative is not linear.
         coarse: `shift` at the start, in pixels, >= `shift`; None for `shift` itself. It halves after each step that is short beside the
             widths. Images and derivative images are summed over blocks as wide as the shift, so a wide difference has little noise, and
@@ -135,7 +135,8 @@ class GaussNewton:
         """See `Estimator.estimate`. `info`: "samples" (paths traced), "images" per view."""
         point = _Point(self, problem, parameters)
         if not state.widths:
-            widths = {key: min(self.width, self.largest.get(key, math.inf)) for key in parameters}
+            widths = {key: self.width * (float(np.abs(arrays.numpy(x)).max()) or 1.0) for key, x in parameters.items()}
+            widths = {key: min(width, self.largest.get(key, math.inf)) for key, width in widths.items()}
             state = GaussNewtonState(widths, self.coarse or self.shift, point.theta)
             for index in range(_PASSES):
                 found = point.system(state, key.fold(1 + index), derivatives=False)
@@ -280,7 +281,7 @@ class _Point:
         offsets[0, np.arange(elements.size), elements] = steps[elements]
         offsets[1, np.arange(elements.size), elements] = -steps[elements]
         states = vectors.parts(self.theta + offsets, self.parameters)
-        inside = [project(x, *unknowns[key].bounds).reshape(*x.shape[:2], -1) for key, x in states.items()]
+        inside = [unknowns[key].project(x).reshape(*x.shape[:2], -1) for key, x in states.items()]
         points = np.concatenate(inside, axis=-1).astype(np.float32).astype(np.float64)
         distances = points[0, np.arange(elements.size), elements] - points[1, np.arange(elements.size), elements]
         return points.reshape(-1, self.theta.size), distances

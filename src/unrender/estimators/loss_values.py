@@ -15,7 +15,6 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.rendering.renderer import RenderSession, SampleRequest
-from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 
 
@@ -109,7 +108,7 @@ class BlackBox:
         """The losses (B,) and, per view, the images (B, H, W, 3)."""
         renderer, unknowns = self.problem.renderer, self.problem.unknowns
         session = renderer.prepare(list(self.parameters), None, derivatives=False)
-        stacked = {key: project(x, *unknowns[key].bounds) for key, x in vectors.parts(points, self.parameters).items()}
+        stacked = {key: unknowns[key].project(x) for key, x in vectors.parts(points, self.parameters).items()}
         images, parts = {}, []
         for index, view in enumerate(self.problem.views):
             request = SampleRequest(view.sensor, self.spp, self.key.fold(index).uint32())

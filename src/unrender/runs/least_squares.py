@@ -16,7 +16,6 @@ from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.display import formatting
 from unrender.rendering.renderer import RenderSession, SampleRequest
-from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 
 __all__ = ["NumbersCheck", "check_numbers"]
@@ -203,7 +202,7 @@ class _Numbers:
 
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Return the points (B, n) within the bounds."""
-        parts = {key: project(x, *self.problem.unknowns[key].bounds) for key, x in self.parts(points).items()}
+        parts = {key: self.problem.unknowns[key].project(x) for key, x in self.parts(points).items()}
         return np.concatenate([x.reshape(len(points), -1) for x in parts.values()], axis=1).astype(np.float32)
 
     def pictures(self, points: np.ndarray, key: Key) -> np.ndarray:

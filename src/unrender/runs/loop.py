@@ -26,7 +26,6 @@ from unrender.runs.noise import GradientNoise
 from unrender.runs.phase_times import COMPILING
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, interruptible, snapshot
-from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 
 __all__ = ["Descent", "descend", "initialize", "prepare"]
@@ -116,7 +115,7 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
 def initialize(run: Run, state: RunState, step: int) -> None:
     """Give a run that has not begun its initial parameters, at their resolution of a step, and initial states of that resolution."""
     problem = run.problem
-    run.parameters = {k: project(x, *problem.unknowns[k].bounds) for k, x in problem.start(step).items()}
+    run.parameters = {k: problem.unknowns[k].project(x) for k, x in problem.start(step).items()}
     state.estimator = run.estimator.init(problem, run.parameters)
     state.optimizer = run.optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
 
@@ -258,7 +257,7 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     found = by_coordinates(estimate, problem, parameters)
     steps, state = optimizer.update(found, state, coordinates.of(parameters))
     moved, reached = coordinates.moved(parameters, steps)
-    bounded = {k: project(x, *problem.unknowns[k].bounds) for k, x in reached.items()}
+    bounded = {k: problem.unknowns[k].project(x) for k, x in reached.items()}
     # Before they are bounded: the nearest point to what is no number may be a bound.
     finite = trees.map(arrays.is_finite, moved)
     del steps, moved, reached

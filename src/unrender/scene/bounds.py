@@ -16,7 +16,7 @@ from unrender.parameterisations.base import Bounds
 from unrender.rendering.renderer import ParameterInfo
 
 MARGIN = 1e-4
-"""Margin that `project` keeps from a bound, as a fraction of the range (of 1 if the range is unbounded).
+"""Margin that `project` keeps from a bound, as a fraction of the range (of `open_scale` if it is unbounded).
 
 At reflectance 0 no light passes a surface, so its gradient stays 0. A lobe of probability 0 is never sampled again.
 """
@@ -66,9 +66,21 @@ def clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
     return np.asarray(np.clip(start, low, high), np.float32), notice  # clip returns a scalar for a scalar
 
 
-def project(x: Array, low: float | None, high: float | None) -> Array:
-    """Project onto the bounds, with a margin. A projection, unlike a sigmoid, does not change the gradient inside the bounds."""
-    margin = MARGIN * (high - low if low is not None and high is not None else 1.0)
+def open_scale(initial: np.ndarray) -> float:
+    """Return the scale of values whose range is unbounded: the largest initial magnitude, at most 1; 1 if all are 0."""
+    return min(1.0, float(np.abs(initial).max(initial=0.0))) or 1.0
+
+
+def project(x: Array, low: float | None, high: float | None, scale: float = 1.0) -> Array:
+    """Project onto the bounds, with a margin. A projection, unlike a sigmoid, does not change the gradient inside the bounds.
+
+    Args:
+        x: values.
+        low: lower bound; None if unbounded.
+        high: upper bound; None if unbounded.
+        scale: scale of the margin if the range is unbounded, see `open_scale`.
+    """
+    margin = MARGIN * (high - low if low is not None and high is not None else scale)
     if low is not None:
         x = arrays.maximum(x, low + margin)
     if high is not None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from unrender.core.arrays import Array
 from unrender.parameterisations.base import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.parameter_errors import ErrorMeasure
+from unrender.scene.bounds import open_scale, project
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.parameter import Parameter
@@ -57,6 +60,14 @@ class Unknown:
     truth: np.ndarray | None = None
     surface: Surface | None = None
     notices: tuple[str, ...] = ()
+
+    @cached_property
+    def _scale(self) -> float:
+        return open_scale(self.initial) if None in self.bounds else 1.0
+
+    def project(self, values: Array) -> Array:
+        """Return the nearest values inside the bounds, less the margin."""
+        return project(values, *self.bounds, self._scale)
 
     def shape(self, step: int | None = None) -> tuple[int, ...]:
         """Return its shape at a step; None for the scene's."""

@@ -24,7 +24,7 @@ from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene import coarse_to_fine, prior
-from unrender.scene.bounds import check_bounds, move_inside, project
+from unrender.scene.bounds import check_bounds, move_inside, open_scale, project
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
 from unrender.scene.key_hints import instead_of, near_key
@@ -203,7 +203,7 @@ def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> Paramete
 
 def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.ndarray, bounds: Bounds) -> list[str]:
     """Return a notice if values start on a bound that a parameterisation leaves slowly; else an empty list."""
-    count = 0 if transform is None else int(np.sum(project(initial, *bounds) != initial))
+    count = 0 if transform is None else int(np.sum(project(initial, *bounds, open_scale(initial)) != initial))
     slowly = f"at a bound, which {type(given).__name__.lower()} leaves slowly"
     return [f"parameter {key}: {count} of {initial.size} initial values are {slowly}"] if count else []
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from unrender.methods.rules.constants import CONSTANTS, Constants
-from unrender.scene.bounds import MARGIN
+from unrender.scene.bounds import MARGIN, open_scale
 from unrender.scene.problem import Problem
 
 _ALBEDO, _EXTINCTION, _NORMALS = ".albedo.", ".sigma_t.", ".normalmap."
@@ -33,7 +33,7 @@ def logarithms(problem: Problem, constants: Constants = CONSTANTS) -> list[str]:
         and unknown.learning_rate is None
         and unknown.parameterisation is None
         and (unknown.initial.ndim == _TEXTURE or _is_number(unknown.initial, constants))
-        and (unknown.initial > low + constants.margins * MARGIN).all()
+        and (unknown.initial > low + constants.margins * MARGIN * open_scale(unknown.initial)).all()
     ]
 
 
