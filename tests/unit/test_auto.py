@@ -119,7 +119,7 @@ def test_positive_numbers_move_as_logarithms() -> None:
         {"bounds": (0, 500)},
         {"bounds": None},
         {"learning_rate": 1.0},
-        {"initial": 1e-4},
+        {"initial": 0.0},
         {"parameterisation": "identity"},
     ):
         base = problem()
