@@ -63,6 +63,14 @@ def test_the_truth_s_image_is_the_reference(pixel_format: str, kind: str, tmp_pa
         np.testing.assert_allclose(reference, rendered("rgb"), atol=0.01)
 
 
+@pytest.mark.parametrize("pixel_format", ["xyz", "xyza"])
+def test_a_file_that_calls_values_of_an_xyz_film_rgb_is_refused(pixel_format: str, tmp_path: Path) -> None:
+    """As `mi.util.write_bitmap` does with an array of `mi.render`: taken as RGB, colours would be off by up to 9 %."""
+    mi.Bitmap(rendered(pixel_format)).write(str(tmp_path / "reference.exr"))
+    with pytest.raises(ur.InputError, match=r"the file names its channels R, G and B.*pixel_format is xyz"):
+        problem(pixel_format, tmp_path / "reference.exr")
+
+
 def test_gradients_of_luminance_are_those_of_the_weighted_channels() -> None:
     numbers = np.random.default_rng(0)
     grey, colour = problem("luminance", np.zeros((6, 6))), problem("rgb", np.zeros((6, 6, 3)))

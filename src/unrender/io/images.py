@@ -25,11 +25,13 @@ class Picture:
         values: (H, W, C) float32, C in {1, 3}.
         notice: one line about the conversion of the values, "" for none.
         alpha: (H, W) float32 in [0, 1], if it was requested and integer values are not opaque everywhere; else None.
+        labelled_xyz: whether the file names its channels X, Y and Z. The values are RGB in any case.
     """
 
     values: np.ndarray
     notice: str = ""
     alpha: np.ndarray | None = None
+    labelled_xyz: bool = False
 
 
 def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tuple[int, ...] = (1, 3, 4)) -> Picture:
@@ -131,7 +133,8 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
         raise InputError(f"cannot be read as a picture: {reason_of(error, 300)}") from error
     values = values.reshape(*values.shape[:2], -1)
     if not linearised:
-        return Picture(values)
+        labelled = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.XYZ, mi.Bitmap.PixelFormat.XYZA)
+        return Picture(values, labelled_xyz=labelled)
     coverage = _coverage(stored[..., -1]) if transparent and alpha else None
     note = f", its alpha {'left out' if coverage is None else 'taken as mask'}" if transparent else ""
     return Picture(values, f"{bits}-bit sRGB, linearised{note}", coverage)

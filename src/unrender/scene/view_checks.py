@@ -47,7 +47,8 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
     An array, or a .npy file, contains the film's format. Other files specify their own colour space. Alpha of 8- and 16-bit images
     becomes a mask. Alpha of floating-point images is ignored, because films store premultiplied colours.
 
-    Raises `InputError` as `images.read` does, and if the number of channels differs from the film's or radiance is negative.
+    Raises `InputError` as `images.read` does, and if the number of channels differs from the film's or radiance is negative. It also
+    does so for floating-point files labelled RGB of films that store XYZ: `mi.util.write_bitmap` labels XYZ values so.
     """
     grey = form.colour == "luminance"
     channels = {"luminance": (1, 2), "xyz": (3, 4), "rgb": (1, 3, 4)}[form.colour]
@@ -62,10 +63,16 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
         raise InputError(
             "it has three channels and the film's pixel_format is luminance; use an image of one channel, or the pixel_format rgb"
         )
+    xyz = form.colour == "xyz"
+    if xyz and not (image.notice or image.labelled_xyz or _is_of_film(source)):
+        raise InputError(
+            "the file names its channels R, G and B, but the film's pixel_format is xyz, so either may be meant; write XYZ values to a .npy "
+            "file, or use the pixel_format rgb"
+        )
     if not form.signed:
         _check_not_negative(values)
     notices = [image.notice] if image.notice else []
-    if form.colour == "xyz" and _is_of_film(source):
+    if xyz and _is_of_film(source):
         values = images.xyz_to_rgb(values)
         notices.append("is in XYZ, as the film stores it, and is converted to RGB")
     elif values.shape[2] == 1 and not grey:
