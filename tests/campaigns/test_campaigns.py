@@ -1,6 +1,6 @@
 """Long campaigns of power cuts and kills. `UNRENDER_CAMPAIGN=N` sets the number of faults of each kind; without it they are skipped.
 
-    UNRENDER_CAMPAIGN=50 python -m pytest tests/campaigns -s
+    UNRENDER_CAMPAIGN=50 python -m pytest -o faulthandler_timeout=0 tests/campaigns -s
 
 Power cuts and killed nodes need root: for an ext4 file system on a loop device, and for network namespaces.
 """
@@ -23,7 +23,6 @@ STEPS = 60
 SEED = 0
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.timeout(0),
     pytest.mark.skipif(not COUNT, reason="set UNRENDER_CAMPAIGN to the number of faults"),
 ]
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root")

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import mitsuba as mi
@@ -15,7 +16,6 @@ import pytest
 
 import unrender as package
 from tiers import quick
-from unrender.app.cli import execute
 from unrender.app.cli.signals import WAITING
 from unrender.runs.final_images import render_pictures
 
@@ -141,10 +141,10 @@ def test_run_replaces_earlier_results_only_when_told(unrender, problem: Path, mi
 
 
 def test_run_leaves_no_folder_where_it_fails(unrender, problem: Path, mitsuba_variant: str, monkeypatch):
-    def fail(*_):
+    def fail(**_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(execute, "optimize", fail)
+    monkeypatch.setattr(import_module("unrender.runs.optimize"), "optimize", fail)
     answer = unrender("run", "problem.toml", "--out", "result", "--variant", mitsuba_variant)
     assert (answer.status, answer.error) == (130, "unrender: interrupted\n")
     assert not (problem.parent / "result").exists()
