@@ -189,7 +189,7 @@ MISTAKES = [
         "[[views]]",
         "[parameters.preconditioner]\ntype = 'LargeStep'\n[[views]]",
         5,
-        'parameters[0].preconditioner: expected "LaplacianPyramid" or "LargeSteps" or "Sobolev", got "LargeStep"; did you mean LargeSteps?',
+        'parameters[0].preconditioner: expected "LargeSteps" or "Sobolev", got "LargeStep"; did you mean LargeSteps?',
     ),
     (
         "[[views]]",

@@ -1,8 +1,7 @@
 """Preconditioners: linear maps of one parameter's gradients and steps."""
 
 from unrender.preconditioners.base import Preconditioner
-from unrender.preconditioners.laplacian_pyramid import LaplacianPyramid
 from unrender.preconditioners.large_steps import LargeSteps
 from unrender.preconditioners.sobolev import Sobolev
 
-__all__ = ["LaplacianPyramid", "LargeSteps", "Preconditioner", "Sobolev"]
+__all__ = ["LargeSteps", "Preconditioner", "Sobolev"]
