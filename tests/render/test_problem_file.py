@@ -116,7 +116,12 @@ MISTAKES = [
     ('loss = "L1"', 'scene = "again.xml"', 2, "not valid TOML: "),
     # names of fields
     ("scene =", "scen =", 1, "scen: no such field; did you mean scene?"),
-    ('loss = "L1"', "zzz = 1", 2, "zzz: no such field; there are scene, parameters, views, name, max_depth, expressions, loss"),
+    (
+        'loss = "L1"',
+        "zzz = 1",
+        2,
+        "zzz: no such field; there are scene, parameters, views, name, max_depth, expressions, loss",
+    ),
     (
         'reference = "photo.exr"',
         'refrence = "photo.exr"',
