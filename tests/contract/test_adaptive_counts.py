@@ -220,10 +220,10 @@ def test_others_take_different_numbers(made: Any) -> None:
         (lambda: Counts(refresh=0), "AdaptiveCounts: refresh must be"),
         (lambda: Counts(uniform=0.0), "AdaptiveCounts: uniform must be"),
         (lambda: Counts(uniform=1.5), "AdaptiveCounts: uniform must be a share"),
-        (lambda: ur.PathGradient(pixels=Counts(), spp=2), "so spp must be 3 or more, got 2"),
+        (lambda: ur.PathGradient(pixels=Counts(), spp=2), "spp must be at least 3, got 2"),
         (lambda: ur.PathGradient(pixels=Counts(), spp=4, adjoint_spp=1), "leave adjoint_spp out"),
-        (lambda: ur.PathGradient(ur.images.Denoised(), Counts(), spp=4), "Denoised needs whole views"),
-        (lambda: ur.MetaEstimator(pixels=Counts()), "so spp must be 3 or more, got 1"),
+        (lambda: ur.PathGradient(ur.images.Denoised(), Counts(), spp=4), "Denoised needs full views"),
+        (lambda: ur.MetaEstimator(pixels=Counts()), "spp must be at least 3, got 1"),
     ],
 )
 def test_what_makes_no_sense_is_refused(make: Any, message: str) -> None:

@@ -63,7 +63,7 @@ def test_it_takes_no_mini_batches(name: str) -> None:
 
 
 def test_it_has_no_gauss_newton_matrix() -> None:
-    with pytest.raises(InputError, match="GaussNewton requires a loss of single pixels, such as L2, got FunctionLoss"):
+    with pytest.raises(InputError, match="GaussNewton requires a per-pixel loss, such as L2, got FunctionLoss"):
         ur.estimate(problem(of_drjit), ESTIMATORS["Gauss-Newton"]())
 
 

@@ -98,5 +98,5 @@ def test_as_many_draws_as_dimensions_tell_a_linear_function() -> None:
 
 def test_orthogonal_draws_are_of_the_aggregate() -> None:
     for options in ({"low_discrepancy": True}, {"aggregate": False}, {"product": True}):
-        with pytest.raises(ur.InputError, match="orthogonal draws are of the aggregate"):
+        with pytest.raises(ur.InputError, match="orthogonal requires aggregate"):
             ur.smoothed.gradient(f, THETA, SIGMA, 64, orthogonal=True, **options)

@@ -176,7 +176,7 @@ made: Any = ur.estimators.FilteredGradient
         (lambda: made(3), "inner must be an estimator, such as PathGradient"),
         (
             lambda: ur.estimators.FilteredGradient(ur.estimators.LossValues()),
-            "LossValues provides no gradient to be filtered",
+            "LossValues provides no gradient",
         ),
         (lambda: made(wrap=True), "wrap must be {key: true or false}, got True"),
         (lambda: made(wrap={"map": 2}), "wrap must be true, false, or one of these per axis, got 2"),

@@ -351,10 +351,10 @@ def test_what_makes_no_sense_is_refused_at_once(made: Any, said: str) -> None:
 @pytest.mark.parametrize(
     ("options", "keys", "said"),
     [
-        ({"keys": ("pole",)}, ("map", "pose"), "pole, which is none of the parameters; did you mean pose"),
+        ({"keys": ("pole",)}, ("map", "pose"), "pole, which is not a parameter; did you mean pose"),
         ({"keys": ()}, ("map", "pose"), "at least one"),
         ({"keys": ("map", "pose")}, ("map", "pose"), "use SmoothedDerivatives"),
-        ({}, ("map",), "path gradients reach all"),
+        ({}, ("map",), "path gradients suit all"),
         ({"path": ur.PathGradient(CV())}, ("map", "pose"), "no paths shared"),
         ({"keys": ("map",)}, ("map", "pose"), "no path gradient"),
         ({"perturbed": ur.SmoothedDerivatives({"map": 0.1, "*": 0.1})}, ("map", "pose"), "sigma names map"),

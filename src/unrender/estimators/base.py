@@ -1,4 +1,4 @@
-"""What every gradient estimator returns, and what it is."""
+"""Interface of gradient estimators, and the estimates that they return."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class Estimate:
     """The loss and its derivatives at the current parameters, as estimated in one step.
 
     Attributes:
-        loss: of this step's samples (biased upward by their noise).
+        loss: loss of this step's samples (biased upward by their noise).
         gradient: {key: array}, the parameters' keys and shapes; {} from estimators that compute none.
-        capabilities: what else was computed, at most one of each type; library code reads it by `get` and `require`, which return
+        capabilities: additional quantities, at most one of each type; library code reads them by `get` and `require`, which return
             typed values.
-        info: for people: samples traced, control weights, images. Never read back.
+        info: information for people: samples traced, control weights, images. Library code never reads it.
         preconditioned: whether `gradient` and its variance are already by v, where a parameter is x = φ(S v) with its parameterisation φ
-            and its preconditioner S: estimators with a per-element state keep it in the coordinates of the descent.
+            and its preconditioner S. Estimators with a per-element state store it in the coordinates of the descent.
     """
 
     loss: float
@@ -51,48 +51,48 @@ class Estimate:
     preconditioned: bool = False
 
     def get(self, kind: type[C]) -> C | None:
-        """The capability of this type; None where it was not computed."""
-        return next((found for found in self.capabilities if isinstance(found, kind)), None)
+        """Return the capability of this type; None if it was not computed."""
+        return next((capability for capability in self.capabilities if isinstance(capability, kind)), None)
 
     def require(self, owner: str, kind: type[C]) -> C:
-        """The capability of this type. Raises `InputError` that names `owner` where it was not computed."""
-        if (found := self.get(kind)) is None:
+        """Return the capability of this type. Raise `InputError` that names `owner` if it was not computed."""
+        if (capability := self.get(kind)) is None:
             raise InputError(f'{owner} requires "{kind.name}", which this estimate does not have')
-        return found
+        return capability
 
     @property
     def variance(self) -> Tree | None:
-        """Variance of `gradient` per element, {key: array}; None where it was not computed."""
-        found = self.get(Variance)
-        return None if found is None else found.values
+        """Variance of `gradient` per element, {key: array}; None if it was not computed."""
+        capability = self.get(Variance)
+        return None if capability is None else capability.values
 
     @property
     def hessian(self) -> Array | None:
-        """(n, n) over all parameters flattened in key order; None where it was not computed."""
-        found = self.get(Hessian)
-        return None if found is None else found.matrix
+        """Hessian (n, n) over all parameters flattened in key order; None if it was not computed."""
+        capability = self.get(Hessian)
+        return None if capability is None else capability.matrix
 
     @property
     def hvp(self) -> Callable[[Tree], Tree] | None:
-        """The product of the Hessian with a tree; None where there is none."""
-        found = self.get(HessianProduct)
-        return None if found is None else found.apply
+        """Product of the Hessian with a tree; None if it is not available."""
+        capability = self.get(HessianProduct)
+        return None if capability is None else capability.apply
 
     @property
     def losses(self) -> Callable[[np.ndarray], np.ndarray] | None:
-        """The loss at points (B, n), as (B,), all with this step's random numbers; None where there is no such function."""
-        found = self.get(LossFunction)
-        return None if found is None else found.evaluate
+        """Function from points (B, n) to their losses (B,), all with this step's random numbers; None if it is not available."""
+        capability = self.get(LossFunction)
+        return None if capability is None else capability.evaluate
 
     @property
     def sigma(self) -> Mapping[str, float | np.ndarray] | None:
-        """{key: σ} of the Gaussian that the derivatives are smoothed by; None where they are not smoothed."""
-        found = self.get(Smoothing)
-        return None if found is None else found.sigma
+        """{key: σ} of the Gaussian that smooths the derivatives; None if they are not smoothed."""
+        capability = self.get(Smoothing)
+        return None if capability is None else capability.sigma
 
 
 def as_numpy(estimate: Estimate) -> Estimate:
-    """The same estimate, its gradient, variance and Hessian as NumPy arrays."""
+    """Return the estimate with its gradient, variance and Hessian as NumPy arrays."""
 
     def convert(capability: Capability) -> Capability:
         match capability:
@@ -113,17 +113,17 @@ def as_numpy(estimate: Estimate) -> Estimate:
 
 
 class Estimator(Protocol):
-    """A way to estimate the loss gradient. Immutable; all that changes is in the state."""
+    """An estimator of the loss gradient. It is immutable; everything that changes is in the state."""
 
     @property
     def provides(self) -> AbstractSet[str]:
-        """What its estimates have: `Capabilities` of types, e.g. `Capabilities(Gradient, Variance)`; reads as a set of names."""
+        """Types that its estimates provide: `Capabilities` such as `Capabilities(Gradient, Variance)`, which reads as a set of names."""
         ...
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
-        """The state before the first step: a dataclass of arrays."""
+        """Return the state before the first step: a dataclass of arrays."""
         ...
 
     def estimate(self, problem: Problem, parameters: Tree, state: Any, key: Key) -> tuple[Estimate, Any]:
-        """One estimate at `parameters` and the next state. Pure: equal arguments, equal results."""
+        """Return an estimate at `parameters` and the next state. Pure: equal arguments give equal results."""
         ...

@@ -1,4 +1,4 @@
-"""What an estimate can carry beside loss and gradient, one type each: estimators provide these types, optimizers require them."""
+"""Optional quantities of an estimate besides loss and gradient, one type each: estimators provide them, optimizers require them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from unrender.core.trees import Tree
 
 @dataclass(frozen=True)
 class Capability:
-    """One quantity that an estimator computes. Subclasses name it and hold its value.
+    """One quantity that an estimator computes. Subclasses define its name and hold its value.
 
     Attributes:
-        name: what messages and `Estimator.provides` call it.
+        name: name in messages and in `Estimator.provides`.
     """
 
     name: ClassVar[str]
@@ -25,17 +25,17 @@ class Capability:
 
 @dataclass(frozen=True)
 class Gradient(Capability):
-    """`Estimate.gradient` has an entry for every parameter. For `provides` and `requires` only: the value is a field of `Estimate`."""
+    """Marker for `provides` and `requires`: `Estimate.gradient` has an entry for every parameter. The value is a field of `Estimate`."""
 
     name: ClassVar[str] = "gradient"
 
 
 @dataclass(frozen=True)
 class Variance(Capability):
-    """The variance of the gradient.
+    """Variance of the gradient.
 
     Attributes:
-        values: {key: array}, of the gradient's keys and shapes, >= 0.
+        values: {key: array}, with the gradient's keys and shapes, >= 0.
     """
 
     name: ClassVar[str] = "variance"
@@ -44,10 +44,10 @@ class Variance(Capability):
 
 @dataclass(frozen=True)
 class PastWeight(Capability):
-    """The weight of earlier estimates in the gradient: its noise is correlated with the last step's by this factor.
+    """Weight of earlier estimates in the gradient. Its noise is correlated with that of the last step by this factor.
 
     Attributes:
-        values: {key: array}, of the gradient's keys and shapes, in [0, 1).
+        values: {key: array}, with the gradient's keys and shapes, in [0, 1).
     """
 
     name: ClassVar[str] = "past_weight"
@@ -56,12 +56,12 @@ class PastWeight(Capability):
 
 @dataclass(frozen=True)
 class FreshGradient(Capability):
-    """The gradient as this step's samples alone show it: whatever the earlier ones were, its noise is 0 on average.
+    """Gradient from this step's samples alone. Its noise has mean 0, independent of earlier samples.
 
-    Estimators that remember samples give it now and then.
+    Estimators that reuse earlier samples provide it in some of their steps.
 
     Attributes:
-        values: {key: array}, of the gradient's keys and shapes.
+        values: {key: array}, with the gradient's keys and shapes.
     """
 
     name: ClassVar[str] = "fresh_gradient"
@@ -70,7 +70,7 @@ class FreshGradient(Capability):
 
 @dataclass(frozen=True)
 class Hessian(Capability):
-    """The Hessian of the loss.
+    """Hessian of the loss.
 
     Attributes:
         matrix: (n, n) over all parameters flattened in key order.
@@ -82,11 +82,11 @@ class Hessian(Capability):
 
 @dataclass(frozen=True)
 class HessianNoise(Capability):
-    """What the noise of derivative images would add to the Gauss-Newton matrix, if it were made of their squares.
+    """Noise that squared derivative images would add to the Gauss-Newton matrix.
 
     Attributes:
-        matrix: (n, n), positive semidefinite: Σ ℓ'' N Nᵀ over pixels, with the noise N of the derivative images. Damping by it keeps
-            steps from following noise.
+        matrix: (n, n), positive semidefinite: Σ ℓ'' N Nᵀ over pixels, with the noise N of the derivative images. Damping by it prevents
+            steps along noisy directions.
     """
 
     name: ClassVar[str] = "hessian_noise"
@@ -98,7 +98,7 @@ class HessianProduct(Capability):
     """Products of the Hessian of the loss with vectors.
 
     Attributes:
-        apply: from a tree v of the parameters' keys and shapes to H v.
+        apply: function from a tree v with the parameters' keys and shapes to H v.
     """
 
     name: ClassVar[str] = "hvp"
@@ -107,10 +107,10 @@ class HessianProduct(Capability):
 
 @dataclass(frozen=True)
 class LossFunction(Capability):
-    """The loss at any points, all evaluated with this step's random numbers.
+    """The loss as a function of the parameters, evaluated with this step's random numbers.
 
     Attributes:
-        evaluate: from points (B, n), all parameters flattened in key order, to losses (B,); NumPy arrays.
+        evaluate: function from points (B, n), all parameters flattened in key order, to losses (B,); NumPy arrays.
     """
 
     name: ClassVar[str] = "losses"
@@ -131,11 +131,11 @@ class Smoothing(Capability):
 
 @dataclass(frozen=True)
 class BlockEstimate(Capability):
-    """The estimate of some of the parameters alone, with their own curvature, the others held at their present values.
+    """Estimate for a subset of the parameters, with their own curvature. The other parameters are fixed at their current values.
 
     Attributes:
-        keys: of these parameters, in key order.
-        estimate: an `Estimate` whose gradient has these keys; None in a step in which they stay where they are.
+        keys: keys of the subset, in key order.
+        estimate: an `Estimate` whose gradient has these keys; None in a step in which they do not change.
     """
 
     name: ClassVar[str] = "block"
@@ -152,6 +152,6 @@ class Capabilities(frozenset[str]):
     types: frozenset[type[Capability]]
 
     def __new__(cls, *types: type[Capability]) -> Capabilities:
-        made = super().__new__(cls, (kind.name for kind in types))
-        made.types = frozenset(types)
-        return made
+        capabilities = super().__new__(cls, (kind.name for kind in types))
+        capabilities.types = frozenset(types)
+        return capabilities

@@ -1,4 +1,4 @@
-"""An estimate of derivatives by the parameters, as one by the variables that an optimizer moves."""
+"""Change of variables of an estimate: from derivatives by the parameters to derivatives by the optimizer's variables."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from unrender.scene.problem import Problem
 
 
 def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
-    """The estimate by v, where x = φ(u) and u = S v (`problem.coordinates`); itself where it is by v already.
+    """Return the estimate by v, where x = φ(u) and u = S v (`problem.coordinates`); the estimate itself if it already is.
 
-    With J the diagonal matrix of φ': gradients become S J g, variances J² Var (a variance per element does not pass through S). The second
-    derivatives are exact, J H J + diag(g φ''), with the term of φ's own curvature; the loss is a function of u. The σ of smoothed
-    derivatives, which is of x, becomes that of each element of u, see `_width`.
+    J is the diagonal matrix of φ'. Gradients become S J g, variances J² Var (a variance per element cannot be mapped by S). Second
+    derivatives are exact, J H J + diag(g φ''), and the loss becomes a function of u. The σ of smoothed derivatives refers to x and is
+    converted for each element of u, see `_width`.
     """
     if estimate.preconditioned:
         return estimate
@@ -50,7 +50,7 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
 
 
 def restricted(problem: Problem, keys: Sequence[str]) -> Problem:
-    """Return the problem with these unknowns alone."""
+    """Return the problem with these unknowns only."""
     return problem.with_parts(unknowns={key: problem.unknowns[key] for key in keys})
 
 
@@ -64,13 +64,13 @@ def _block(block: BlockEstimate, problem: Problem, parameters: Tree) -> BlockEst
 def _second_order(
     capability: Capability, gradient: Tree, problem: Problem, parameters: Tree, slopes: Tree
 ) -> Capability:
-    """What is not linear in the gradient, by u."""
+    """Convert a capability that is not linear in the gradient to u."""
     match capability:
         case Variance(values):
             return Variance({k: v * slopes[k] * slopes[k] if k in slopes else v for k, v in values.items()})
         case Hessian(matrix):
-            J, bend = _flat(slopes, parameters), _bend(gradient, problem, parameters)
-            full = J[:, None] * arrays.numpy(matrix).astype(np.float64) * J + np.diag(bend)
+            J, term = _flat(slopes, parameters), _curvature_term(gradient, problem, parameters)
+            full = J[:, None] * arrays.numpy(matrix).astype(np.float64) * J + np.diag(term)
             return Hessian(full)
         case HessianNoise(matrix):
             J = _flat(slopes, parameters)
@@ -79,10 +79,10 @@ def _second_order(
             curvatures = problem.coordinates.curvatures(parameters)
 
             def product(v: Tree) -> Tree:
-                found = apply({k: x * slopes[k] if k in slopes else x for k, x in v.items()})
+                values = apply({k: x * slopes[k] if k in slopes else x for k, x in v.items()})
                 return {
                     k: x * slopes[k] + gradient[k] * curvatures[k] * v[k] if k in slopes else x
-                    for k, x in found.items()
+                    for k, x in values.items()
                 }
 
             return HessianProduct(product)
@@ -91,8 +91,8 @@ def _second_order(
 
             def losses(points: np.ndarray) -> np.ndarray:
                 split = vectors.parts(points, parameters)
-                found = [transforms[k].forward(u) if k in transforms else u for k, u in split.items()]
-                return evaluate(np.concatenate([x.reshape(len(points), -1) for x in found], axis=1))
+                values = [transforms[k].forward(u) if k in transforms else u for k, u in split.items()]
+                return evaluate(np.concatenate([x.reshape(len(points), -1) for x in values], axis=1))
 
             return LossFunction(losses)
         case Smoothing(sigma):
@@ -107,13 +107,13 @@ def _second_order(
 
 
 def _width(transform: Transform, x: np.ndarray, sigma: float | np.ndarray) -> np.ndarray:
-    """σ of x as one of u: σ / φ', with the greatest φ' within σ, since near a bound φ' vanishes and a width of σ leads beyond it."""
+    """Return σ of x as a standard deviation of u: σ / φ', with the maximum of φ' within σ, since φ' vanishes near a bound."""
     around = [np.asarray(transform.slope(at)) for at in (x, x + sigma, x - sigma)]
     return sigma / np.maximum.reduce(around)
 
 
 def _flat(tree: Tree, parameters: Tree, missing: float = 1.0) -> np.ndarray:
-    """All elements in key order, (n,); `missing` for the parameters that the tree does not have."""
+    """Return all elements in key order, (n,), with `missing` for parameters that the tree does not have."""
     return np.concatenate(
         [
             arrays.numpy(tree[key]).astype(np.float64).ravel()
@@ -124,7 +124,7 @@ def _flat(tree: Tree, parameters: Tree, missing: float = 1.0) -> np.ndarray:
     )
 
 
-def _bend(gradient: Tree, problem: Problem, parameters: Tree) -> np.ndarray:
-    """g φ'', (n,)."""
+def _curvature_term(gradient: Tree, problem: Problem, parameters: Tree) -> np.ndarray:
+    """Return g φ'', (n,)."""
     curvatures = problem.coordinates.curvatures(parameters)
     return _flat({key: gradient[key] * x for key, x in curvatures.items()}, parameters, missing=0.0)

@@ -1,4 +1,4 @@
-"""The probabilities with which connections take emitters, by the variance of the gradient."""
+"""Probabilities of emitter sampling that minimise the variance of the gradient."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler
 
 EmitterSelection = Literal["scene", "adaptive"]
-"""Probabilities as the scene has them, uniform but for its sampling weights; or by the variance of the gradient."""
+"""Emitter probabilities: "scene" for uniform times the scene's sampling weights, "adaptive" to minimise the gradient's variance."""
 
 _FIRST, _REFRESH = 4, 20
-"""Steps at the beginning that are all learnt from, and steps between those that are, later."""
+"""Number of initial steps that all update the probabilities, and interval of later updates in steps."""
 
 _MEMORY = 0.8
-"""Weight, each time, of what was learnt before."""
+"""Decay of earlier statistics at each update."""
 
 _LEAST_VARIANCE = 0.1
-"""Floor of a pixel's variance where one divides by it, relative to the mean over all pixels."""
+"""Floor of a pixel's variance in divisions, relative to the mean over all pixels."""
 
 
 @dataclass(frozen=True)
 class EmitterRequest:
-    """What a step is asked for.
+    """Emitter sampling of a step.
 
     Attributes:
-        probabilities: of each emitter, (E,), sum 1.
-        tangents: of the parameters, along which `connections` are asked for; {} where they are not.
+        probabilities: probability of each emitter, (E,), sum 1.
+        tangents: parameter tangents for `connections`; {} if the step does not update the probabilities.
     """
 
     probabilities: np.ndarray
@@ -49,18 +49,18 @@ class EmitterRequest:
 class EmitterState:
     """State between steps.
 
-    The probabilities of the E emitters are p = λ u + (1 - λ) q with q ∝ √M, for u, the scene's own, and the second moment M of what
-    connections to each emitter add. Of connections that are drawn by p, the second moment of the gradient is Σ_e M_e / p_e plus what no
-    probability changes, and that q minimises it. Since p >= λ u, each of the two factors of a gradient, the loss derivative and the
-    pixel's, has at most 1 / λ times the second moment that it has under u. Where paths sampled by the BSDF find an emitter, too, MIS
-    weights change with p, which M leaves out: then q is near the best, and the bound holds approximately.
+    The probabilities of the E emitters are p = λ u + (1 - λ) q with q ∝ √M. Here u are the scene's own probabilities and M is the
+    second moment of the contributions of connections to each emitter. With connections sampled by p, the second moment of the gradient
+    is Σ_e M_e / p_e plus a constant, which this q minimises. Since p >= λ u, the second moment of each factor of a gradient, the loss
+    derivative and the pixel's, is at most 1 / λ times that under u. If BSDF sampling hits an emitter too, MIS weights change with p. M
+    neglects this, so q is approximately optimal and the bound approximate.
 
     Attributes:
         start: u, (E,).
-        step: estimates made so far.
-        moments: M / u, running mean up to a factor, (E,); zeros before the first is known.
+        step: number of estimates so far.
+        moments: M / u, running mean up to a factor, (E,); zeros before the first update.
         uniform: λ.
-        evidence: for λ, see `uniform_share`.
+        evidence: statistics for λ, see `uniform_share`.
         second_moment: running mean square of each element of the gradient, in the coordinates of the descent.
     """
 
@@ -72,34 +72,34 @@ class EmitterState:
     second_moment: Tree = field(default_factory=dict)
 
     def upsampled(self, upsampler: Upsampler) -> EmitterState:
-        """See `Upsamplable`: the mean squares of the gradient are interpolated."""
+        """Return the state with interpolated mean squares of the gradient."""
         return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES))
 
     @property
     def known(self) -> bool:
-        """Whether anything was learnt."""
+        """Whether the probabilities were updated at least once."""
         return bool(self.moments.sum() > 0)
 
     @property
     def density(self) -> np.ndarray:
-        """q / u, (E,); ones before anything is known, and where u is 0."""
+        """q / u, (E,); ones before the first update, and where u is 0."""
         if not self.known:
             return np.ones(len(self.start))
         root = np.sqrt(self.moments * self.start)
-        taken = self.start > 0
-        return np.divide(root / root.sum(), self.start, out=np.ones(len(root)), where=taken)
+        positive = self.start > 0
+        return np.divide(root / root.sum(), self.start, out=np.ones(len(root)), where=positive)
 
     @property
     def probabilities(self) -> np.ndarray:
         """p, (E,)."""
-        found = self.start * (self.uniform + (1 - self.uniform) * self.density)
-        return found / found.sum()
+        mixture = self.start * (self.uniform + (1 - self.uniform) * self.density)
+        return mixture / mixture.sum()
 
 
 def init(owner: str, problem: Problem, session: RenderSession) -> EmitterState | None:
-    """The state before the first step; None where the scene has one emitter at most, and there is nothing to choose.
+    """Return the state before the first step; None if the scene has at most one emitter.
 
-    Raises `InputError` where the renderer takes no probabilities of emitters.
+    Raises `InputError` if the renderer does not support custom emitter sampling.
     """
     try:
         start = drawing_emitters(session).emitters()
@@ -109,7 +109,7 @@ def init(owner: str, problem: Problem, session: RenderSession) -> EmitterState |
 
 
 def request(problem: Problem, parameters: Tree, state: EmitterState, key: Key) -> EmitterRequest:
-    """What the next step is asked for; with random ±1 tangents where it is to be learnt from."""
+    """Return the emitter sampling of the next step, with random ±1 tangents if the step updates the probabilities."""
     tangents: Tree = {}
     if state.step < _FIRST or state.step % _REFRESH == 0:
         scales = pixel_statistics.scales(parameters, state.second_moment)
@@ -118,35 +118,36 @@ def request(problem: Problem, parameters: Tree, state: EmitterState, key: Key) -
 
 
 def connections(
-    session: RenderSession, parameters: Tree, tangents: Tree, found: ImageEstimate, weights: Array, spp: int
+    session: RenderSession, parameters: Tree, tangents: Tree, image: ImageEstimate, weights: Array, spp: int
 ) -> EmitterMoments:
-    """What the connections of a frame tell: Σ y by emitter, with Σ_e M_e / p_e = E[Σ y] for the probabilities p that they were drawn with.
+    """Return the connection statistics of a frame: Σ y by emitter, with Σ_e M_e / p_e = E[Σ y] for the sampling probabilities p.
 
-    A connection that adds f to its pixel j changes the gradient by ∂L/∂I_j · ∂f/∂θ, and by its noise in ∂L/∂I_j, times the derivative of
+    A connection that adds f to its pixel j changes the gradient by ∂L/∂I_j · ∂f/∂θ, and by its noise in ∂L/∂I_j times the derivative of
     the pixel's other samples. With B_j = Σ_k E[(∂I_j/∂θ_k)²] and h_j, the derivative of ∂L/∂I_j by I_j,
 
         y = (∂L/∂I_j Σ_k v_k ∂f/∂θ_k)² / S² + h_j² B_j f² / (S² n),
 
-    for S samples of the pixel, of which n make the image of the other groups: what f² changes in the product of both factors' second
-    moments. B_j is of the other groups, as the loss derivative is: with the connection's own, bright paths would count by their fourth
-    power. h_j² is the variance over groups of the loss derivative over that of the image, so that a control variate counts.
+    for S samples of the pixel, of which n form the image of the other groups. The second term is the effect of f² on the product of
+    both factors' second moments. B_j comes from the other groups, like the loss derivative: with the connection's own, bright paths
+    would count by their fourth power. h_j² is the variance over groups of the loss derivative over that of the image, which accounts
+    for a control variate.
 
     Args:
-        session: of the frame's paths.
-        parameters: of these.
-        tangents: random.
-        found: the image, of two groups or more.
-        weights: of the adjoint, the loss derivative at the image of the other groups, (groups, ...).
+        session: session of the frame's paths.
+        parameters: parameters of the paths.
+        tangents: random tangents.
+        image: image of at least two groups.
+        weights: weights of the adjoint, the loss derivative at the image of the other groups, (groups, ...).
         spp: S.
     """
-    images = found.fresh_others()
+    images = image.fresh_others()
     groups = int(arrays.shape(images)[0])
-    moments = session.tangent_moment(parameters, found.paths, tangents)
+    moments = session.tangent_moment(parameters, image.paths, tangents)
     variance = _variance(images)
     floor = arrays.mean(variance) * _LEAST_VARIANCE + 1e-30
     slope = _variance(weights) / arrays.maximum(variance, floor)
     noise = arrays.sqrt(leave_one_out(moments) * slope * (groups / (spp * (groups - 1.0))))
-    return drawing_emitters(session).emitter_moments(parameters, found.paths, tangents, weights, noise)
+    return drawing_emitters(session).emitter_moments(parameters, image.paths, tangents, weights, noise)
 
 
 def _variance(images: Array) -> Array:
@@ -154,18 +155,18 @@ def _variance(images: Array) -> Array:
     return arrays.maximum(arrays.mean_over_first(images * images) - mean * mean, 0.0)
 
 
-def learned(state: EmitterState, told: EmitterMoments | None) -> EmitterState:
-    """The state after a step, with what its connections tell; None where they were not asked for."""
+def learned(state: EmitterState, statistics: EmitterMoments | None) -> EmitterState:
+    """Return the state after a step, updated by its connection statistics; None if they were not requested."""
     state = replace(state, step=state.step + 1)
-    if told is None:
+    if statistics is None:
         return state
-    # A sample's second moment under u: it was drawn by p.
+    # Convert the second moment of samples from p to u.
     ratio = np.divide(state.probabilities, state.start, out=np.zeros(len(state.start)), where=state.start > 0)
-    y, squares = told.sums * ratio, told.squares * ratio**2
+    y, squares = statistics.sums * ratio, statistics.squares * ratio**2
     total = float(y.sum())
     if not (np.isfinite(squares).all() and total > 0):
         return state
-    y, squares = y / total, squares / total**2  # steps count alike, whatever the loss has become in between
+    y, squares = y / total, squares / total**2  # normalise, so that all steps have equal weight as the loss decreases
     evidence, uniform = state.evidence, state.uniform
     if state.known:
         evidence = _observed(evidence, y, squares, state.density)
@@ -174,32 +175,34 @@ def learned(state: EmitterState, told: EmitterMoments | None) -> EmitterState:
 
 
 def _observed(evidence: ShareEvidence, y: np.ndarray, squares: np.ndarray, density: np.ndarray) -> ShareEvidence:
-    """`uniform_share.observed`, from sums over each emitter's samples. Both rows are the same."""
+    """Return `uniform_share.observed` of sums over each emitter's samples. Both rows are the same."""
     mixed = SHARES[:, None] + (1 - SHARES[:, None]) * density
     moments = np.append((y / mixed).sum(axis=1), y.sum())
     return ShareEvidence(evidence.moments * _MEMORY + moments, evidence.squares * _MEMORY + squares.sum())
 
 
 def observed(problem: Problem, state: EmitterState, gradient: Tree) -> EmitterState:
-    """The state after a step with this gradient by u (`Problem.coordinates`), before preconditioning: variances count relative to the mean
-    squares, as in Adam's steps."""
+    """Return the state after a step with this gradient by u (`Problem.coordinates`), before preconditioning. Variances are relative to
+    the mean squares, as in Adam's steps."""
     return replace(state, second_moment=pixel_statistics.observed(problem, state.second_moment, gradient))
 
 
 def check(owner: str, emitters: Any, groups: int, equal_counts: bool) -> None:
-    """Raise `InputError` for what is no way to choose emitters, or does not go with the samples.
+    """Raise `InputError` for an invalid choice of emitters, or one that the samples do not support.
 
     Args:
-        owner: for messages.
+        owner: class name for messages.
         emitters: the option.
-        groups: leave-one-out groups.
-        equal_counts: whether all pixels have as many samples.
+        groups: number of leave-one-out groups.
+        equal_counts: whether all pixels have equal sample counts.
     """
     if emitters not in ("scene", "adaptive"):
         raise InputError(f'{owner}: emitters must be "scene" or "adaptive", got {emitters!r}')
     if emitters == "adaptive" and not equal_counts:
-        raise InputError(f'{owner}: emitters="adaptive" needs as many samples in each pixel; AdaptiveCounts differs')
+        raise InputError(
+            f'{owner}: emitters="adaptive" needs equal sample counts in all pixels; use another pixel sampler than AdaptiveCounts'
+        )
     if emitters == "adaptive" and groups < 2:
         raise InputError(
-            f'{owner}: emitters="adaptive" compares groups of samples: give an spp that 2 to 16 divide, and no adjoint_spp'
+            f'{owner}: emitters="adaptive" needs sample groups; use an spp that is divisible by a number from 2 to 16, and no adjoint_spp'
         )

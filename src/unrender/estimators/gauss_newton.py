@@ -1,4 +1,4 @@
-"""Gradient and Gauss-Newton matrix from the derivative image of every parameter, by differences of renders: for poses."""
+"""Gradient and Gauss-Newton matrix from finite-difference derivative images of every parameter, for few parameters such as poses."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
-"""Of the widths: passes of their own before the first estimate, and factors by which a width changes at most, there and later."""
+"""Number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
 _VALUES = 1 << 22
-"""Of images, that are turned into double precision at once."""
+"""Maximum number of image values that are converted to double precision at once."""
 _SETTLED = 0.5
-"""Longest step, in units of the widths, after which differences become sharper."""
+"""Maximum step, in units of the widths, after which the shift is halved."""
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
-"""Stream of the trial of a start; eigenvalues of its matrix, relative to the largest, that count as 0."""
+"""Stream of `explained`, and relative eigenvalue below which its matrix counts as singular."""
 _MEMORY = 0.3
 """Weight of the latest image in the running mean of the variance."""
 _IMAGE = 2
-"""Stream of a view's key: of the image. Those below are of the two halves of the derivative images."""
+"""Stream of a view's key for the image. Lower streams are for the two halves of the derivative images."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class GaussNewtonState:
     """State between steps.
 
     Attributes:
-        widths: of the differences, {key: in units of the parameter}; {} before the first estimate.
-        shift: in pixels, of the differences.
-        point: the parameters of the last estimate, (n,); None before the first.
+        widths: widths of the differences, {key: in units of the parameter}; {} before the first estimate.
+        shift: target image shift of the differences in pixels.
+        point: parameters of the last estimate, (n,); None before the first.
         variances: running mean of the variance of each view's image, (H, W, 1); () without `noise_limit` and before the first estimate.
     """
 
@@ -52,7 +52,7 @@ class GaussNewtonState:
     variances: tuple[np.ndarray, ...] = ()
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
-        """See `Upsamplable`: widths are measured anew."""
+        """Return an empty state: widths are estimated again."""
         del upsampler
         return GaussNewtonState({})
 
@@ -62,31 +62,32 @@ class GaussNewtonState:
 class GaussNewton:
     """g = Σ J ℓ'(I) and H = Σ J ℓ''(I) Jᵀ over pixels, with a derivative image J for every element of every parameter.
 
-    J is the central difference of renders from the same random numbers, at ± a width. The width is found for each parameter, so that
-    both renders differ from the picture by as much as a shift by `shift` pixels does. It is the unit of trust regions, too
-    (`Smoothing`). Images and derivative images have samples of their own, and H is the product of two halves of the derivative images,
-    made symmetric: no product contains the square of a noise. Their difference tells what noise would add (`HessianNoise`).
+    J is the central difference of renders with the same random numbers, at ± a width. The width of each parameter is chosen so that
+    both renders differ from the image as much as a shift by `shift` pixels would. It is also the unit of trust regions (`Smoothing`).
+    Images and derivative images have independent samples. H is the symmetrised product of two independent halves of the derivative
+    images, so no product contains squared noise. Their difference estimates what noise would add (`HessianNoise`).
 
     Bias: J is the derivative averaged over ± the width, so g and H are those of nearby parameters. The expected gradient vanishes where
-    the expected image is the reference, as the loss's does, for a loss whose derivative is linear in the image. H leaves out the
-    curvature of the image, as Gauss-Newton does, and by its noise it may have negative eigenvalues. Of other losses of single pixels, L1
-    and Huber, ℓ' is damped where noise exceeds the residual (see `PathGradient`, `tolerance`), and the secant ℓ'(r) / r stands for ℓ''.
+    the expected image equals the reference, for a loss whose derivative is linear in the image. H neglects the curvature of the image,
+    as in Gauss-Newton, and noise may give it negative eigenvalues. For other per-pixel losses, L1 and Huber, ℓ' is damped where noise
+    exceeds the residual (see `PathGradient`, `tolerance`), and the secant ℓ'(r) / r replaces ℓ''.
 
-    For few parameters, such as poses of sensors: each element takes two renders of every view that it changes, and no derivative of the
-    renderer, so whatever can be rendered will do. A sensor's own parameters change its own views alone.
+    Use it for few parameters, such as poses of sensors: each element takes two renders of every view that it changes. It needs no
+    derivative of the renderer, so every parameter that can be rendered is supported. A sensor's own parameters only change its own
+    views.
 
     Args:
         spp: samples per pixel of the image, >= 2.
-        derivative_spp: of the renders that differences are made of, >= 2.
-        shift: in pixels, > 0. Smaller ones are sharper, with more noise at edges.
-        width: of the differences before the first estimate finds better ones, > 0: a share of a parameter's largest value, or in its units
+        derivative_spp: samples per pixel of the renders of differences, >= 2.
+        shift: target image shift in pixels, > 0. Smaller values are less biased, with more noise at edges.
+        width: initial width of the differences, > 0: a fraction of the largest absolute value of a parameter, or in units of the parameter
             if all values are 0.
         tolerance: κ > 0 of the damping, for losses whose derivative is not linear.
-        coarse: `shift` at the start, in pixels, >= `shift`; None for `shift` itself. It halves after each step that is short beside the
-            widths. Images and derivative images are summed over blocks as wide as the shift, so a wide difference has little noise, and
-            a start that is several pixels away takes few steps.
-        largest: {key: largest width, > 0}; no limit for the others. A pose of one shape needs it: the shape covers a part of the picture,
-            so no shift of it differs from the picture by as much as a shift of the whole.
+        coarse: `shift` at the start, in pixels, >= `shift`; None for `shift` itself. It is halved after each step that is short
+            relative to the widths. Images and derivative images are summed over blocks as wide as the shift, so a large shift has
+            little noise, and a start several pixels away takes few steps.
+        largest: {key: maximum width, > 0}; no limit for the others. The pose of one shape needs it: the shape covers a part of the
+            image, so it may never differ from the image as much as a shift of the full image would.
         noise_limit: a pixel of variance σ² has the weight 1 / (1 + σ² / (c m)), with this c and the median m over pixels with noise, so a
             few noisy pixels, such as those of a visible lamp, do not outweigh the others; > 0. None for equal weights.
     """
@@ -118,41 +119,39 @@ class GaussNewton:
         return Capabilities(Gradient, Hessian, HessianNoise)
 
     def init(self, problem: Problem, parameters: Tree) -> GaussNewtonState:
-        """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed or has a preconditioner, and for a loss of
-        several pixels together."""
+        """Return the state before the first step. Raise `InputError` for a parameter that cannot be perturbed or has a preconditioner,
+        and for a loss that is not per pixel."""
         if not (problem.loss.linear or problem.loss.pixelwise):
-            raise InputError(
-                f"GaussNewton requires a loss of single pixels, such as L2, got {type(problem.loss).__name__}"
-            )
+            raise InputError(f"GaussNewton requires a per-pixel loss, such as L2, got {type(problem.loss).__name__}")
         for key in (key for key in problem.coordinates.preconditioners if key in parameters):
-            raise InputError(f"GaussNewton: parameter {key} has a preconditioner; leave it out, H takes its place")
+            raise InputError(f"GaussNewton: parameter {key} has a preconditioner, which H replaces; leave it out")
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         return GaussNewtonState({})
 
     def estimate(
         self, problem: Problem, parameters: Tree, state: GaussNewtonState, key: Key
     ) -> tuple[Estimate, GaussNewtonState]:
-        """See `Estimator.estimate`. `info`: "samples" (paths traced), "images" per view."""
+        """Return an estimate and the next state. `info`: "samples" (paths traced), "images" per view."""
         point = _Point(self, problem, parameters)
         if not state.widths:
             widths = {key: self.width * (float(np.abs(arrays.numpy(x)).max()) or 1.0) for key, x in parameters.items()}
             widths = {key: min(width, self.largest.get(key, math.inf)) for key, width in widths.items()}
             state = GaussNewtonState(widths, self.coarse or self.shift, point.theta)
             for index in range(_PASSES):
-                found = point.system(state, key.fold(1 + index), derivatives=False)
-                state = self._next(state, found, parameters, _FIRST_CHANGE)
+                system = point.system(state, key.fold(1 + index), derivatives=False)
+                state = self._next(state, system, parameters, _FIRST_CHANGE)
         state = self._sharpened(state, parameters)
-        found = point.system(state, key.fold(0))
+        system = point.system(state, key.fold(0))
         estimate = Estimate(
-            found.loss,
-            vectors.unravel(found.gradient, parameters),
-            (Hessian(found.hessian), HessianNoise(found.noise), Smoothing(dict(state.widths))),
-            {"samples": point.samples, "images": found.images},
+            system.loss,
+            vectors.unravel(system.gradient, parameters),
+            (Hessian(system.hessian), HessianNoise(system.noise), Smoothing(dict(state.widths))),
+            {"samples": point.samples, "images": system.images},
         )
-        return estimate, self._next(state, found, parameters, _CHANGE)
+        return estimate, self._next(state, system, parameters, _CHANGE)
 
     def _sharpened(self, state: GaussNewtonState, parameters: Tree) -> GaussNewtonState:
-        """Return the state with half the shift, where the last step was short beside the widths."""
+        """Return the state with half the shift if the last step was short relative to the widths."""
         point = vectors.ravel(parameters)
         if state.point is None:
             return GaussNewtonState(state.widths, state.shift or self.coarse or self.shift, point)
@@ -161,37 +160,37 @@ class GaussNewton:
         shift = max(0.5 * state.shift, self.shift) if settled else state.shift
         return replace(state, shift=shift, point=point)
 
-    def _next(self, state: GaussNewtonState, found: _System, parameters: Tree, change: float) -> GaussNewtonState:
-        """With the widths at which renders differ from the picture as a shift by so many pixels does, root mean square over the elements of
-        a parameter; no more than `change` times what they were, or less by it."""
-        squares, slopes = vectors.parts(found.squares, parameters), vectors.parts(found.slopes, parameters)
+    def _next(self, state: GaussNewtonState, system: _System, parameters: Tree, change: float) -> GaussNewtonState:
+        """Return the state with updated widths, at which renders differ from the image as much as the target shift, in the root mean
+        square over the elements of a parameter. Widths change by at most the factor `change`."""
+        squares, slopes = vectors.parts(system.squares, parameters), vectors.parts(system.slopes, parameters)
         widths = {}
         for key, width in state.widths.items():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
-            wanted = state.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
-            widths[key] = float(np.clip(wanted, width / change, min(width * change, self.largest.get(key, math.inf))))
-        return replace(state, widths=widths, variances=tuple(found.variances) or state.variances)
+            target = state.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
+            widths[key] = float(np.clip(target, width / change, min(width * change, self.largest.get(key, math.inf))))
+        return replace(state, widths=widths, variances=tuple(system.variances) or state.variances)
 
 
 def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
-    """Return the share of the initial loss that the quadratic model at the start promises to remove.
+    """Return the fraction of the initial loss that the quadratic model at the start predicts to remove.
 
-    It is near 0 on a plateau, where no derivative image resembles the residual. Noise does not add to it: gradients and images come from
-    two independent estimates. The loss must be linear in its derivative, such as L2.
+    It is near 0 on a plateau, where no derivative image resembles the residual. Noise does not bias it: gradients and images come from
+    two independent estimates. The loss must have a linear derivative, such as L2.
     """
     first = problem.initial()
-    state, found, losses, images = estimator.init(problem, first), [], [], []
+    state, estimates, losses, images = estimator.init(problem, first), [], [], []
     for step in range(2):
         estimate, state = estimator.estimate(problem, first, state, Key(seed, step, stream=_TRIAL))
-        found.append(estimate)
+        estimates.append(estimate)
         losses.append(estimate.loss)
         images.append(estimate.info["images"])
     mean = sum(
         arrays.number(problem.loss_value(view, 0.5 * (image + images[1][view]))) for view, image in images[0].items()
     )
     loss = 2.0 * mean - 0.5 * sum(losses)
-    hessian = 0.5 * sum(arrays.numpy(estimate.require("explained", Hessian).matrix) for estimate in found)
-    one, other = (vectors.ravel(estimate.gradient) for estimate in found)
+    hessian = 0.5 * sum(arrays.numpy(estimate.require("explained", Hessian).matrix) for estimate in estimates)
+    one, other = (vectors.ravel(estimate.gradient) for estimate in estimates)
     units = np.sqrt(np.abs(np.diag(hessian)))
     if loss <= 0.0 or not np.isfinite(hessian).all() or not units.all():
         return 0.0
@@ -201,14 +200,14 @@ def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
 
 @dataclass
 class _System:
-    """What the views say together, of n elements.
+    """Sums over all views, for n elements.
 
     Attributes:
-        loss: at the parameters.
+        loss: loss at the parameters.
         gradient, hessian, noise: (n,), (n, n), (n, n).
-        squares: of the derivative images, summed over their pixels, (n,).
+        squares: squared derivative images, summed over their pixels, (n,).
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
-        images: by view.
+        images: images by view.
         variances: running mean of the variance of each view's image.
     """
 
@@ -230,7 +229,7 @@ class _Point:
     """Images and derivative images of a problem at its parameters.
 
     Attributes:
-        samples: paths traced so far.
+        samples: number of paths traced so far.
     """
 
     def __init__(self, options: GaussNewton, problem: Problem, parameters: Tree):
@@ -243,39 +242,40 @@ class _Point:
         self._sensors = vectors.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
 
     def system(self, state: GaussNewtonState, key: Key, derivatives: bool = True) -> _System:
-        """Gradient and Hessian at differences of the state's widths; without `derivatives`, what the next widths are found by alone."""
-        found = _System.zero(self.theta.size)
+        """Return gradient and Hessian for the state's widths. Without `derivatives`, only compute the quantities that the next widths
+        need."""
+        total = _System.zero(self.theta.size)
         steps = vectors.repeat_per_element(state.widths, self.parameters)
-        for view, of in enumerate(self.problem.views):
-            elements = np.flatnonzero((self._sensors == -1) | (self._sensors == of.sensor))
+        for view, sensor_view in enumerate(self.problem.views):
+            elements = np.flatnonzero((self._sensors == -1) | (self._sensors == sensor_view.sensor))
             own = key.fold(view)
             image, variance = self._image(view, own) if derivatives else (None, None)
             if derivatives:
-                found.images[view] = image
+                total.images[view] = image
                 if self.options.noise_limit is not None:
-                    found.variances.append(_running(state.variances, view, arrays.numpy(variance)))
-                found.loss += arrays.number(self.problem.loss_value(view, image))
+                    total.variances.append(_running(state.variances, view, arrays.numpy(variance)))
+                total.loss += arrays.number(self.problem.loss_value(view, image))
             if not elements.size:
                 continue
             points, distances = self._points(elements, steps)
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
             slope = _slope(halves)
             weights = None if image is None else self._weights(view, image, variance)
-            if weights is not None and found.variances:
-                # After the first step they come from earlier images too, so they hardly correlate with the noise of this one.
-                factor = noise_weights(found.variances[view], self.options.noise_limit or math.inf)
+            if weights is not None and total.variances:
+                # After the first step, the variances come from earlier images too, so they hardly correlate with the noise of this one.
+                factor = noise_weights(total.variances[view], self.options.noise_limit or math.inf)
                 weights = weights[0] * factor, weights[1] * factor
             gradient, hessian, noise, squares = _products(halves, distances, weights, int(state.shift))
-            found.gradient[elements] += gradient
-            found.hessian[np.ix_(elements, elements)] += hessian
-            found.noise[np.ix_(elements, elements)] += noise
-            found.squares[elements] += squares
-            found.slopes[elements] += slope
-        return found
+            total.gradient[elements] += gradient
+            total.hessian[np.ix_(elements, elements)] += hessian
+            total.noise[np.ix_(elements, elements)] += noise
+            total.squares[elements] += squares
+            total.slopes[elements] += slope
+        return total
 
     def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The parameters with one element more by its step, for each, and then less, (2 m, n), within bounds; how far apart the two are,
-        (m,)."""
+        """Return the parameters with one element increased, then decreased, by its step, (2 m, n), within bounds, and the distances of
+        both, (m,)."""
         unknowns = self.problem.unknowns
         offsets = np.zeros((2, elements.size, self.theta.size))
         offsets[0, np.arange(elements.size), elements] = steps[elements]
@@ -287,7 +287,7 @@ class _Point:
         return points.reshape(-1, self.theta.size), distances
 
     def _states(self, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
-        """Half the samples of images (B, H, W, 3) at points (B, n), all from the same random numbers."""
+        """Render images (B, H, W, 3) at points (B, n) with half of the samples, all with the same random numbers."""
         request = SampleRequest(self.problem.views[view].sensor, spp // 2, key.uint32())
         stacked = {key: x.astype(np.float32) for key, x in vectors.parts(points, self.parameters).items()}
         for name, x in stacked.items():
@@ -298,13 +298,13 @@ class _Point:
         return images
 
     def _image(self, view: int, key: Key) -> tuple[Array, Array]:
-        """The image, and its variance from two halves."""
+        """Return the image, and its variance from two halves."""
         halves = [self._states(self.theta[None], view, key.fold(_IMAGE + half), self.options.spp)[0] for half in (0, 1)]
         mean = 0.5 * (halves[0] + halves[1])
         return self.problem.renderer.array(mean), self.problem.renderer.array(0.25 * np.square(halves[0] - halves[1]))
 
     def _weights(self, view: int, image: Array, variance: Array) -> tuple[np.ndarray, np.ndarray]:
-        """ℓ' and ℓ'' at the image, (H, W, 3) each."""
+        """Return ℓ' and ℓ'' at the image, (H, W, 3) each."""
         problem = self.problem
         derivative = problem.loss_derivative(view, image)
         if problem.loss.linear:
@@ -331,8 +331,8 @@ def _running(before: tuple[np.ndarray, ...], view: int, variance: np.ndarray) ->
 
 
 def _slope(halves: list[np.ndarray]) -> float:
-    """The squared differences of neighbouring pixels of the mean image, summed, mean of the two directions; without noise, from two
-    independent halves (B, H, W, 3)."""
+    """Return the sum of squared differences of neighbouring pixels of the mean image, averaged over both directions. It is unbiased by
+    noise, since it uses two independent halves (B, H, W, 3)."""
     one, other = (half.mean(axis=0, dtype=np.float64) for half in halves)
     return 0.5 * sum(float((np.diff(one, axis=axis) * np.diff(other, axis=axis)).sum()) for axis in (0, 1))
 
@@ -340,14 +340,14 @@ def _slope(halves: list[np.ndarray]) -> float:
 def _products(
     halves: list[np.ndarray], distances: np.ndarray, weights: tuple[np.ndarray, np.ndarray] | None, block: int = 1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Σ J ℓ', Σ J ℓ'' Jᵀ, Σ N ℓ'' Nᵀ with the noise N of the mean of the halves, and the diagonal of Σ J Jᵀ over pixels, from two
-    independent halves of J.
+    """Return Σ J ℓ', Σ J ℓ'' Jᵀ, Σ N ℓ'' Nᵀ with the noise N of the mean of the halves, and the diagonal of Σ J Jᵀ over pixels, from
+    two independent halves of J.
 
     Args:
-        halves: images (2 m, H, W, 3), those at more and those at less.
-        distances: of the two parameters of each difference, (m,); an element with 0 has no derivative.
-        weights: ℓ' and ℓ''; None where only the last is wanted.
-        block: side of the blocks of pixels over which all but the last are summed.
+        halves: images (2 m, H, W, 3), first those of increased, then those of decreased parameters.
+        distances: distance of the two parameters of each difference, (m,); an element with 0 has no derivative.
+        weights: ℓ' and ℓ''; None if only the last result is needed.
+        block: side of the blocks of pixels over which all but the last result are summed.
     """
     m = distances.size
     gradient, hessian, noise, squares = np.zeros(m), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m)
@@ -365,13 +365,13 @@ def _products(
         first, second = first.reshape(-1), second.reshape(-1)
         gradient += 0.5 * ((one + other) @ first)
         hessian += (one * second) @ other.T
-        apart = 0.5 * (one - other)
-        noise += (apart * second) @ apart.T
+        noise_of_halves = 0.5 * (one - other)
+        noise += (noise_of_halves * second) @ noise_of_halves.T
     return gradient, 0.5 * (hessian + hessian.T), noise, squares
 
 
 def _pooled(images: np.ndarray, block: int) -> np.ndarray:
-    """Sums over blocks of pixels, over the square root of their number, of images (..., H, W, 3)."""
+    """Return sums over blocks of pixels, divided by the square root of their size, of images (..., H, W, 3)."""
     for axis in (-3, -2):
         starts = np.arange(0, images.shape[axis], block)
         sizes = np.diff(np.append(starts, images.shape[axis]))
@@ -382,13 +382,13 @@ def _pooled(images: np.ndarray, block: int) -> np.ndarray:
 
 
 def _difference(images: np.ndarray) -> np.ndarray:
-    """Of the first half of the images and the second, (m, H, W, 3), in double precision."""
+    """Return the first half of the images minus the second, (m, H, W, 3), in double precision."""
     count = len(images) // 2
     return images[:count].astype(np.float64) - images[count:]
 
 
 def _rows(images: np.ndarray, block: int) -> Iterator[slice]:
-    """Return whole blocks of rows, of some million values of all images or fewer."""
+    """Yield slices of full blocks of rows, with at most `_VALUES` values of all images if possible."""
     height = images.shape[1]
     step = max(_VALUES // max(images[:, :1].size * block, 1), 1) * block
     for start in range(0, height, step):

@@ -1,4 +1,4 @@
-"""The sum of the gradients of a step's frames."""
+"""Sum of the gradients of a step's frames."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
 _SIDE = 9
-"""Of the square of pixels that variances are averaged over, twice."""
+"""Side of the square of pixels over which variances are averaged, twice."""
 
 
 def damping(residual: Array, variance: Array, tolerance: float) -> Array:
-    """|r| / √(r² + κ² σ²): the derivative of |r| times this is that of Charbonnier's loss √(r² + δ²), with δ = κ σ.
+    """Return |r| / √(r² + κ² σ²). Times the derivative of |r|, it is the derivative of Charbonnier's loss √(r² + δ²), with δ = κ σ.
 
     Args:
         residual: r, image minus reference, (..., H, W, 3).
@@ -27,7 +27,7 @@ def damping(residual: Array, variance: Array, tolerance: float) -> Array:
 
 
 def smoothed_variance(variance: Array) -> Array:
-    """The mean of the variance (H, W, 3) over each pixel's neighbours: a pixel whose few samples agreed has not yet seen its fireflies.
+    """Return the variance (H, W, 3) averaged over neighbouring pixels, since the sample variance of few samples misses rare fireflies.
 
     Waits for the device.
     """
@@ -41,11 +41,11 @@ def smoothed_variance(variance: Array) -> Array:
 
 
 class GradientSum:
-    """Σ of trees in their order, in double precision, rounded to theirs once: however the views are divided among workers, the result is
-    the same but for its last bit, now and then.
+    """Sum of trees in order, in double precision and rounded once. Results for different divisions of views among workers therefore
+    differ at most in the last bit.
 
-    Small arrays are kept and added by one kernel. Of large ones two are kept, or their sum in double precision, to which others are added
-    in place: as much memory, however many views there are.
+    Small arrays are stored and added by one kernel. For large arrays, two are stored, or their sum in double precision, to which others
+    are added in place. The memory is then independent of the number of views.
     """
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class GradientSum:
         self._wide: dict[str, Array] = {}
 
     def add(self, tree: Tree) -> None:
-        """One more, of the keys and shapes of the others."""
+        """Add a tree with the keys and shapes of the others."""
         for key, x in tree.items():
             parts = self._parts.setdefault(key, [])
             if not memory.is_large(x) or (len(parts) < 2 and key not in self._wide):
@@ -62,14 +62,14 @@ class GradientSum:
             if key not in self._wide:
                 self._wide[key] = _wide(parts[0]) + _wide(parts[1])
                 arrays.evaluate(self._wide[key])
-                parts[:] = [dr.zeros(type(x), arrays.shape(x))]  # of this form; a literal
+                parts[:] = [dr.zeros(type(x), arrays.shape(x))]  # a literal, which only retains shape and type
             _add(self._wide[key], x)
 
     def result(self) -> Tree:
-        """The sum, {} of none; of large arrays evaluated. Afterwards there is nothing in it."""
-        found = {key: self._rounded(key, parts) for key, parts in self._parts.items()}
+        """Return the sum, {} if nothing was added, and clear it. Large arrays are evaluated."""
+        sums = {key: self._rounded(key, parts) for key, parts in self._parts.items()}
         self._parts.clear()
-        return found
+        return sums
 
     def _rounded(self, key: str, parts: list[Array]) -> Array:
         like = parts[0]
@@ -84,13 +84,13 @@ class GradientSum:
 
 
 def _wide(x: Array) -> Array:
-    """Flat, in double precision."""
+    """Return a flat array in double precision."""
     kind: Any = dr.float64_array_t(dr.array_t(x))
     return kind(arrays.flat(x))
 
 
 def _add(total: Array, x: Array) -> None:
-    """In place."""
+    """Add x to the total in place."""
     index = dr.arange(dr.uint32_array_t(dr.array_t(x)), dr.width(total))
     dr.scatter_add(total, _wide(x), index, mode=dr.ReduceMode.NoConflicts)
     memory.evaluate_in_turn(total)

@@ -20,13 +20,13 @@ from unrender.scene.problem import Problem
 
 @dataclass(frozen=True)
 class LossState:
-    """Empty: there is no state."""
+    """Empty state."""
 
 
 @register
 @dataclass(frozen=True)
 class LossValues:
-    """The loss at any points, and no derivative: for searches such as `optimizers.CMAES`.
+    """The loss at any points, without derivatives: for searches such as `optimizers.CMAES`.
 
     Every point of a step is rendered with the same random numbers. Unbiased for the expected loss of images with this noise.
 
@@ -45,13 +45,13 @@ class LossValues:
         return Capabilities(LossFunction)
 
     def init(self, problem: Problem, parameters: Tree) -> LossState:
-        """See `Estimator.init`. Raises `InputError` for a parameter that cannot be perturbed."""
+        """Return the empty state. Raise `InputError` for a parameter that cannot be perturbed."""
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         return LossState()
 
     def estimate(self, problem: Problem, parameters: Tree, state: LossState, key: Key) -> tuple[Estimate, LossState]:
-        """See `Estimator.estimate`; the gradient is empty. `info`: "samples" (those of the optimizer's
-        evaluations included), "images" per view."""
+        """Return an estimate with an empty gradient. `info`: "samples" (including those of the optimizer's evaluations), "images" per
+        view."""
         box = BlackBox(problem, parameters, self.spp, key)
         return Estimate(box.center(), {}, (LossFunction(box.losses),), box.info), state
 
@@ -59,18 +59,18 @@ class LossValues:
 class BlackBox:
     """The problem's loss at any points, all with the same random numbers.
 
-    The loss at the parameters themselves is rendered once, in one batch with the first points that are asked for: for small images the
-    overhead of a launch exceeds the cost of its content.
+    The loss at the parameters is rendered once, in one batch with the first requested points: for small images the overhead of a launch
+    exceeds the cost of rendering.
 
     Args:
-        problem: whose scene.
-        parameters: the current ones; they give keys and shapes.
+        problem: problem whose loss is evaluated.
+        parameters: current parameters; they determine keys and shapes.
         spp: samples per pixel.
-        key: of the renders' random numbers.
-        debiased: whether to leave out what the noise of the images adds to the loss, see `SmoothedDerivatives`.
+        key: random key of the renders.
+        debiased: whether to remove the bias of the loss by image noise, see `SmoothedDerivatives`.
 
     Attributes:
-        info: for `Estimate.info`: "samples", the paths traced so far, and "images", each view's at the parameters themselves.
+        info: values for `Estimate.info`: "samples", the paths traced so far, and "images", each view's at the parameters.
     """
 
     def __init__(self, problem: Problem, parameters: Tree, spp: int, key: Key, debiased: bool = False):
@@ -81,7 +81,7 @@ class BlackBox:
         self._center: float | None = None
 
     def losses(self, points: np.ndarray) -> np.ndarray:
-        """The loss at points (B, n), all parameters flattened in key order, as (B,). Points are projected onto the bounds.
+        """Return the loss at points (B, n), all parameters flattened in key order, as (B,). Points are projected onto the bounds.
 
         Unbiased for the expected loss of images with this noise.
         """
@@ -92,20 +92,20 @@ class BlackBox:
         return self._evaluate_with_center(points)[1][1:]
 
     def center(self) -> float:
-        """The loss at the parameters themselves."""
+        """Return the loss at the parameters."""
         if self._center is None:
             return self._evaluate_with_center(np.empty((0, self._theta.size)))[0]
         return self._center
 
     def _evaluate_with_center(self, points: np.ndarray) -> tuple[float, np.ndarray]:
-        """The loss at the parameters, and at the parameters and `points` (B, n) in one array (1 + B,)."""
+        """Return the loss at the parameters, and at the parameters and `points` (B, n) in one array (1 + B,)."""
         losses, images = self._evaluate(np.concatenate([self._theta[None], points]))
         self.info["images"] = {view: image[0] for view, image in images.items()}
         self._center = float(losses[0])
         return self._center, losses
 
     def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, dict[int, Any]]:
-        """The losses (B,) and, per view, the images (B, H, W, 3)."""
+        """Return the losses (B,) and, per view, the images (B, H, W, 3)."""
         renderer, unknowns = self.problem.renderer, self.problem.unknowns
         session = renderer.prepare(list(self.parameters), None, derivatives=False)
         stacked = {key: unknowns[key].project(x) for key, x in vectors.parts(points, self.parameters).items()}
@@ -120,7 +120,7 @@ class BlackBox:
         return np.stack([arrays.numpy(part).astype(np.float64) for part in parts]).sum(axis=0), images
 
     def _view(self, session: RenderSession, states: Tree, request: SampleRequest, view: int) -> tuple[Array, Array]:
-        """The images (B, H, W, 3) of a view, and their part of the losses (B,)."""
+        """Return the images (B, H, W, 3) of a view, and their contribution to the losses (B,)."""
         if not self.debiased:
             images = session.image_batch(states, request)
             return images, self.problem.loss_values(view, images)
@@ -129,11 +129,12 @@ class BlackBox:
         b = session.image_batch(states, replace(request, spp=request.spp - first, seed=_other(request.seed)))
         share = first / request.spp
         images = a * share + b * (1.0 - share)
-        apart = self.problem.loss_values(view, a) * share + self.problem.loss_values(view, b) * (1.0 - share)
-        # Of a quadratic loss with value Q at the noise: the mean's is L + Q / n, of n samples in all, that of the parts' L + 2 Q / n.
-        return images, self.problem.loss_values(view, images) * 2.0 - apart
+        loss_of_halves = self.problem.loss_values(view, a) * share + self.problem.loss_values(view, b) * (1.0 - share)
+        # Let Q be the quadratic loss of the noise of one sample. The loss of the mean of n samples is L + Q / n, that of the halves
+        # L + 2 Q / n.
+        return images, self.problem.loss_values(view, images) * 2.0 - loss_of_halves
 
 
 def _other(seed: int) -> int:
-    """The seed of other random numbers."""
+    """Return the seed of independent random numbers."""
     return Key(seed, 1).uint32()

@@ -1,4 +1,4 @@
-"""Meta-estimation: a gradient estimate that combines all earlier ones, updated by finite differences, with its own variance."""
+"""Meta-estimation: a gradient estimate that combines all earlier estimates by finite differences, with its own variance."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler, upsampled
 from unrender.statistics import meta
 
-_PROPORTIONAL, _DIFFERENCE, _OBSERVED = 0, 1, 2  # streams of a step's key
+_PROPORTIONAL, _DIFFERENCE, _OBSERVED = 0, 1, 2  # streams of a step's random key
 _PROPORTIONAL_SPP, _DIFFERENCE_SPP, _COUPLED_SPP = 2, 1, 3
 
 
@@ -33,12 +33,12 @@ class MetaState:
     """State between steps.
 
     Attributes:
-        parameters: of the last step; None before the first.
+        parameters: parameters of the last step; None before the first.
         elements: {key: meta-estimate and statistics of each element of its gradient}; empty before the first step.
-        image: the image estimator's, in the coupled form.
-        pixels: the pixel sampler's.
-        step: how many steps of whole views were made; see `PairRequest.step`.
-        batches: steps with pixel mini-batches since the last of whole views.
+        image: state of the image estimator, in the coupled form.
+        pixels: state of the pixel sampler.
+        step: number of steps of full views; see `PairRequest.step`.
+        batches: number of steps with pixel mini-batches since the last of full views.
     """
 
     parameters: Tree | None
@@ -49,36 +49,38 @@ class MetaState:
     batches: int = 0
 
     def upsampled(self, upsampler: Upsampler) -> MetaState:
-        """See `Upsamplable`: gradients, their moments and the previous parameters are interpolated."""
+        """Return the state with interpolated gradients, moments and previous parameters."""
         image, pixels = upsampled(self.image, upsampler), upsampled(self.pixels, upsampler)
         if self.parameters is None:
             return replace(self, image=image, pixels=pixels)
         before = upsampler.tree(self.parameters)
-        # Differences are kept per unit of a step's length, and the same step is longer where it has more elements.
+        # Differences are stored per unit of step length, and the length of the same step grows with the number of elements.
         old = _distance(self.parameters, upsampler.parameters)
         new = _distance(before, upsampler.tree(upsampler.parameters))
         ratio = old / new if new > 0 else 1.0
 
-        def moments(key: str, given: meta.Moments, factor: float) -> meta.Moments:
-            mean = upsampler.array(key, given.mean, 1.0, factor) if given.has_mean else given.mean
-            return meta.Moments(mean, upsampler.array(key, given.square, SQUARES, factor * factor), given.weight)
-
-        def element(key: str, given: meta.State) -> meta.State:
-            return meta.State(
-                gradient=upsampler.array(key, given.gradient, 1.0),
-                variance=upsampler.array(key, given.variance, SQUARES),
-                alpha=upsampler.array(key, given.alpha),
-                proportional=moments(key, given.proportional, 1.0),
-                difference=moments(key, given.difference, ratio),
-                steps=given.steps,
+        def moments(key: str, old_state: meta.Moments, factor: float) -> meta.Moments:
+            mean = upsampler.array(key, old_state.mean, 1.0, factor) if old_state.has_mean else old_state.mean
+            return meta.Moments(
+                mean, upsampler.array(key, old_state.square, SQUARES, factor * factor), old_state.weight
             )
 
-        elements = {key: element(key, given) for key, given in self.elements.items()}
+        def element(key: str, old_state: meta.State) -> meta.State:
+            return meta.State(
+                gradient=upsampler.array(key, old_state.gradient, 1.0),
+                variance=upsampler.array(key, old_state.variance, SQUARES),
+                alpha=upsampler.array(key, old_state.alpha),
+                proportional=moments(key, old_state.proportional, 1.0),
+                difference=moments(key, old_state.difference, ratio),
+                steps=old_state.steps,
+            )
+
+        elements = {key: element(key, old_state) for key, old_state in self.elements.items()}
         return replace(self, parameters=before, elements=elements, image=image, pixels=pixels)
 
 
 def _distance(a: Tree, b: Tree) -> float:
-    """The Euclidean distance of two trees."""
+    """Return the Euclidean distance of two trees."""
     return math.sqrt(sum(arrays.number(memory.square(a[key] - b[key])) for key in a))
 
 
@@ -87,53 +89,53 @@ def _distance(a: Tree, b: Tree) -> float:
 class MetaEstimator:
     """M_i = α_i (M_{i-1} + ΔF_i) + (1 − α_i) F_i: Eq. 7 of Balint et al. 2023, per element of each parameter.
 
-    The independent form is the paper's. F comes from `proportional_spp` samples per pixel. ΔF comes from `difference_spp`
-    others: one set of paths, traced in the current scene, gives the images and the adjoints of both states, and the loss
-    derivative of each state comes from a pair of images independent of those paths (the other sample groups; for one sample per
-    pixel, a pair of its own). `difference_images="proportional"` takes that pair from F's samples: the loss derivatives of ΔF are at the
-    mean of their `proportional_spp`, whose paths are traced for both states, and ΔF traces its own paths once. F's samples are independent
-    of ΔF's paths, so that ΔF stays unbiased; but F and ΔF then share the noise of an image, and Eq. 8, which takes them for independent,
-    tells the variance without their covariance.
+    The independent form is the paper's. F uses `proportional_spp` samples per pixel, ΔF `difference_spp` other samples. For ΔF, one set
+    of paths, traced in the current scene, gives the images and the adjoints of both states. The loss derivative of each state comes
+    from a pair of images independent of those paths: the other sample groups or, for one sample per pixel, a separate pair.
+    `difference_images="proportional"` takes that pair from F's samples, whose paths are then traced for both states: the loss
+    derivatives of ΔF use the mean of `proportional_spp` samples, and ΔF traces its own paths once. F's samples are independent of ΔF's
+    paths, so ΔF is unbiased. But F and ΔF then share the noise of an image, and the variance by Eq. 8, which assumes independence,
+    lacks their covariance.
 
-    The coupled form, beyond the paper, takes F and the previous state's H from the same `spp` samples and computes
-    M = F + w (M − H), with w from their covariance: each sample serves both terms, at little more than the cost of a plain one. With
-    `image=RecursiveControlVariate()` the images that the loss sees have a control variate too, from the same passes; of mini-batches it is
-    that of the last whole views, and a pass for the state in between comes with it.
+    The coupled form, an extension of the paper, computes F and the previous state's H from the same `spp` samples, and M = F + w (M −
+    H) with w from their covariance. Each sample serves both terms, at little more than the cost of a plain gradient. With
+    `image=RecursiveControlVariate()` the images that the loss sees have a control variate too, from the same passes. For mini-batches
+    it is that of the last full views, which costs an additional pass for the intermediate state.
 
-    In path space the two states share directions, weighted by the current state's density: the paper's shift mapping, which
-    reuses BSDF samples, in the solid angle measure, where its Jacobian is one. Var ΔF then falls with the square of the step.
-    Where any parameter moves geometry, a path of one state is not valid in the other, and the whole difference is taken in
-    primary sample space, from the same random numbers: `info["space"]` says which was taken, for each parameter.
+    In path space the two states share directions, weighted by the current state's density: the paper's shift mapping, which reuses BSDF
+    samples, in the solid angle measure, where its Jacobian is one. Var ΔF then decreases with the square of the step. If any parameter
+    moves geometry, a path of one state is not valid in the other. The difference is then computed in primary sample space, from the
+    same random numbers. `info["space"]` states the space of each parameter.
 
-    Gradient and variance are by v where a parameter is x = φ(S v) with its parameterisation and preconditioner
-    (`Estimate.preconditioned`): a variance per element does not pass through S.
+    Gradient and variance are by v if a parameter is x = φ(S v) with its parameterisation and preconditioner
+    (`Estimate.preconditioned`), since a variance per element cannot be mapped by S.
 
-    Bias: none with `statistics="independent"`, a loss whose derivative is linear and plain images, along a path of parameters that does not
-    depend on the samples; a descent's own path depends on them a little. With "shared" statistics, the paper's choice, α
-    depends on the samples that it weighs, which biases the gradient toward zero, most at the start. The variance is that of the
+    Bias: none with `statistics="independent"`, a loss whose derivative is linear and plain images, along a path of parameters that does
+    not depend on the samples; the path of an optimisation depends on them slightly. With "shared" statistics, the paper's choice, α
+    depends on the samples that it weights, which biases the gradient towards zero, mostly at the start. The variance is that of the
     recurrence (15): a zero-centred second moment, so too large where the gradient exceeds the noise of one step. With a control
-    variate, successive steps also share its image, which the recurrence does not model: the gradient is biased as that image is, and
-    somewhat noisier than its variance says. The state starts anew when a parameter changes its shape.
+    variate, successive steps also share its image, which the recurrence does not model. The gradient then has the bias of that image,
+    and is somewhat noisier than its variance. The state is reset if a parameter changes its shape.
 
     Args:
-        proportional_spp: samples per pixel and view of F in the independent form, >= 1; 2 where none is given.
-        difference_spp: of ΔF in the independent form, >= 1; 1 where none is given.
-        coupled: take the coupled form.
-        spp: samples per pixel and view in the coupled form, >= 1; 3 where none is given; at 1 the adjoint gets a second set of paths.
-        image: estimates the image that the loss sees, in the coupled form; the independent form uses plain images.
-        pixels: the pixels of a step; F and ΔF of the independent form draw their own, with the same probabilities.
-        space: "path", "primary", or "auto": path space where all parameters share paths.
+        proportional_spp: samples per pixel and view of F in the independent form, >= 1; 2 by default.
+        difference_spp: samples per pixel and view of ΔF in the independent form, >= 1; 1 by default.
+        coupled: whether to use the coupled form.
+        spp: samples per pixel and view in the coupled form, >= 1; 3 by default; at 1 the adjoint has a second set of paths.
+        image: estimator of the image that the loss sees, in the coupled form; the independent form uses plain images.
+        pixels: pixel sampler; F and ΔF of the independent form have different samples with the same probabilities.
+        space: "path", "primary", or "auto": path space if all parameters share paths.
         beta_proportional: β_F, decay of the mean square of F, in [0, 1).
         beta_difference: β_Δ, decay of the mean square of ΔF / ‖Δπ‖, in [0, 1).
-        clip: hold α below 1 / (2 − α_{i-1}) (Eq. 17).
-        max_weight: upper bound of α, in (0, 1]; 1 in the paper. Below, noise is forgotten after some 1 / (1 − max_weight) steps. With 1 it
-            lasts as long as the run, and the optimizer cannot average what stays the same from step to step.
-        centred: variances about the mean in place of mean squares. For comparison (Fig. 5).
-        decouple: divide ΔF by the step before averaging (Eq. 13). For comparison (Fig. 5).
-        statistics: "shared" estimates variances from the samples that it sums; "independent" from as many more, at twice the cost.
-        difference_images: of both states, at which the loss derivatives of ΔF are: "own", or "proportional", F's. That is for the
-            independent form and whole views, `pixels.All()`. In path space it saves a pass where `difference_spp` cannot be divided into
-            groups, as 1 cannot; elsewhere it saves nothing.
+        clip: whether to clamp α to at most 1 / (2 − α_{i-1}) (Eq. 17).
+        max_weight: upper bound of α, in (0, 1]; 1 in the paper. With a smaller value, noise decays after about 1 / (1 − max_weight)
+            steps. With 1 it persists, and the optimizer cannot average an error that is the same in every step.
+        centred: whether to use variances about the mean instead of mean squares. For comparison (Fig. 5).
+        decouple: whether to divide ΔF by the step before averaging (Eq. 13). For comparison (Fig. 5).
+        statistics: "shared" estimates variances from the samples of the sum; "independent" from as many others, at twice the cost.
+        difference_images: images of both states for the loss derivatives of ΔF: "own", or "proportional", F's. The latter requires the
+            independent form and full views, `pixels.All()`. In path space it saves a pass if `difference_spp` cannot be divided into
+            groups, such as 1; otherwise it saves nothing.
     """
 
     proportional_spp: int | None = None
@@ -158,9 +160,9 @@ class MetaEstimator:
             ("difference_spp", False, _DIFFERENCE_SPP),
             ("spp", True, _COUPLED_SPP),
         ):
-            given = getattr(self, name)
-            if given is not None:
-                checks.integer("MetaEstimator", name, given, at_least=1)
+            value = getattr(self, name)
+            if value is not None:
+                checks.integer("MetaEstimator", name, value, at_least=1)
                 if coupled != self.coupled:
                     form = "coupled" if coupled else "independent"
                     raise InputError(f"MetaEstimator: {name} is for the {form} form; give coupled={coupled} with it")
@@ -183,12 +185,12 @@ class MetaEstimator:
             raise InputError("MetaEstimator: image is for the coupled form; give coupled=True with it")
         if self.difference_images == "proportional" and (self.coupled or not isinstance(self.pixels, All)):
             raise InputError(
-                'MetaEstimator: difference_images="proportional" is for the independent form and whole views; leave it out, or '
+                'MetaEstimator: difference_images="proportional" requires the independent form and full views; leave it out, or '
                 "give coupled=False and pixels=unrender.pixels.All()"
             )
         if self.statistics == "independent" and not isinstance(self.image, Plain):
             raise InputError(
-                'MetaEstimator: statistics="independent" goes with plain images; those of a control variate share their memory'
+                'MetaEstimator: statistics="independent" requires plain images, since those of a control variate are correlated'
             )
         fewest = min(n for n in (self.proportional_spp, self.difference_spp, self.spp) if n is not None)
         check_pixels("MetaEstimator", self.pixels, self.image, fewest)
@@ -199,17 +201,17 @@ class MetaEstimator:
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient, its variance, and the weight of earlier ones in it."""
+        """A gradient, its variance, and the weight of earlier estimates in it."""
         return Capabilities(Gradient, Variance, PastWeight)
 
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
-        """See `Estimator.init`. Raises `InputError` for a parameter whose values share no paths, with `space="path"`."""
+        """Return the state before the first step. Raise `InputError` for a parameter whose values share no paths, with `space="path"`."""
         problem.renderer.prepare(list(parameters), self._space(problem, parameters))
         return MetaState(None, {}, self.image.init(problem, parameters), self.pixels.init(problem, parameters))
 
     def estimate(self, problem: Problem, parameters: Tree, state: MetaState, key: Key) -> tuple[Estimate, MetaState]:
-        """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view, "space" and
-        "alpha" (the weight of the past) per parameter, and the info of the image estimator, per view."""
+        """Return an estimate and the next state. `info`: "samples" (paths traced for images and adjoints), "images" per view, "space"
+        and "alpha" (the weight of the past) per parameter, and the info of the image estimator, per view."""
         fresh = state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
         if fresh or state.parameters is None:
             elements, previous = {name: meta.init(x) for name, x in parameters.items()}, parameters
@@ -231,7 +233,7 @@ class MetaEstimator:
             *observed, more, pixels = take(problem, parameters, again, pair_request, fresh, further, first=False)
             samples += more.samples
         rule = meta.update_coupled if self.coupled else meta.update
-        found = {
+        results = {
             name: rule(
                 elements[name],
                 first[name],
@@ -247,10 +249,10 @@ class MetaEstimator:
             )
             for name in parameters
         }
-        gradient, variance, alpha = ({name: parts[n] for name, parts in found.items()} for n in range(3))
-        elements = {name: parts[3] for name, parts in found.items()}
-        del first, second, observed, found
-        steps = (state.step + 1, 0) if self._whole(parameters, state) else (state.step, state.batches + 1)
+        gradient, variance, alpha = ({name: parts[n] for name, parts in results.items()} for n in range(3))
+        elements = {name: parts[3] for name, parts in results.items()}
+        del first, second, observed, results
+        steps = (state.step + 1, 0) if self._renders_full_views(parameters, state) else (state.step, state.batches + 1)
         after = MetaState(parameters, elements, step.image, pixels, *steps)
         arrays.evaluate(gradient, variance, alpha, after, step.losses, step.info)
         info = {
@@ -281,8 +283,8 @@ class MetaEstimator:
         key: Key,
         first: bool = True,
     ) -> tuple[Tree, Tree, GradientSample, Any]:
-        """F, ΔF from independent samples, the sample of F with the cost of both, and the pixel sampler's next state. `first`: as for
-        `_sample`."""
+        """Return F, ΔF from independent samples, the sample of F with the cost of both, and the pixel sampler's next state. `first`:
+        see `_sample`."""
         spp, difference_spp = self.proportional_spp or _PROPORTIONAL_SPP, self.difference_spp or _DIFFERENCE_SPP
         at_once = self.difference_images == "proportional" and not fresh
         asked = replace(pair_request, difference_spp=difference_spp) if at_once else None
@@ -290,7 +292,7 @@ class MetaEstimator:
         coordinates = problem.coordinates
         slopes, before = coordinates.slopes(parameters), coordinates.slopes(pair_request.previous)
         F = coordinates.pull_back(step.gradient, slopes)
-        if fresh:  # no change to be estimated
+        if fresh:  # the first step has no difference
             return F, trees.zeros_like(F), step, pixels
         current, previous, samples = step.paired, step.previous, step.samples
         if not at_once:
@@ -312,7 +314,8 @@ class MetaEstimator:
         key: Key,
         first: bool = True,
     ) -> tuple[Tree, Tree, GradientSample, Any]:
-        """F, H of the previous state from the same samples, their sample, and the pixel sampler's next state. `first`: as for `_sample`."""
+        """Return F, H of the previous state from the same samples, their sample, and the pixel sampler's next state. `first`: see
+        `_sample`."""
         del fresh
         spp = self.spp or _COUPLED_SPP
         step, pixels = self._sample(problem, parameters, state, spp, key, pair_request, first=first)
@@ -331,11 +334,11 @@ class MetaEstimator:
         pair_request: PairRequest | None = None,
         first: bool = True,
     ) -> tuple[GradientSample, Any]:
-        """A gradient of pixels of its own, and the pixel sampler's next state. Where it is not the `first` of a step, that state stays: the
-        step has been counted, and its gradient observed."""
+        """Return a gradient with its own pixel sample, and the pixel sampler's next state. That state only advances for the `first`
+        sample of a step."""
         draw_key = key.fold(PIXELS)
         drawn = draws_pixels(self.pixels)
-        if drawn and self._whole(parameters, state):
+        if drawn and self._renders_full_views(parameters, state):
             batch, pixels = MiniBatch(None), state.pixels
         elif first or not isinstance(self.pixels, RepeatableSampler):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, draw_key)
@@ -350,6 +353,6 @@ class MetaEstimator:
                 step = replace(step, image=problem.executor.prepare_images(problem, self.image, step.image))
         return step, pixels
 
-    def _whole(self, parameters: Tree, state: MetaState) -> bool:
-        """Whether a step renders whole views: all do, or the image estimator needs them."""
+    def _renders_full_views(self, parameters: Tree, state: MetaState) -> bool:
+        """Return whether a step renders full views: always without mini-batches, else if the image estimator requires it."""
         return not draws_pixels(self.pixels) or self.image.needs_whole_views(parameters, state.image, state.batches)

@@ -1,4 +1,4 @@
-"""The gradient by path replay, weighted by the loss derivative at an image from independent samples."""
+"""Gradient by path replay, weighted by the loss derivative at an image from independent samples."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler, upsampled
 
 _EMITTERS = PIXELS + 1
-"""The stream of a step's key that chooses emitters' tangents."""
+"""Stream of a step's key for the tangents of emitter sampling."""
 
 _WINDOW = 8
-"""Estimates in a row that have the fresh gradient."""
+"""Number of consecutive estimates that have the fresh gradient."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class PathGradientState:
     """State between steps.
 
     Attributes:
-        image: the image estimator's.
-        pixels: the pixel sampler's.
-        batches: steps with pixel mini-batches since the last that rendered whole views.
-        step: estimates made so far.
-        emitters: of the probabilities of emitters; None where they are the scene's own.
+        image: state of the image estimator.
+        pixels: state of the pixel sampler.
+        batches: number of steps with pixel mini-batches since the last that rendered full views.
+        step: number of estimates so far.
+        emitters: state of the emitter probabilities; None for the scene's own.
     """
 
     image: Any
@@ -57,7 +57,7 @@ class PathGradientState:
     emitters: EmitterState | None = None
 
     def upsampled(self, upsampler: Upsampler) -> PathGradientState:
-        """See `Upsamplable`: the states of image estimator, pixel sampler and emitters are carried."""
+        """Return the state with upsampled states of image estimator, pixel sampler and emitters."""
         emitters = None if self.emitters is None else self.emitters.upsampled(upsampler)
         image, pixels = upsampled(self.image, upsampler), upsampled(self.pixels, upsampler)
         return replace(self, image=image, pixels=pixels, emitters=emitters)
@@ -66,43 +66,43 @@ class PathGradientState:
 @register
 @dataclass(frozen=True)
 class PathGradient:
-    """∂L/∂θ = Σ ∂L/∂I · ∂I/∂θ, the two factors from independent samples (Nicolet et al. 2023, Eqs 12 and 13).
+    """∂L/∂θ = Σ ∂L/∂I · ∂I/∂θ, with the two factors from independent samples (Nicolet et al. 2023, Eqs 12 and 13).
 
     Independence comes from leave-one-out sample groups (dual buffers at 2 spp): the adjoint of each group is weighted by the loss
-    derivative at the image of all other groups. That takes two traces where the usual loop takes three. With a control variate the
-    groups' images share the control variate, which is independent of them all. Where noise dominates, G groups have G / (G - 1)
-    times the variance of an adjoint on paths of its own, so there are as many as samples, up to 16.
+    derivative at the image of all other groups. This takes two traces where the usual loop takes three. With a control variate the
+    groups' images share the control variate, which is independent of all of them. If noise dominates, G groups have G / (G - 1) times
+    the variance of an adjoint on separate paths. Therefore there are as many groups as samples, up to 16.
 
-    Unbiased for a loss whose derivative is linear in the image (`loss.linear`) and a plain image; otherwise biased by the noise of
-    the image that the loss sees, which a control variate reduces step by step.
+    Unbiased for a loss whose derivative is linear in the image (`loss.linear`) and a plain image. Otherwise it is biased by the noise
+    of the image that the loss sees, which a control variate reduces from step to step.
 
-    With pixel mini-batches (Eq. 4 of the paper of `pixels.Adaptive`) each pixel's samples are weighted by 1 / (N p): as unbiased as the
-    gradient of all pixels, for any positive probabilities.
+    With pixel mini-batches (Eq. 4 of the paper of `pixels.Adaptive`) each pixel's samples are weighted by 1 / (N p). This is as
+    unbiased as the gradient of all pixels, for any positive probabilities.
 
     Args:
-        image: estimates the image that the loss sees, `images.Plain()` or `images.RecursiveControlVariate()`.
-        pixels: the pixels of a step: `pixels.All()`, or a mini-batch by `Uniform`, `LossProportional` or `Adaptive`.
+        image: estimator of the image that the loss sees, `images.Plain()` or `images.RecursiveControlVariate()`.
+        pixels: pixel sampler: `pixels.All()`, or a mini-batch by `Uniform`, `LossProportional` or `Adaptive`.
         spp: samples per pixel and view of the image, or per pixel of the mini-batch, >= 1.
-        adjoint_spp: samples per pixel of the adjoint on paths of its own, >= 1. None for leave-one-out groups, and for `spp` paths of
-            its own where `spp` cannot be divided into groups: 1, and primes above 16.
-        tolerance: κ >= 0. Where it is above 0, the loss's derivative not linear, as of L1, and the variance σ² of the image known (of
-            whole views, or mini-batches of these, of several samples), the derivative at the residual r is multiplied by |r| / √(r² + κ²
-            σ²), with σ² averaged over neighbouring pixels. Of L1 that makes Charbonnier's loss √(r² + δ²) with δ = κ σ: where the sign of
-            r is the noise's, r counts by its size, and noise of skewed distribution, as of fireflies, does not pull. As the noise falls,
-            it is the loss itself again.
-        fresh_from: the estimate, counted from 0, from which eight have `FreshGradient`, too, as again from twice, four times, … that
-            count, >= 8; for 0 none has. Costs an adjoint more. Only for whole views, of an image that remembers earlier samples (where it
-            does not, every gradient is fresh), and with a linear derivative or a tolerance.
-        emitters: how a connection takes one of several emitters: "scene", uniformly or by the scene's own sampling weights, or
-            "adaptive", by the variance of the gradient, in units of Adam's steps (`emitter_selection.EmitterState`). As unbiased either
-            way. The first steps, and one in 20, cost two passes more, from which the probabilities are learnt; four fifths of the scene's
-            own are kept at first, and down to a tenth as samples confirm what was learnt. These passes keep eight bytes for each path and
-            vertex. Needs at least two leave-one-out groups, and a scene without participating media and without moving shapes or sensors; a
-            single emitter leaves nothing to choose.
-        differential_bsdf: whether the adjoint samples the derivative of rough conductors by their roughness apart, in proportion to it and
-            in antithetic pairs (Belhe et al. 2024). As unbiased; an adjoint costs about twice as much, and the variance
-            of roughness gradients is smaller, by the more the smoother the surface. `init` raises `InputError` where no parameter is such
-            a roughness (`RoughLobes`), or views are dealt to workers.
+        adjoint_spp: samples per pixel of the adjoint on separate paths, >= 1. None for leave-one-out groups, or for `spp` separate paths
+            if `spp` cannot be divided into groups: 1, and primes above 16.
+        tolerance: κ >= 0. If it is positive, the loss's derivative is not linear, such as L1's, and the variance σ² of the image is known
+            (full views, or mini-batches of these, with several samples), then the derivative at the residual r is multiplied by
+            |r| / √(r² + κ² σ²), with σ² averaged over neighbouring pixels. L1 becomes Charbonnier's loss √(r² + δ²) with δ = κ σ: where
+            noise determines the sign of r, the derivative is proportional to r, so skewed noise, such as fireflies, does not bias it. It
+            tends to the loss itself as noise decreases.
+        fresh_from: index of the estimate from which eight have `FreshGradient` as well, and again from twice, four times, … this
+            index, >= 8; 0 for none. It costs an additional adjoint. Only for full views, with an image estimator that reuses earlier
+            samples (otherwise every gradient is fresh), and with a linear derivative or a tolerance.
+        emitters: selection of emitters in next-event estimation: "scene", uniform or by the scene's own sampling weights, or
+            "adaptive", to minimise the variance of the gradient, in units of Adam's steps (`emitter_selection.EmitterState`). Both are
+            unbiased alike. The first steps, and one in 20, take two additional passes, which update the probabilities. The weight of the
+            scene's own probabilities decreases from four fifths to a tenth as samples confirm the estimate. These passes store eight
+            bytes per path and vertex. It requires at least two leave-one-out groups, and a scene without participating media, moving
+            shapes or moving sensors. It has no effect with a single emitter.
+        differential_bsdf: whether the adjoint samples the derivative of rough conductors by their roughness separately, in proportion
+            to it and in antithetic pairs (Belhe et al. 2024). It is as unbiased. An adjoint costs about twice as much, and the variance
+            of roughness gradients decreases, most for smooth surfaces. `init` raises `InputError` if no parameter is such a roughness
+            (`RoughLobes`), or if views are distributed to workers.
     """
 
     image: ImageEstimator = field(default_factory=Plain)
@@ -127,7 +127,7 @@ class PathGradient:
         emitter_selection.check("PathGradient", self.emitters, self.groups, equal)
         if self.differential_bsdf and self.emitters == "adaptive":
             raise InputError(
-                'PathGradient: differential_bsdf does not go with emitters="adaptive": leave one of them out'
+                'PathGradient: differential_bsdf does not support emitters="adaptive"; leave out one of them'
             )
 
     @property
@@ -137,28 +137,28 @@ class PathGradient:
 
     @property
     def groups(self) -> int:
-        """How many leave-one-out sample groups there are; 1 where the adjoint has paths of its own."""
+        """Number of leave-one-out sample groups; 1 if the adjoint has separate paths."""
         return leave_one_out_groups(self.spp, self.adjoint_spp)
 
     def _has_secant(self, loss: Loss) -> bool:
-        """Whether the derivative is linear, or has a secant that is bounded."""
+        """Return whether the derivative is linear, or has a bounded secant."""
         return loss.linear or (loss.pixelwise and self.tolerance > 0)
 
     def _in_window(self, step: int) -> bool:
-        """Whether an estimate, counted from 0, has the fresh gradient, too."""
+        """Return whether the estimate of this index has the fresh gradient as well."""
         if self.fresh_from == 0 or step < self.fresh_from:
             return False
-        begun = self.fresh_from << ((step // self.fresh_from).bit_length() - 1)
-        return step < begun + _WINDOW
+        start = self.fresh_from << ((step // self.fresh_from).bit_length() - 1)
+        return step < start + _WINDOW
 
     def _rendered(self, problem: Problem) -> Problem:
-        """The problem by the renderer that is asked for."""
+        """Return the problem with the renderer that the options require."""
         if not self.differential_bsdf:
             return problem
         return problem.with_parts(renderer=with_differential_bsdf(problem.renderer))
 
     def init(self, problem: Problem, parameters: Tree) -> PathGradientState:
-        """See `Estimator.init`. Raises `InputError` for a parameter that `image.space` cannot carry."""
+        """Return the state before the first step. Raise `InputError` for a parameter that `image.space` does not support."""
         problem = self._rendered(problem)
         session = problem.renderer.prepare(list(parameters), self.image.space)
         adaptive = self.emitters == "adaptive"
@@ -169,17 +169,17 @@ class PathGradient:
     def estimate(
         self, problem: Problem, parameters: Tree, state: PathGradientState, key: Key
     ) -> tuple[Estimate, PathGradientState]:
-        """See `Estimator.estimate`. `info`: "samples" (paths traced for images, adjoints and probabilities), "images" and
-        the info of the image estimator, per view that was rendered whole, "pixel_probability" per view of a mini-batch,
-        "emitter_probability" where these are adaptive."""
+        """Return an estimate and the next state. `info`: "samples" (paths traced for images, adjoints and probabilities), "images" and
+        the info of the image estimator, per fully rendered view, "pixel_probability" per view of a mini-batch, "emitter_probability" if
+        it is adaptive."""
         problem = self._rendered(problem)
         batch, pixels = MiniBatch(None), state.pixels
-        drawn = draws_pixels(self.pixels)
-        if not drawn or not self.image.needs_whole_views(parameters, state.image, state.batches):
+        has_batches = draws_pixels(self.pixels)
+        if not has_batches or not self.image.needs_whole_views(parameters, state.image, state.batches):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
-        emitters, asked = state.emitters, None
+        emitters, emitter_request = state.emitters, None
         if emitters is not None:
-            asked = emitter_selection.request(problem, parameters, emitters, key.fold(_EMITTERS))
+            emitter_request = emitter_selection.request(problem, parameters, emitters, key.fold(_EMITTERS))
         request = GradientRequest(
             parameters,
             self.image,
@@ -190,7 +190,7 @@ class PathGradient:
             batch=batch,
             tolerance=self.tolerance,
             fresh=batch.sample is None and self._in_window(state.step) and self._has_secant(problem.loss),
-            emitters=asked,
+            emitters=emitter_request,
         )
         step = problem.executor.estimate_gradient(problem, request)
         wrt_u = problem.coordinates.wrt_u(step.gradient, parameters)
@@ -198,14 +198,14 @@ class PathGradient:
         if emitters is not None:
             emitters = emitter_selection.learned(emitter_selection.observed(problem, emitters, wrt_u), step.connections)
         pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
-        whole, image = batch.sample is None, step.image
-        if whole and drawn:
+        is_full, image = batch.sample is None, step.image
+        if is_full and has_batches:
             image = problem.executor.prepare_images(problem, self.image, image)
-        next_state = PathGradientState(image, pixels, 0 if whole else state.batches + 1, state.step + 1, emitters)
+        next_state = PathGradientState(image, pixels, 0 if is_full else state.batches + 1, state.step + 1, emitters)
         arrays.evaluate(step.gradient, step.fresh, step.losses, next_state, step.info)
         loss = sum(arrays.number(value) for value in step.losses)
         info = {"samples": step.samples, "images": step.images, **step.info}
-        if asked is not None:
-            info["emitter_probability"] = asked.probabilities
+        if emitter_request is not None:
+            info["emitter_probability"] = emitter_request.probabilities
         capabilities = (FreshGradient(step.fresh),) if step.fresh else ()
         return Estimate(loss, step.gradient, capabilities, info), next_state

@@ -1,4 +1,4 @@
-"""Priors and regularizers of unknowns as parts of the loss: their values and derivatives, which have no noise."""
+"""Priors and regularizers of unknowns as terms of the loss: their values and exact derivatives."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from unrender.scene.problem import Problem
 
 
 def penalty(problem: Problem, parameters: Mapping[str, Array | np.ndarray]) -> float:
-    """Return what priors and regularizers add to the loss at `parameters`; 0 where there are none."""
+    """Return the sum of priors and regularizers at `parameters`; 0 if there are none."""
     return sum(_terms(problem, key, parameters[key])[0] for key in _keys(problem))
 
 
 def penalized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
-    """Return the estimate with priors and regularizers added to the loss and its derivatives; itself where there are none.
+    """Return the estimate with priors and regularizers added to the loss and its derivatives; the estimate itself if there are none.
 
-    Second derivatives and products of `estimate` are by the parameters. The part of regularizers of meshes in these is left out.
+    Second derivatives and products of `estimate` must be by the parameters. They do not include the regularizers of meshes.
     """
     if not (keys := _keys(problem)):
         return estimate
@@ -70,7 +70,7 @@ def _sum(gradient: Tree, added: Tree) -> Tree:
 
 
 def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tree) -> Capability:
-    """Return a capability of the data's loss as one of the whole."""
+    """Return a capability of the data term as one of the total loss."""
     match capability:
         case FreshGradient(values):
             return FreshGradient(_sum(values, added))
@@ -81,10 +81,10 @@ def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tr
         case HessianProduct(apply):
             product = _product(problem, parameters)
 
-            def whole(v: Tree) -> Tree:
+            def total(v: Tree) -> Tree:
                 return _sum(apply(v), {key: arrays.like(x, v[key]) for key, x in product(v).items()})
 
-            return HessianProduct(whole)
+            return HessianProduct(total)
         case LossFunction(evaluate):
 
             def losses(points: np.ndarray) -> np.ndarray:
@@ -99,15 +99,15 @@ def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tr
 
 
 def _product(problem: Problem, parameters: Tree) -> Callable[[Mapping[str, Array | np.ndarray]], dict[str, np.ndarray]]:
-    """Return v -> the product of the priors' curvature with v, by the parameters."""
+    """Return a function from v to the product of the priors' Hessian with v, by the parameters."""
     unknowns, scale = problem.unknowns, problem.prior_scale
     points = {key: arrays.numpy(x) for key, x in parameters.items()}
 
     def product(v: Mapping[str, Array | np.ndarray]) -> dict[str, np.ndarray]:
-        found = {}
+        products = {}
         for key, x in v.items():
             values, prior = x if isinstance(x, np.ndarray) else arrays.numpy(x), unknowns[key].prior
-            found[key] = np.zeros(points[key].shape) if prior is None else scale * prior.product(points[key], values)
-        return found
+            products[key] = np.zeros(points[key].shape) if prior is None else scale * prior.product(points[key], values)
+        return products
 
     return product

@@ -1,4 +1,4 @@
-"""Perturbations of parameters that have a preconditioner: Gaussian in the coordinates of the descent, so as smooth as its steps."""
+"""Perturbations of parameters with a preconditioner: Gaussian in the coordinates of the descent, so as smooth as its steps."""
 
 from __future__ import annotations
 
@@ -14,53 +14,54 @@ from unrender.preconditioners.base import Preconditioner
 from unrender.scene.problem import Problem
 
 _PROBES = 4
-"""Draws that tell how much S shrinks white noise: of a thousand vertices, to 5 percent or less."""
+"""Number of samples that estimate the gain of S for white noise, within 5 percent for a thousand vertices."""
 
 
 class PreconditionedPerturbations:
-    """A function of the parameters as one of v, where u = θ + S (v − θ), S the preconditioners, θ the parameters now.
+    """A function of the parameters as a function of v, where u = θ + S (v − θ), with the preconditioners S and the current parameters
+    θ.
 
-    A Gaussian of v of deviation σ moves u by σ S ε: neighbours move alike, by less than σ. `deviations` are those of v that move the
-    elements of u by σ, in the mean square over a parameter. Without preconditioners all is as it is.
+    A Gaussian of v with standard deviation σ moves u by σ S ε: neighbours move alike, by less than σ. `deviations` are those of v that
+    move the elements of u by σ, in the root mean square over a parameter. Without preconditioners nothing changes.
 
     Args:
-        problem: whose preconditioners.
-        parameters: θ; their keys and shapes.
+        problem: problem with the preconditioners.
+        parameters: θ; they determine keys and shapes.
 
     Raises:
-        InputError: where beside a preconditioner there is a parameterisation, whose coordinates would be others.
+        InputError: there are both a preconditioner and a parameterisation, whose coordinates would conflict.
     """
 
     def __init__(self, problem: Problem, parameters: Tree):
         maps = problem.coordinates.preconditioners
         self._maps: Mapping[str, Preconditioner] = {key: maps[key] for key in parameters if key in maps}
         self._parameters, self._theta = parameters, vectors.ravel(parameters)
-        bent = [key for key in problem.coordinates.transforms if key in parameters]
-        if self._maps and bent:
+        transformed = [key for key in problem.coordinates.transforms if key in parameters]
+        if self._maps and transformed:
             smooth = next(iter(self._maps))
             raise InputError(
-                f"SmoothedDerivatives: parameter {smooth} has a preconditioner and {bent[0]} a parameterisation; leave one of them out"
+                f"SmoothedDerivatives: parameter {smooth} has a preconditioner and {transformed[0]} a parameterisation; leave out one"
             )
 
     def __bool__(self) -> bool:
-        """Whether there is a preconditioner."""
+        """Return whether there is a preconditioner."""
         return bool(self._maps)
 
     def deviations(self, sigma: Mapping[str, float]) -> dict[str, float]:
-        """{key: deviation of v} for {key: σ of u}: σ over the root mean square of S ε, by a few draws of ε, the same in every step."""
+        """Return {key: standard deviation of v} for {key: σ of u}: σ over the root mean square of S ε, from a few fixed samples of ε."""
         return {
             key: value / self._gain(key, arrays.shape(self._parameters[key])) if key in self._maps else value
             for key, value in sigma.items()
         }
 
     def by_coordinates(self, f: Callable[[np.ndarray], np.ndarray]) -> Callable[[np.ndarray], np.ndarray]:
-        """f of u, (B, n) to (B,), as a function of v."""
+        """Return f of u, (B, n) to (B,), as a function of v."""
         if not self._maps:
             return f
-        return lambda points: f(self._reached(points))
+        return lambda points: f(self._to_u(points))
 
-    def _reached(self, points: np.ndarray) -> np.ndarray:
-        """u at v, (B, n) each."""
+    def _to_u(self, points: np.ndarray) -> np.ndarray:
+        """Return u at v, (B, n) each."""
         changes = vectors.parts(points - self._theta, self._parameters)
         rows = [
             np.stack([self._smoothed(key, row) for row in rows]) if key in self._maps else rows
@@ -73,5 +74,5 @@ class PreconditionedPerturbations:
         return float(np.sqrt(np.mean([np.mean(self._smoothed(key, draw) ** 2) for draw in draws])))
 
     def _smoothed(self, key: str, x: Array) -> np.ndarray:
-        """S x on the host, in double precision."""
+        """Return S x on the host, in double precision."""
         return np.asarray(self._maps[key].apply(np.asarray(x, np.float32)), np.float64)

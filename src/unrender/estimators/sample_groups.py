@@ -1,5 +1,5 @@
-"""Image, loss derivative and adjoint of each frame, a view or a pixel mini-batch, with leave-one-out sample groups; of one state, or of
-two on one set of paths."""
+"""Image, loss derivative and adjoint of each frame (a view or a pixel mini-batch) with leave-one-out sample groups, for one state, or
+for two on one set of paths."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from unrender.scene.problem import Problem
 from unrender.scene.sample_counts import SampleCounts
 
 PIXELS = 1 << 32
-"""The stream of a step's key that draws its pixels; the streams below are its frames'."""
+"""Stream of a step's key for its pixels; lower streams are for its frames."""
 
 TREES = ("gradient", "paired", "previous", "fresh")
-"""What is summed over the frames, in a `GradientSample`."""
+"""Trees of a `GradientSample` that are summed over the frames."""
 
 _MOST_GROUPS = 16
 
@@ -46,17 +46,17 @@ class GradientSample:
     """The gradient estimate of one step's paths, over all frames.
 
     Attributes:
-        gradient: of the loss with respect to the current parameters.
-        paired: the same on the paths of `previous`, where `PairRequest.difference_spp` asks for others than those of `gradient`; else {}.
-        previous: of the loss at the previous parameters with respect to them, from the same paths; {} where it was not requested.
-        fresh: of the loss as the samples of this step alone show it; {} where it was not requested.
-        losses: of the current state, one per frame, lazy.
-        images: of the current state, per whole view, as the loss sees them.
-        samples: paths traced for images, adjoints and the probabilities of pixels.
-        info: for people, {name: {view: array}}: of the image estimator for whole views, and of the pixels' probabilities.
-        image: the image estimator's next state.
-        draws: what the samples of a pixel mini-batch tell of its pixels; None where it was not asked for.
-        connections: what its connections to emitters tell; None where it was not asked for.
+        gradient: gradient of the loss by the current parameters.
+        paired: the same on the paths of `previous`, if `PairRequest.difference_spp` requests separate paths; else {}.
+        previous: gradient of the loss at the previous parameters by them, from the same paths; {} if it was not requested.
+        fresh: gradient from the samples of this step alone; {} if it was not requested.
+        losses: losses of the current state, one per frame, lazy.
+        images: images of the current state that the loss sees, per full view.
+        samples: number of paths traced for images, adjoints and the probabilities of pixels.
+        info: information for people, {name: {view: array}}: of the image estimator for full views, and of the pixels' probabilities.
+        image: next state of the image estimator.
+        draws: statistics of the pixels of a mini-batch; None if they were not requested.
+        connections: statistics of the emitter-sampling connections; None if they were not requested.
     """
 
     gradient: Tree
@@ -107,74 +107,79 @@ class GradientRequest:
 
     @property
     def tangents(self) -> Tree:
-        """Along which the squared derivatives of the pixels are wanted; {} for none. Of pairs of mini-batches they are not
-        known."""
+        """Tangents for the squared derivatives of the pixels; {} for none. They are not available for pairs of mini-batches."""
         if self.batch is None or (self.pair_request is not None and self.batch.shares is None):
             return {}
         return self.batch.tangents
 
     def begin(self, problem: Problem) -> GatheredFrames:
-        """Return the frames of the step, whose parts are yet to be estimated."""
+        """Return the frames of the step, before the estimation of their contributions."""
         sample, shares = (self.batch.sample, self.batch.shares) if self.batch else (None, None)
         likely = None if self.emitters is None else self.emitters.probabilities
         frames: Sequence[Frame] = [PixelBatch(problem, sample, likely)] if sample is not None else ()
         return GatheredFrames(self, frames or whole_views(problem, shares, self.spp, likely))
 
     def estimate_frame(self, problem: Problem, frame: Frame, key: Key) -> FrameGradient:
-        """Return the part of one frame, computed in this process; `key` is the frame's own."""
+        """Return the contribution of one frame, computed in this process. `key` is the random key of the frame."""
         parameters, spp, adjoint_spp, pair_request = self.parameters, self.spp, self.adjoint_spp, self.pair_request
         difference_spp = pair_request.difference_spp if pair_request else None
-        on_images = pair_request if difference_spp is None else None  # whose gradients are on the paths of the images
+        on_images = (
+            pair_request if difference_spp is None else None
+        )  # the pair whose gradients use the paths of the images
         groups = leave_one_out_groups(spp, adjoint_spp)
         session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
-        found, kept = self.image.estimate(
+        image_estimate, kept = self.image.estimate(
             problem, parameters, self.state, frame, spp, groups, key.fold(0), pair_request
         )
-        mean = found.mean()
+        mean = image_estimate.mean()
         loss = frame.loss_value(mean)
-        paths, traced = found.paths, spp
+        paths, traced = image_estimate.paths, spp
         counts = frame.counts if isinstance(frame, WholeView) else None
         if groups == 1 and counts is None:
             samples = frame.request(adjoint_spp or spp, key.fold(1).uint32())
             paths = _paths(session, parameters, samples, on_images)
             traced += samples.spp
-        derivative = _derivative(problem, frame, found.variance, self.tolerance)
-        others = found.others()
+        derivative = _derivative(problem, frame, image_estimate.variance, self.tolerance)
+        others = image_estimate.others()
         weights = derivative(others)
         paired: Tree = {}
         previous: Tree = {}
         if on_images is None:
             gradient = session.adjoint(parameters, paths, weights)
         else:
-            weights_previous = derivative(found.previous_others())
+            weights_previous = derivative(image_estimate.previous_others())
             gradient, previous = session.adjoint_pair(parameters, on_images.previous, paths, weights, weights_previous)
         if pair_request is not None and difference_spp is not None:
             samples = frame.request(difference_spp, key.fold(2).uint32())
-            both = (derivative(arrays.add_first_axis(image)) for image in (mean, found.previous_mean()))
+            both = (derivative(arrays.add_first_axis(image)) for image in (mean, image_estimate.previous_mean()))
             further = _paths(session, parameters, samples, pair_request)
             paired, previous = session.adjoint_pair(parameters, pair_request.previous, further, *both)
             traced += difference_spp
         fresh: Tree = {}
-        if self.fresh and found.fresh is not None:
-            fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, found, others, weights))
+        if self.fresh and image_estimate.fresh is not None:
+            fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, image_estimate, others, weights))
         draws = None
         if self.tangents and isinstance(frame, PixelBatch):
             draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, self.tangents))
         elif self.tangents and counts is not None:
             draws = _view_statistics(counts, weights, session.tangent_moment(parameters, paths, self.tangents))
-        told = None
+        connections = None
         if self.emitters is not None and self.emitters.tangents:
-            told = emitter_selection.connections(session, parameters, self.emitters.tangents, found, weights, spp)
+            connections = emitter_selection.connections(
+                session, parameters, self.emitters.tangents, image_estimate, weights, spp
+            )
         pixels = traced * frame.pixels
-        return FrameGradient(gradient, paired, previous, fresh, loss, mean, pixels, found.info, kept, draws, told)
+        return FrameGradient(
+            gradient, paired, previous, fresh, loss, mean, pixels, image_estimate.info, kept, draws, connections
+        )
 
 
 class GatheredFrames:
-    """The parts of a step's frames: gradients are summed as they come.
+    """The contributions of the frames of a step: gradients are summed in the order of arrival.
 
     Args:
-        request: what is estimated.
-        frames: in the order of their parts.
+        request: the request of the step.
+        frames: the frames, in the order of their contributions.
     """
 
     def __init__(self, request: GradientRequest, frames: Sequence[Frame]):
@@ -184,7 +189,7 @@ class GatheredFrames:
         self._parts: list[FrameGradient] = []
 
     def add(self, part: FrameGradient) -> None:
-        """Add the part of the next frame."""
+        """Add the contribution of the next frame."""
         for name, total in self._sums.items():
             total.add(getattr(part, name))
         self._parts.append(replace(part, **{name: {} for name in TREES}))
@@ -201,7 +206,7 @@ class GatheredFrames:
                 images[frame.view] = part.image
                 for name, value in part.info.items():
                     info.setdefault(name, {})[frame.view] = value
-        told = [part.connections for part in parts if part.connections is not None]
+        connections = [part.connections for part in parts if part.connections is not None]
         return GradientSample(
             **{name: total.result() for name, total in self._sums.items()},
             losses=[part.loss for part in parts],
@@ -209,59 +214,60 @@ class GatheredFrames:
             samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
             info=info,
             image=_image_state(problem, self._request, batch.sample if batch else None, parts),
-            draws=_joined([part.draws for part in parts if part.draws is not None]),
-            connections=functools.reduce(operator.add, told) if told else None,
+            draws=_concatenated([part.draws for part in parts if part.draws is not None]),
+            connections=functools.reduce(operator.add, connections) if connections else None,
         )
 
 
 def leave_one_out_groups(spp: int, adjoint_spp: int | None = None) -> int:
-    """How many groups `spp` samples are divided into; 1 where they cannot be, or where the adjoint has paths of its own."""
+    """Return the number of groups that `spp` samples are divided into; 1 if they cannot be divided, or if the adjoint has separate
+    paths."""
     return 1 if adjoint_spp is not None else max(n for n in range(1, _MOST_GROUPS + 1) if spp % n == 0)
 
 
 def draws_pixels(pixels: PixelSampler) -> bool:
-    """Whether a pixel sampler has mini-batches; the others render whole views at each step."""
+    """Return whether a pixel sampler has mini-batches; the others render full views at each step."""
     return not isinstance(pixels, (All, AdaptiveCounts))
 
 
 def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, adjoint_spp: int | None = None) -> None:
-    """Raise `InputError` for what is no pixel sampler, for mini-batches or counts where the image estimator needs whole views of equal
-    counts, or where the samples are too few to be counted out.
+    """Raise `InputError` for an invalid pixel sampler, for mini-batches or sample counts that the image estimator does not support, or
+    for too few samples.
 
     Args:
-        owner: for messages.
+        owner: class name for messages.
         pixels: the sampler.
         image: the image estimator.
-        fewest: the samples per pixel, the fewest of any gradient of a step.
+        fewest: minimum number of samples per pixel of any gradient of a step.
         adjoint_spp: see `PathGradient`.
     """
     if isinstance(pixels, type) or not isinstance(pixels, _PixelSampler):
         raise InputError(f"{owner}: pixels must be one of unrender.pixels, such as All(), got {pixels!r}")
     if not isinstance(pixels, All) and not image.pixelwise:
-        raise InputError(f"{owner}: {type(image).__name__} needs whole views; use pixels=unrender.pixels.All()")
+        raise InputError(f"{owner}: {type(image).__name__} needs full views; use pixels=unrender.pixels.All()")
     if not isinstance(pixels, AdaptiveCounts):
         return
     if adjoint_spp is not None:
-        raise InputError(f"{owner}: AdaptiveCounts has its adjoint on the image's paths; leave adjoint_spp out")
+        raise InputError(f"{owner}: AdaptiveCounts uses the image's paths for the adjoint; leave out adjoint_spp")
     if fewest <= pixels.least:
         raise InputError(
-            f"{owner}: AdaptiveCounts has {pixels.least} samples in each pixel and more in some, so spp must be {pixels.least + 1} "
-            f"or more, got {fewest}"
+            f"{owner}: spp must be at least {pixels.least + 1}, got {fewest}; AdaptiveCounts takes {pixels.least} samples in each "
+            "pixel and more in some"
         )
 
 
 def _image_state(
     problem: Problem, request: GradientRequest, sample: PixelSample | None, parts: list[FrameGradient]
 ) -> Any:
-    """The image estimator's next."""
+    """Return the next state of the image estimator."""
     image, state = request.image, request.state
     if sample is not None:
         return image.learn(problem, state, sample, parts[0].kept)
     return image.advance(request.parameters, state, tuple(part.kept for part in parts))
 
 
-def _joined(draws: list[DrawStatistics]) -> DrawStatistics | None:
-    """Of all frames, one after the other."""
+def _concatenated(draws: list[DrawStatistics]) -> DrawStatistics | None:
+    """Concatenate the statistics of all frames."""
     if len(draws) <= 1:
         return draws[0] if draws else None
     squares, moments = (np.concatenate([getattr(part, name) for part in draws]) for name in ("squares", "moments"))
@@ -270,7 +276,7 @@ def _joined(draws: list[DrawStatistics]) -> DrawStatistics | None:
 
 @dataclass(frozen=True)
 class FrameGradient:
-    """The part of one frame in a `GradientSample`; `kept` is its contribution to the image estimator's next state."""
+    """Contribution of one frame to a `GradientSample`. `kept` is its contribution to the image estimator's next state."""
 
     gradient: Tree
     paired: Tree
@@ -286,7 +292,8 @@ class FrameGradient:
 
 
 def _draw_statistics(frame: PixelBatch, weights: Array, moments: Array) -> DrawStatistics:
-    """From the weights of the adjoint (groups, N, 3) and the squared derivatives of its paths, of the same shape or of one group (N, 3).
+    """Return the statistics from the weights of the adjoint (groups, N, 3) and the squared derivatives of its paths, of the same shape
+    or of one group (N, 3).
 
     Each is unbiased; their product is not, since the weights of one group come from the paths of another.
     """
@@ -298,7 +305,7 @@ def _draw_statistics(frame: PixelBatch, weights: Array, moments: Array) -> DrawS
 
 
 def _view_statistics(counts: SampleCounts, weights: Array, moments: Array) -> DrawStatistics:
-    """Likewise of a whole view: from the weights of its samples (1, N, 3), and their squared derivatives (N, 3)."""
+    """Return the statistics of a full view, from the weights of its samples (1, N, 3), and their squared derivatives (N, 3)."""
     derivative = weights * counts.spread(counts.divisors)
     means = [arrays.rows(counts.means(x)) for x in (derivative * derivative, moments)]
     arrays.evaluate(means)
@@ -307,7 +314,7 @@ def _view_statistics(counts: SampleCounts, weights: Array, moments: Array) -> Dr
 
 
 def _derivative(problem: Problem, frame: Frame, variance: Array | None, tolerance: float) -> Callable[[Array], Array]:
-    """The loss derivative of a frame's images; damped where the variance of its image is known, and the loss biased by it."""
+    """Return the loss derivative of a frame's images, damped if the loss is biased by noise and the variance of the image is known."""
     loss = problem.loss
     if variance is None or not tolerance or loss.linear or not loss.pixelwise:
         return frame.loss_derivative
@@ -322,23 +329,25 @@ def _derivative(problem: Problem, frame: Frame, variance: Array | None, toleranc
 
 
 def _variance_by_views(variance: Array, complete: Sequence[tuple[slice, tuple[int, int]]]) -> Array:
-    """Return `smoothed_variance` of the pixels (N, 3) of complete views; 0 for the pixels that fill up the batch after them."""
+    """Return `smoothed_variance` of the pixels (N, 3) of complete views; 0 for the padding pixels after them."""
     parts = [arrays.rows(smoothed_variance(arrays.reshape(variance[rows], (*size, 3)))) for rows, size in complete]
     rest = variance[complete[-1][0].stop :]
     return arrays.concatenate([*parts, rest * 0.0] if int(arrays.shape(rest)[0]) else parts)
 
 
-def fresh_weights(problem: Problem, frame: Frame, found: ImageEstimate, others: Array, weights: Array) -> Array:
-    """The loss derivative at this step's samples alone; where it is not linear, along its secant at the image that the loss sees: L1's own
-    would be the sign of the noise.
+def fresh_weights(problem: Problem, frame: Frame, image: ImageEstimate, others: Array, weights: Array) -> Array:
+    """Return the loss derivative at this step's samples alone.
+
+    If the derivative is not linear, it is taken along the secant at the image that the loss sees, since L1's own would be the sign of
+    the noise.
 
     Args:
-        problem, frame: whose loss and reference.
-        found: the image.
+        problem, frame: they determine loss and reference.
+        image: image estimate.
         others: its leave-one-out images.
-        weights: the loss derivative at these; of a loss that is not linear, damped (`tolerance`), or the secant has no bound.
+        weights: loss derivative at these; it must be damped (`tolerance`) if it is not linear, since the secant would be unbounded.
     """
-    fresh = found.fresh_others()
+    fresh = image.fresh_others()
     if problem.loss.linear or not isinstance(frame, WholeView):
         return frame.loss_derivative(fresh)
     reference = frame.expand(problem.reference(frame.view))

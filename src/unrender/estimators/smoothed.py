@@ -1,4 +1,4 @@
-"""Derivatives of the loss from renders at perturbed parameters alone, smoothed by a Gaussian (Wang et al., section 3)."""
+"""Derivatives of the loss, smoothed by a Gaussian, from renders at perturbed parameters (Wang et al., section 3)."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ from unrender.scene.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
 from unrender.statistics import diagonal_curvature
 
-_MOST_KEPT = 4096
-"""Parameters up to which a Hessian is kept between steps."""
+_MAX_STORED = 4096
+"""Maximum number of parameters for which a Hessian is stored between steps."""
 _DIRECTIONS = 1
-"""The stream of random numbers of the directions of products; 0 is that of the draws."""
+"""Stream of random numbers for the directions of products; 0 is for the perturbations."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class SmoothedState:
     """State between steps.
 
     Attributes:
-        age: the argument of the schedule of σ: the steps made or, with `adaptive_annealing`, the sum of their convergence measures.
-        hessian: with `hessian_rate`, the Hessian kept between steps, in units of σ, (n, n), or its diagonal, (n,); None before the
+        age: argument of the schedule of σ: the number of steps or, with `adaptive_annealing`, the sum of their convergence measures.
+        hessian: with `hessian_rate`, the Hessian stored between steps, in units of σ, (n, n), or its diagonal, (n,); None before the
             first step.
     """
 
@@ -60,70 +60,70 @@ class SmoothedState:
     hessian: np.ndarray | None = None
 
     def upsampled(self, upsampler: Upsampler) -> SmoothedState:
-        """See `Upsamplable`: the Hessian begins anew."""
+        """Return the state without its Hessian, which is estimated again."""
         del upsampler
         return replace(self, hessian=None)
 
     def restarted(self, fresh: SmoothedState) -> SmoothedState:
-        """See `Restartable`: the schedule of σ goes on."""
+        """Return the state of the schedule of σ with a new Hessian."""
         return replace(self, hessian=fresh.hessian)
 
 
 @register
 @dataclass(frozen=True)
 class SmoothedDerivatives:
-    """∇ S L, and ∇² S L or its products with vectors: S smooths the loss L over the parameters by a Gaussian of deviation σ.
+    """∇ S L, and ∇² S L or its products with vectors: S smooths the loss L over the parameters by a Gaussian of standard deviation σ.
 
-    The renderer is a black box, never differentiated, so plateaus, silhouettes, shadows and poses (`rendering/mitsuba/poses.py`) are
-    included. All perturbations of a step share the random numbers of their renders, so that differences are of the parameters and not
-    of the noise. Perturbed parameters are projected onto their bounds before they are rendered.
+    The renderer is a black box and never differentiated, so plateaus, silhouettes, shadows and poses (`rendering/mitsuba/poses.py`) are
+    supported. All perturbations of a step share the random numbers of their renders, so differences are due to the parameters, not to
+    noise. Perturbed parameters are projected onto their bounds before they are rendered.
 
-    A parameter with a preconditioner S is perturbed along the steps that it allows, by S ε in place of ε, scaled to σ in the mean square:
-    neighbouring vertices or texels move alike. Derivatives are then by v, where the parameter is S v, of the loss smoothed by that
-    Gaussian of covariance S². For meshes and textures of thousands of elements: the noise of a gradient grows with the number of
-    directions, and those are fewer.
+    A parameter with a preconditioner S is perturbed by S ε instead of ε, scaled to σ in the root mean square, so neighbouring vertices
+    or texels move alike. Derivatives are then by v, where the parameter is S v, of the loss smoothed by that Gaussian of covariance S².
+    Use it for meshes and textures of thousands of elements: the noise of a gradient grows with the number of directions, which S
+    reduces.
 
-    Unbiased for the derivative of the smoothed expected loss of images at `spp` samples, whose noise adds to the loss, unless it is
-    `debiased`; but products that are not `joint` have the bias of their central difference (`smoothed.hvp`).
+    Unbiased for the derivative of the smoothed expected loss of images at `spp` samples. Their noise adds to the loss unless it is
+    `debiased`. Products that are not `joint` have the bias of their central difference (`smoothed.hvp`).
 
     Args:
         sigma: σ in units of the parameters, > 0 (with a preconditioner the root mean square of a perturbation): one number, or
             {key: number}, where "*" stands for all keys that are not named.
-        samples: renders per view and derivative, >= 4; without `aggregate`, per element of the derivative too.
+        samples: renders per view and derivative, >= 4; without `aggregate`, per element of the derivative as well.
         order: "gradient", "hessian" (n × n, for few parameters), or "hvp".
-        aggregate: one draw from the mixture over all elements serves all of them (section 3.5); otherwise each element has its own.
-        product: every dimension from its own gradient kernel at once, in place of `aggregate`: the gradient of Fischer and
-            Ritschel 2023, "FR22" in the paper, whose smoothing is not a Gaussian's; gradients only.
-        joint: with "hessian" and "hvp", gradient and curvature from the same renders (`smoothed.joint`), so that curvature costs
-            nothing. Without, as the paper has it: a Hessian from draws of its own, products by the difference of two gradients, each
-            taking twice `samples` renders. `aggregate` and `baseline` are for that.
+        aggregate: one sample of the mixture over all elements serves all of them (section 3.5); otherwise each element has its own.
+        product: sample every dimension from its own gradient kernel at once, instead of `aggregate`: the gradient of Fischer and
+            Ritschel 2023, "FR22" in the paper, whose smoothing kernel is not a Gaussian; gradients only.
+        joint: with "hessian" and "hvp", gradient and curvature from the same renders (`smoothed.joint`), so curvature is free.
+            Otherwise, as in the paper, a Hessian has its own samples, and products are differences of two gradients, each with twice
+            `samples` renders. `aggregate` and `baseline` apply to the latter.
         antithetic, baseline, low_discrepancy: see `unrender.smoothed`.
         spp: samples per pixel of a render, >= 1.
-        debiased: leave out what the noise of the images adds to the loss: from two halves of the samples with mean images A and B, the
-            loss is 2 L((A + B) / 2) − (L(A) + L(B)) / 2. Unbiased for a loss that is quadratic in the image (`loss.linear`), with the
-            bias of the noise's fourth power for others that are smooth. Takes two launches, and 2 samples at least.
-        epsilon: of products by differences, in units of σ, > 0 (see `unrender.smoothed.hvp`): images of edges jump, so more than the
-            default there.
+        debiased: remove the noise bias of the loss: from two halves of the samples with mean images A and B, the
+            loss is 2 L((A + B) / 2) − (L(A) + L(B)) / 2. Unbiased for a loss that is quadratic in the image (`loss.linear`); for other
+            smooth losses the remaining bias is of fourth order in the noise. Takes two launches, and at least 2 samples.
+        epsilon: ε of products by differences, in units of σ, > 0 (see `unrender.smoothed.hvp`): images are discontinuous at edges, so
+            it is larger than the default there.
         schedule: factor of σ by step, e.g. `schedules.Exponential(100)`; see `unrender.schedules.functions`.
-        adaptive_annealing: let the schedule of σ advance by convergence in place of steps. A step advances it by the mean over the root
-            mean square, if positive, of the losses at the perturbed points less the loss at the parameters, which the gradient has
-            evaluated anyway. That is near 1 at a minimum of the smoothed loss (0.6 to 0.8 for one parameter, with noise less), and 0
-            on a slope or a plateau, of whatever length. So σ shrinks after convergence at the present σ; half-lives are shorter, e.g.
-            `Exponential(6)`. For few parameters: with many, the curvature in all other directions outweighs the slope in one, and the
-            schedule advances at every step.
-        hessian_rate: ω in (0, 1], for "hvp": products are of a Hessian that is kept between steps in units of σ, (n, n), so that all
-            products of a step are free. None, the default: of this step's renders alone. Joint, the kept matrix B moves by ω toward
-            this step's Hessian. Otherwise each step estimates one product h along a random direction v, by the difference of two
-            gradients whose mean is the step's gradient, with `samples` renders for both in one launch, and moves B by ω toward the
-            nearest symmetric matrix with B v = h (Powell's symmetric Broyden update; Gower and Richtárik 2017 on random directions).
-            The first B is vᵀh times the identity. Costs n² memory, and is refused above 4096 parameters. Old curvature is a bias of
-            products, not of the gradient.
-        hessian_form: "full", or "diagonal": with `hessian_rate`, the diagonal alone is kept, (n,), for many parameters that hardly touch
-            one another. Each draw tells one sum of its elements: zᵀ B z joint, zᵀ B v otherwise. A step moves the diagonal by ω toward the
-            nearest one with all of its sums; the first is a multiple of the identity (`statistics/diagonal_curvature.py`). Products are
-            of that diagonal with no element below 0.15 of their mean magnitude, so that it is positive definite.
-        orthogonal: see `smoothed.gradient`: with `aggregate` or `joint`, directions of draws that are orthogonal. For many parameters and
-            samples: 2 n of them (4 n for products that are not joint) tell the whole gradient of a linear loss.
+        adaptive_annealing: advance the schedule of σ by convergence instead of steps. A step advances it by the mean over the root
+            mean square, if positive, of the losses at the perturbed points minus the loss at the parameters, which the gradient has
+            evaluated already. This measure is near 1 at a minimum of the smoothed loss (0.6 to 0.8 for one parameter, less with noise),
+            and 0 on a slope or a plateau of any length. σ therefore decreases after convergence at the current σ. Half-lives are
+            shorter, e.g. `Exponential(6)`. Use it for few parameters: with many, the curvature in all other directions dominates the
+            slope in one, and the schedule advances at every step.
+        hessian_rate: ω in (0, 1], for "hvp": products use a Hessian that is stored between steps in units of σ, (n, n), so all
+            products of a step are free. None, the default: products use this step's renders only. With `joint`, the stored matrix B
+            moves by ω towards this step's Hessian. Otherwise each step estimates one product h along a random direction v, by the
+            difference of two gradients whose mean is the step's gradient, with `samples` renders for both in one launch, and moves B by
+            ω towards the nearest symmetric matrix with B v = h (Powell's symmetric Broyden update; Gower and Richtárik 2017 on random
+            directions). The first B is vᵀh times the identity. Costs n² memory, and is refused above 4096 parameters. Old curvature
+            biases products, not the gradient.
+        hessian_form: "full", or "diagonal": with `hessian_rate`, only the diagonal is stored, (n,), for many weakly coupled parameters.
+            Each sample determines one sum of its elements: zᵀ B z if joint, zᵀ B v otherwise. A step moves the diagonal by ω towards
+            the nearest one that satisfies all sums; the first is a multiple of the identity (`statistics/diagonal_curvature.py`).
+            Products use this diagonal with elements of at least 0.15 times their mean magnitude, so that it is positive definite.
+        orthogonal: see `smoothed.gradient`: with `aggregate` or `joint`, sample orthogonal directions. Use it for many parameters and
+            samples: 2 n of them (4 n for products that are not joint) determine the full gradient of a linear loss.
     """
 
     sigma: float | Mapping[str, float]
@@ -148,7 +148,7 @@ class SmoothedDerivatives:
         if self.order not in ("gradient", "hessian", "hvp"):
             raise InputError(f'SmoothedDerivatives: order must be "gradient", "hessian" or "hvp", got {self.order!r}')
         if self.product and self.order != "gradient":
-            raise InputError(f'SmoothedDerivatives: product=True goes with order="gradient", got {self.order!r}')
+            raise InputError(f'SmoothedDerivatives: product=True requires order="gradient", got {self.order!r}')
         for name, value in self.sigma.items() if isinstance(self.sigma, Mapping) else [("sigma", self.sigma)]:
             checks.number("SmoothedDerivatives", f"sigma of {name}" if name != "sigma" else name, value, above=0.0)
         checks.integer("SmoothedDerivatives", "samples", self.samples, at_least=16 if self.low_discrepancy else 4)
@@ -159,21 +159,23 @@ class SmoothedDerivatives:
                 f'SmoothedDerivatives: hessian_form must be "full" or "diagonal", got {self.hessian_form!r}'
             )
         if self.hessian_form == "diagonal" and self.hessian_rate is None:
-            raise InputError('SmoothedDerivatives: hessian_form="diagonal" goes with hessian_rate')
+            raise InputError('SmoothedDerivatives: hessian_form="diagonal" requires hessian_rate')
         joint = self.joint and self.order != "gradient"
         if self.orthogonal and (self.low_discrepancy or not (joint or self.aggregate) or self.product):
-            raise InputError("SmoothedDerivatives: orthogonal draws need aggregate, and no sequence or product")
+            raise InputError(
+                "SmoothedDerivatives: orthogonal requires aggregate, and neither low_discrepancy nor product"
+            )
         if self.hessian_rate is not None:
             if checks.number("SmoothedDerivatives", "hessian_rate", self.hessian_rate, above=0.0) > 1.0:
                 raise InputError(f"SmoothedDerivatives: hessian_rate must be at most 1, got {self.hessian_rate!r}")
             if self.order != "hvp":
-                raise InputError(f'SmoothedDerivatives: hessian_rate goes with order="hvp", got {self.order!r}')
+                raise InputError(f'SmoothedDerivatives: hessian_rate requires order="hvp", got {self.order!r}')
             if not (self.joint or (self.aggregate and self.antithetic)):
-                raise InputError("SmoothedDerivatives: hessian_rate needs aggregate and antithetic draws")
+                raise InputError("SmoothedDerivatives: hessian_rate requires aggregate and antithetic")
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient with its variance and σ, the loss at any points, and what `order` says."""
+        """A gradient with its variance and σ, the loss at any points, and the curvature that `order` selects."""
         common = (Gradient, Variance, LossFunction)
         match self.order:
             case "gradient":
@@ -184,24 +186,24 @@ class SmoothedDerivatives:
                 return Capabilities(*common, HessianProduct)
 
     def init(self, problem: Problem, parameters: Tree) -> SmoothedState:
-        """See `Estimator.init`. Raises `InputError` where a parameter cannot be perturbed or has no σ, or where one has a preconditioner
-        and one a parameterisation."""
+        """Return the state before the first step. Raise `InputError` if a parameter cannot be perturbed or has no σ, or if one has a
+        preconditioner and one a parameterisation."""
         PreconditionedPerturbations(problem, parameters)
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         self._sigma_per_parameter(parameters)
         size = vectors.ravel(parameters).size
-        if self.hessian_rate is not None and self.hessian_form == "full" and size > _MOST_KEPT:
+        if self.hessian_rate is not None and self.hessian_form == "full" and size > _MAX_STORED:
             raise InputError(
-                f"SmoothedDerivatives: hessian_rate keeps a matrix of {size} × {size} elements, too many: "
-                f'leave it out above {_MOST_KEPT} parameters, or keep hessian_form="diagonal"'
+                f"SmoothedDerivatives: hessian_rate would store a matrix of {size} × {size} elements, which is too large; "
+                f'leave it out above {_MAX_STORED} parameters, or use hessian_form="diagonal"'
             )
         return SmoothedState()
 
     def estimate(
         self, problem: Problem, parameters: Tree, state: SmoothedState, key: Key
     ) -> tuple[Estimate, SmoothedState]:
-        """See `Estimator.estimate`. `info`: "samples" (paths traced, those of products included), "images" per view
-        at the parameters themselves."""
+        """Return an estimate and the next state. `info`: "samples" (paths traced, including those of products), "images" per view at
+        the parameters."""
         box = BlackBox(problem, parameters, self.spp, key.fold(0), self.debiased)
         factor = self.schedule(state.age) if self.schedule else 1.0
         smooth = PreconditionedPerturbations(problem, parameters)
@@ -217,7 +219,7 @@ class SmoothedDerivatives:
         point = vectors.ravel(parameters), vectors.repeat_per_element(sigma, parameters)
         seed, hessian = key.fold(1).uint32(), state.hessian
         if self.hessian_rate is not None:
-            gradient, error, hessian = self._kept(record_losses, *point, seed, hessian, self.hessian_rate)
+            gradient, error, hessian = self._stored_hessian(record_losses, *point, seed, hessian, self.hessian_rate)
             width = point[1]
             if self.hessian_form == "diagonal":
                 used, multiply = diagonal_curvature.positive(hessian), np.multiply
@@ -234,23 +236,25 @@ class SmoothedDerivatives:
             LossFunction(evaluate),
             Smoothing(sigma),
         )
-        found = Estimate(
+        estimate = Estimate(
             box.center(), vectors.unravel(gradient, parameters), capabilities, box.info, preconditioned=bool(smooth)
         )
-        age = state.age + (_convergence(losses, found.loss) if self.adaptive_annealing else 1.0)
-        return found, SmoothedState(age, hessian)
+        age = state.age + (_convergence(losses, estimate.loss) if self.adaptive_annealing else 1.0)
+        return estimate, SmoothedState(age, hessian)
 
     def _joint(
         self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int, like: Tree
     ) -> tuple[np.ndarray, np.ndarray, tuple[Capability, ...]]:
-        """The gradient (n,), its standard error (n,), and the curvature that `order` asks for: all from the same renders."""
-        found = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
-        return *found.gradient(), self._curvature(lambda: found.hessian()[0], lambda v: found.hvp(v)[0], like)
+        """Return the gradient (n,), its standard error (n,), and the curvature that `order` selects, all from the same renders."""
+        derivatives = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
+        return *derivatives.gradient(), self._curvature(
+            lambda: derivatives.hessian()[0], lambda v: derivatives.hvp(v)[0], like
+        )
 
     def _separate(
         self, f: smoothed.Function, theta: np.ndarray, sigma: np.ndarray, seed: int, like: Tree
     ) -> tuple[np.ndarray, np.ndarray, tuple[Capability, ...]]:
-        """As `_joint`, each derivative from renders of its own."""
+        """Return the results of `_joint`, with separate renders for each derivative."""
         options = self._options(seed)
         gradient, error = estimate_gradient(f, theta, sigma, options)
 
@@ -260,34 +264,35 @@ class SmoothedDerivatives:
         curvature = self._curvature(lambda: estimate_hessian(f, theta, sigma, options)[0], product, like)
         return gradient, error, curvature
 
-    def _kept(
+    def _stored_hessian(
         self,
         f: smoothed.Function,
         theta: np.ndarray,
         sigma: np.ndarray,
         seed: int,
-        kept: np.ndarray | None,
+        stored: np.ndarray | None,
         rate: float,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The gradient (n,), its standard error (n,), and the Hessian kept between steps after this one, in units of σ: (n, n), or its
-        diagonal (n,)."""
+        """Return the gradient (n,), its standard error (n,), and the updated Hessian in units of σ: (n, n), or its diagonal (n,)."""
         if self.joint:
-            found = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
+            derivatives = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
             if self.hessian_form == "diagonal":
-                return *found.gradient(), _diagonal(kept, found.draws * found.draws, found.curvatures, rate)
-            hessian = found.hessian()[0] * np.outer(sigma, sigma)
-            return *found.gradient(), hessian if kept is None else kept + rate * (hessian - kept)
+                return *derivatives.gradient(), _diagonal(
+                    stored, derivatives.draws * derivatives.draws, derivatives.curvatures, rate
+                )
+            hessian = derivatives.hessian()[0] * np.outer(sigma, sigma)
+            return *derivatives.gradient(), hessian if stored is None else stored + rate * (hessian - stored)
         v = np.random.default_rng([seed, _DIRECTIONS]).standard_normal(theta.size)
         v /= np.linalg.norm(v)
         both = estimate_gradient_and_product(f, theta, sigma * v, sigma, self._options(seed))
         gradient, error, product = both.gradient, both.error, sigma * both.product
         if self.hessian_form == "diagonal":
-            return gradient, error, _diagonal(kept, both.draws * v, both.changes, rate)
-        if kept is None:
-            kept, rate = float(v @ product) * np.eye(theta.size), 1.0
-        missing = product - kept @ v
+            return gradient, error, _diagonal(stored, both.draws * v, both.changes, rate)
+        if stored is None:
+            stored, rate = float(v @ product) * np.eye(theta.size), 1.0
+        missing = product - stored @ v
         update = np.outer(missing, v) + np.outer(v, missing) - float(v @ missing) * np.outer(v, v)
-        return gradient, error, kept + rate * update
+        return gradient, error, stored + rate * update
 
     def _options(self, seed: int) -> SamplingOptions:
         return SamplingOptions(
@@ -314,28 +319,28 @@ class SmoothedDerivatives:
                 return (HessianProduct(lambda v: vectors.unravel(product(vectors.ravel(v)), like)),)
 
     def _sigma_per_parameter(self, parameters: Tree) -> dict[str, float]:
-        """σ of each parameter before the schedule. Raises `InputError` for a key that is unknown or missing."""
+        """Return σ of each parameter before the schedule. Raise `InputError` for a key that is unknown or missing."""
         if not isinstance(self.sigma, Mapping):
             return dict.fromkeys(parameters, float(self.sigma))
         for key in self.sigma:
             if key != "*" and key not in parameters:
                 hint = did_you_mean(key, parameters)
-                raise InputError(f"SmoothedDerivatives: sigma names {key}, which is none of the parameters{hint}")
+                raise InputError(f"SmoothedDerivatives: sigma names {key}, which is not a parameter{hint}")
         missing = [key for key in parameters if key not in self.sigma and "*" not in self.sigma]
         if missing:
             raise InputError(f"SmoothedDerivatives: sigma has no entry for parameter {missing[0]}")
         return {key: float(self.sigma[key] if key in self.sigma else self.sigma["*"]) for key in parameters}
 
 
-def _diagonal(kept: np.ndarray | None, rows: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
-    """The diagonal (n,) after the draws of a step, of which each tells rows[b] · diagonal = values[b]."""
-    before = np.full(rows.shape[1], diagonal_curvature.isotropic(rows, values)) if kept is None else kept
+def _diagonal(stored: np.ndarray | None, rows: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
+    """Return the updated diagonal (n,), where each sample requires rows[b] · diagonal = values[b]."""
+    before = np.full(rows.shape[1], diagonal_curvature.isotropic(rows, values)) if stored is None else stored
     return diagonal_curvature.corrected(before, rows, values, rate)
 
 
 def _convergence(losses: np.ndarray, center: float) -> float:
-    """How far the descent has converged at the present σ, in [0, 1]: mean over root mean square of `losses` (B,) less the loss at the
-    parameters; 0 where the mean is negative."""
+    """Return a measure of convergence at the current σ, in [0, 1]: mean over root mean square of `losses` (B,) minus the loss at the
+    parameters; 0 if the mean is negative."""
     differences = losses - center
     root_mean_square = float(np.sqrt(np.mean(differences * differences)))
     return max(0.0, float(np.mean(differences))) / root_mean_square if root_mean_square > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""The gradient of the loop that people have, to be compared with."""
+"""Gradient of a standard Mitsuba optimisation loop, as a baseline."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class StockState:
     """State between steps.
 
     Attributes:
-        path: of the path gradient that takes its place; None where the renderer has a stock loop.
+        path: state of the path gradient that replaces it; None if the renderer has a stock loop.
     """
 
     path: PathGradientState | None = None
@@ -31,16 +31,17 @@ class StockState:
 @register
 @dataclass(frozen=True)
 class StockGradient:
-    """The gradient of a stock Mitsuba loop: `mi.render` of each view, the loss, `dr.backward`; image and adjoint from independent
-    samples. With `optimizers.Adam`, whose steps are those of `mi.ad.Adam`, it is the loop of Mitsuba's tutorials.
+    """The gradient of a standard Mitsuba loop: `mi.render` of each view, the loss, `dr.backward`, with independent samples for image
+    and adjoint.
 
-    Neighbouring pixels share samples here, as in Mitsuba's film; everywhere else in `unrender` each has its own. Renderers other than
-    Mitsuba's answer with `PathGradient(spp=spp, adjoint_spp=spp)`, which estimates the same from the same number of samples.
+    With `optimizers.Adam`, whose steps are those of `mi.ad.Adam`, it is the loop of Mitsuba's tutorials. Neighbouring pixels share
+    samples, as in Mitsuba's film; elsewhere in `unrender` each pixel has its own samples. For renderers other than Mitsuba, it is
+    `PathGradient(spp=spp, adjoint_spp=spp)`, which estimates the same from the same number of samples.
 
     Unbiased for a loss whose derivative is linear in the image; otherwise biased by the image's noise.
 
     Args:
-        spp: samples per pixel and view of the image, and as many of the adjoint, >= 1.
+        spp: samples per pixel and view of the image, and again of the adjoint, >= 1.
     """
 
     spp: int = 16
@@ -54,24 +55,24 @@ class StockGradient:
         return Capabilities(Gradient)
 
     def init(self, problem: Problem, parameters: Tree) -> StockState:
-        """See `Estimator.init`. Raises `InputError` for a parameter that Mitsuba cannot differentiate."""
+        """Return the state before the first step. Raise `InputError` for a parameter that Mitsuba cannot differentiate."""
         problem.renderer.prepare(list(parameters), None)
         known = problem.renderer.parameters()
         if camera := next((key for key in parameters if known[key].viewpoint), ""):
             raise InputError(
-                f"parameter {camera}: Mitsuba's loop has no gradient of what moves a sensor; --method plain has"
+                f"parameter {camera}: Mitsuba's loop has no gradient by the pose of a sensor; use --method plain"
             )
         if isinstance(problem.renderer, StockRenderer):
             return StockState()
         return StockState(self._path.init(problem, parameters))
 
     def estimate(self, problem: Problem, parameters: Tree, state: StockState, key: Key) -> tuple[Estimate, StockState]:
-        """See `Estimator.estimate`. `info`: "samples" (paths traced for images and adjoints), "images" per view."""
+        """Return an estimate and the next state. `info`: "samples" (paths traced for images and adjoints), "images" per view."""
         renderer = problem.renderer
         if state.path is not None or not isinstance(renderer, StockRenderer):
             path = state.path or self._path.init(problem, parameters)
-            found, path = self._path.estimate(problem, parameters, path, key)
-            return found, StockState(path)
+            estimate, path = self._path.estimate(problem, parameters, path, key)
+            return estimate, StockState(path)
         loop = renderer.stock()
         parts, losses, images, samples = [], [], {}, 0
         for index, view in enumerate(problem.views):

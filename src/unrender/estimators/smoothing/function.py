@@ -2,9 +2,9 @@
 
     value, error = ur.smoothed.gradient(f, theta, sigma=0.1, samples=256)
 
-`f` takes a batch of points (B, n) to values (B,) and is never differentiated: it may have plateaus, jumps, noise. What is returned is a
-derivative of its convolution S f with a Gaussian of standard deviation σ (a number, or one per dimension), estimated without bias,
-and its standard error. See `statistics/gaussian.py` for the kernels and how they are sampled.
+`f` maps a batch of points (B, n) to values (B,) and is never differentiated: it may have plateaus, discontinuities and noise. The
+result is a derivative of its convolution S f with a Gaussian of standard deviation σ (a number, or one per dimension), estimated
+without bias, and its standard error. See `statistics/gaussian.py` for the kernels and their sampling.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ def gradient(
     product: bool = False,
     orthogonal: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """∇ S f(θ) and its standard error, (n,) each.
+    """Estimate ∇ S f(θ) and its standard error, (n,) each.
 
     Args:
         f: (B, n) to (B,).
         theta: (n,).
         sigma: standard deviation of the smoothing, > 0: a number, or (n,).
-        samples: how often f is evaluated, for all elements together with `aggregate`, for each of them without; at least 4, and at least
-            16 with `low_discrepancy`.
-        seed: of the draws.
-        aggregate: draw from the mixture over all elements, each draw serving all; otherwise from each element's own kernel.
-        antithetic: draw in pairs z, −z: exact for functions that are even or linear where they should be.
-        baseline: subtract f(θ), at the cost of one evaluation, where the draws are not antithetic (there it cancels).
-        low_discrepancy: draw from scrambled Sobol sequences; the standard error then is that of 8 scramblings.
-        product: in place of `aggregate`, draw every dimension from its own gradient kernel at once, as Fischer and Ritschel 2023
-            ("Plateau-reduced differentiable path tracing") do: one draw serves all elements, each with a constant magnitude of
-            weight. Biased for n > 1: element i is smoothed by the Gaussian along i, and by |z| φ(z), which has two humps, along
+        samples: number of evaluations of f: for all elements together with `aggregate`, for each element otherwise; at least 4, and at
+            least 16 with `low_discrepancy`.
+        seed: random seed of the perturbations.
+        aggregate: sample from the mixture over all elements, so that each sample serves all; otherwise from each element's own kernel.
+        antithetic: sample pairs z, −z: exact for functions with the parity of the kernel.
+        baseline: subtract f(θ), at the cost of one evaluation, without `antithetic` (with which it cancels).
+        low_discrepancy: use scrambled Sobol sequences; the standard error is then that of 8 scramblings.
+        product: instead of `aggregate`, sample every dimension from its own gradient kernel at once, as Fischer and Ritschel 2023
+            ("Plateau-reduced differentiable path tracing") do: one sample serves all elements, each with a weight of constant
+            magnitude. Biased for n > 1: element i is smoothed by the Gaussian along i, and by the bimodal |z| φ(z) along
             the other dimensions.
-        orthogonal: draw directions that are orthogonal, in blocks of n, each a standard normal; in place of the mixture, with `aggregate`.
-            For many dimensions and about as many draws: n of them tell the whole gradient of a linear f, up to their lengths. The standard
-            error then is too large, since draws count as independent.
+        orthogonal: with `aggregate`, sample orthogonal directions in blocks of n, each a standard normal, instead of the mixture. Use
+            it for many dimensions and about as many samples: n of them determine the full gradient of a linear f, up to their lengths.
+            The standard error is then too large, since it assumes independent samples.
 
     Raises:
-        InputError: σ not positive, shapes that do not fit, values that are not finite.
+        InputError: σ not positive, shapes that do not match, values that are not finite.
     """
     options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy, product, orthogonal)
     return estimate_gradient(f, theta, sigma, options)
@@ -74,10 +74,10 @@ def hessian(
     low_discrepancy: bool = False,
     orthogonal: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """∇² S f(θ) and its standard error, (n, n) each, symmetric.
+    """Estimate ∇² S f(θ) and its standard error, (n, n) each, symmetric.
 
-    The arguments are those of `gradient`. The kernels are even, so `baseline` helps antithetic draws as well: without it the value of f
-    itself is noise.
+    The arguments are those of `gradient`. The kernels are even, so `baseline` reduces the variance of antithetic samples as well:
+    without it, the value of f itself is noise.
     """
     options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy, orthogonal=orthogonal)
     return estimate_hessian(f, theta, sigma, options)
@@ -96,15 +96,15 @@ def hvp(
     epsilon: float = 0.1,
     orthogonal: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """∇² S f(θ) v and its standard error, (n,) each, without a Hessian: the central difference of two gradients (Eq. 23).
+    """Estimate ∇² S f(θ) v and its standard error, (n,) each, without a Hessian: the central difference of two gradients (Eq. 23).
 
-    Both gradients take the same draws (common random numbers), so that what f has in common at θ ± ε u cancels, where u is v scaled to
-    one σ. Biased by the difference: its error is ε² / 6 times the fourth derivative of S f in units of σ. Where f jumps, the variance
-    falls with 1 / ε, and 0.3 or more serves better than the default.
+    Both gradients use the same samples (common random numbers), so common terms of f at θ ± ε u cancel, where u is v scaled to one σ.
+    The difference is biased: its error is ε² / 6 times the fourth derivative of S f in units of σ. If f is discontinuous, the variance
+    decreases with 1 / ε, and ε = 0.3 or more is better than the default.
 
     Args:
         v: (n,), the direction; its length scales the product.
-        epsilon: ε, how far θ moves to either side along v, in units of σ, > 0.
+        epsilon: ε, displacement of θ to both sides along v, in units of σ, > 0.
 
     The other arguments are those of `gradient`; `samples` counts evaluations of both gradients.
     """
@@ -115,7 +115,7 @@ def hvp(
 
 
 def estimate_gradient(f: Function, theta: Any, sigma: Any, options: SamplingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """`gradient` with its options in one object."""
+    """Evaluate `gradient` with its options in one object."""
     function = SmoothedFunction("gradient", f, theta, sigma, options)
     offset = function.value_at_theta() if options.baseline and not options.antithetic else 0.0
     if options.product:
@@ -127,7 +127,7 @@ def estimate_gradient(f: Function, theta: Any, sigma: Any, options: SamplingOpti
 
 
 def estimate_hessian(f: Function, theta: Any, sigma: Any, options: SamplingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """`hessian` with its options in one object."""
+    """Evaluate `hessian` with its options in one object."""
     function = SmoothedFunction("hessian", f, theta, sigma, options)
     offset = function.value_at_theta() if options.baseline else 0.0
     if options.aggregate:
@@ -161,7 +161,7 @@ def estimate_hessian(f: Function, theta: Any, sigma: Any, options: SamplingOptio
 def estimate_hvp(
     f: Function, theta: Any, v: Any, sigma: Any, options: SamplingOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`hvp` with its options in one object."""
+    """Evaluate `hvp` with its options in one object."""
     function = SmoothedFunction("hvp", f, theta, sigma, options, sides=2)
     direction, length = function.direction(v)
     step = checks.number("smoothed.hvp", "epsilon", options.epsilon, above=0.0)
@@ -178,14 +178,14 @@ def estimate_hvp(
 
 @dataclass(frozen=True)
 class GradientAndProduct:
-    """Of `estimate_gradient_and_product`, with u the direction v scaled to one σ.
+    """Result of `estimate_gradient_and_product`, where u is the direction v scaled to one σ.
 
     Attributes:
-        gradient: ∇ S f(θ), (n,), smoothed along v by ε σ more.
+        gradient: ∇ S f(θ), (n,), with additional smoothing along v by ε σ.
         error: its standard error, (n,).
         product: ∇² S f(θ) v, (n,).
         draws: z, (B, n), in units of σ, without dropped ones.
-        changes: of each, half the change of f(θ + σ z) − f(θ − σ z) as θ moves by u, (B,): zᵀ σ H u where f is a quadratic.
+        changes: for each, half the change of f(θ + σ z) − f(θ − σ z) as θ moves by u, (B,): zᵀ σ H u for a quadratic f.
     """
 
     gradient: np.ndarray
@@ -198,11 +198,12 @@ class GradientAndProduct:
 def estimate_gradient_and_product(
     f: Function, theta: Any, v: Any, sigma: Any, options: SamplingOptions
 ) -> GradientAndProduct:
-    """∇ S f(θ) and ∇² S f(θ) v from the same evaluations, in one call of f.
+    """Estimate ∇ S f(θ) and ∇² S f(θ) v from the same evaluations, in one call of f.
 
-    They are the mean and the difference (Eq. 23) of the gradients at θ ± ε u, u being v scaled to one σ, by the same draws. So the
-    gradient is of f smoothed along v by ε σ more. Draws are of the aggregate, and antithetic; `options.samples`, at least 4, counts
-    all evaluations. Of one draw alone, the magnitude of the gradient stands for its standard error.
+    They are the mean and the difference (Eq. 23) of the gradients at θ ± ε u, where u is v scaled to one σ, with the same samples. The
+    gradient is therefore that of f with additional smoothing along v by ε σ. Samples are from the aggregate, and antithetic;
+    `options.samples`, at least 4, counts all evaluations. For a single sample, the magnitude of the gradient replaces its standard
+    error.
     """
     function = SmoothedFunction("gradient", f, theta, sigma, options)
     function.draws = max(options.samples // 4, 1)
@@ -212,17 +213,17 @@ def estimate_gradient_and_product(
     ahead, behind = function.odd_at(z, [function.theta + side * moved for side in (1, -1)])
     kernel = gaussian.gradient_kernel(z, function.sigma) / ratio[:, None]
     draws = (0.5 * (ahead + behind))[:, None] * kernel
-    found, error = function.mean_and_error(draws) if len(z) > 1 else (draws[0], np.abs(draws[0]))
+    gradient, error = function.mean_and_error(draws) if len(z) > 1 else (draws[0], np.abs(draws[0]))
     difference = (ahead - behind) / (2 * options.epsilon)
     known = np.isfinite(difference)
     product = np.mean((difference * length)[known, None] * kernel[known], axis=0)
-    return GradientAndProduct(found, error, product, z[known], -difference[known])
+    return GradientAndProduct(gradient, error, product, z[known], -difference[known])
 
 
 def _first_order(
     function: SmoothedFunction, aggregate: bool, values_at: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The gradient kernel's mean of `values_at(z)` over its draws, (n,), and its standard error."""
+    """Return the mean of the gradient kernel times `values_at(z)`, (n,), and its standard error."""
     if aggregate:
         z, ratio = function.draw_aggregate(gaussian.gradient_mixture, gaussian.gradient_ratio)
         weight = gaussian.gradient_kernel(z, function.sigma) / ratio[:, None]

@@ -1,17 +1,18 @@
-"""A black box behind a PyTorch network: torch's own chain rule, of first and second order, with only the black box sampled
+"""A black box behind a PyTorch network: PyTorch's chain rule, of first and second order, with sampled derivatives of the black box only
 (Wang et al., section 4, "CNN"; their supplement calls it the grey box).
 
     poses = network(pictures)  # (K, n)
     losses = ur.grey_box.loss(f, poses, sigma=0.1, samples=32)  # (K,), of f(points, items) -> values
     losses.mean().backward()
 
-With φ(w) the network's output and f what is only evaluated (a render and its distance to a reference), the derivatives of S f(φ(w)) are
+Let φ(w) be the network's output and f a function that is only evaluated (a render and its distance to a reference). The derivatives of
+S f(φ(w)) are
 
     gradient                Jᵀ g
     Hessian times v         Jᵀ H J v + Σₖ gₖ (∇² φₖ) v
 
 where J, its products, and ∇² φₖ v are the network's and exact, and g = ∇ S f(φ), H (J v) = ∇² S f(φ) (J v) are estimated in the few
-dimensions of φ by `unrender.smoothed`. No matrix of n × n, or of weights × weights, is built.
+dimensions of φ by `unrender.smoothed`. No matrix of n × n, or of weights × weights, is formed.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from unrender.estimators.smoothing.joint import JointDerivatives, joint
 from unrender.estimators.smoothing.options import SamplingOptions
 from unrender.estimators.smoothing.sampling import Function
 
-# Not a dependency of the library, and absent where types are checked without the extra.
+# PyTorch is an optional dependency, and absent if types are checked without the extra.
 try:
     import torch  # pyright: ignore[reportMissingImports]
 except ImportError as error:
@@ -54,35 +55,36 @@ def loss(
     epsilon: float = 0.1,
     joint: bool = False,
 ) -> torch.Tensor:
-    """f(φ), with the derivatives of S f(φ): differentiable twice by torch.
+    """Return f(φ), with the derivatives of S f(φ), twice differentiable by PyTorch.
 
-    The value is f at φ itself, not smoothed: it costs one evaluation, has no noise of its own, and measures how good φ is. So finite
-    differences of the value are not what the derivatives estimate. Those are unbiased for ∇ S f; products with ∇² S f have the bias of
-    their central difference (`smoothed.hvp`).
+    The value is f at φ itself, not smoothed: it costs one evaluation, adds no noise, and measures the quality of φ. Finite differences
+    of the value therefore differ from the derivatives. These are unbiased for ∇ S f; products with ∇² S f have the bias of their
+    central difference (`smoothed.hvp`).
 
-    First order is estimated at once, in the one call of f that also gives the value, where φ requires a gradient and grads are enabled.
-    Every product with the Hessian is one further call. All take the same draws, so that the products of conjugate gradients
-    are consistent with each other and with the gradient; items draw independently of each other. If f is noisy itself, let it use the
-    same random numbers in every call of a step.
+    The first order is estimated immediately, in the one call of f that also gives the value, if φ requires a gradient and gradients are
+    enabled. Every product with the Hessian is one further call. All use the same samples, so the products of conjugate gradients are
+    consistent with each other and with the gradient; items have independent samples. If f is noisy itself, use the same random numbers
+    in every call of a step.
 
     Args:
         f: the black box. For φ of (n,): points (B, n) to values (B,), in NumPy. For φ of (K, n), one row for each item of a batch:
-            f(points, items), where items (B,) are the rows of φ that the points (B, n) belong to, in [0, K); so each may have a reference
-            of its own.
-        phi: (n,) or (K, n), finite, of any floating type, on any device; f is called on the thread that asks for the derivative.
+            f(points, items), where items (B,) are the rows of φ that the points (B, n) belong to, in [0, K), so that each may have its
+            own reference.
+        phi: (n,) or (K, n), finite, of any floating-point type, on any device; f is called on the thread that requests the derivative.
         sigma: standard deviation of the smoothing, > 0: a number, or (n,).
         samples: evaluations of f per item for the gradient, >= 4 (>= 16 with `low_discrepancy`); a product takes twice as many. Without
             `aggregate`, for each of the n elements.
-        seed: of the draws; a new one for each step.
+        seed: random seed of the perturbations; use a new one for each step.
         aggregate, antithetic, baseline, low_discrepancy, epsilon: see `smoothed.gradient` and `smoothed.hvp`.
-        joint: gradient and products from the same evaluations (`smoothed.joint`): products cost no call of f and have no bias, and
+        joint: gradient and products from the same evaluations (`smoothed.joint`): products need no call of f and have no bias, and
             `aggregate`, `antithetic`, `baseline` and `epsilon` have no effect.
 
     Returns:
         () for φ of (n,), (K,) for (K, n), of φ's type and on its device.
 
     Raises:
-        InputError: σ not positive, shapes that do not fit, φ or values of f that are not finite. From products, out of torch's `grad`.
+        InputError: σ not positive, shapes that do not match, φ or values of f that are not finite. For products, it is raised from
+            PyTorch's `grad`.
     """
     if not isinstance(phi, torch.Tensor) or not phi.is_floating_point() or phi.ndim not in (1, 2) or phi.numel() == 0:
         given = f"{phi.dtype} {tuple(phi.shape)}" if isinstance(phi, torch.Tensor) else type(phi).__name__
@@ -91,7 +93,7 @@ def loss(
         raise InputError("grey_box.loss: phi has elements that are not finite: the network before it has diverged")
     options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy, epsilon=epsilon)
     box = _BlackBox(f, phi.ndim == 2, sigma, options, joint)
-    # On the host before it enters the black box: torch then calls f on the thread that called torch.
+    # Move to the host first: PyTorch then calls f on the calling thread.
     rows = torch.atleast_2d(phi).to("cpu", torch.float64)
     if torch.is_grad_enabled() and phi.requires_grad:
         values = _Loss.apply(rows, box)
@@ -108,33 +110,35 @@ def newton_cg_step(
     optimizer: torch.optim.Optimizer | None = None,
     scales: Sequence[torch.Tensor] | None = None,
 ) -> float:
-    """One step of Newton's method by conjugate gradients on a network's weights, in place; see `optimizers.NewtonCG` (Eqs 4 to 7).
+    """Update a network's weights in place by one Newton step with conjugate gradients; see `optimizers.NewtonCG` (Eqs 4 to 7).
 
-    Memory is a few vectors of the weights' size beside what torch keeps for the loss; a step takes `iterations` products at most.
+    It needs a few vectors of the weights' size in addition to what PyTorch stores for the loss. A step takes at most `iterations`
+    products.
 
     Args:
-        loss_fn: the loss, a scalar tensor twice differentiable by torch, such as the mean of `loss`; called once.
-        parameters: the weights; those that require no gradient stay.
-        trust_radius: the longest step, Euclidean over all weights, > 0.
-        iterations: products with the Hessian at most, >= 1.
-        optimizer: one of torch's over the same weights, say `torch.optim.Adam`, which takes the step's opposite as its gradient and
-            moves as it sees fit; None to move by the step itself.
-        scales: of each weight that requires a gradient a tensor of its shape, > 0: directions, and the trust radius, are those of the
-            weights over their scales. With the fourth root of 1 / v, v Adam's mean square of the gradient, the first direction is Adam's.
+        loss_fn: the loss, a scalar tensor that PyTorch can differentiate twice, such as the mean of `loss`; called once.
+        parameters: the weights; those that require no gradient do not change.
+        trust_radius: maximum step length, Euclidean over all weights, > 0.
+        iterations: maximum number of products with the Hessian, >= 1.
+        optimizer: a PyTorch optimizer of the same weights, such as `torch.optim.Adam`, which receives the negative step as its gradient;
+            None to apply the step itself.
+        scales: for each weight that requires a gradient a tensor of its shape, > 0: directions, and the trust radius, refer to the
+            weights over their scales. With the fourth root of 1 / v, where v is Adam's mean square of the gradient, the first direction
+            is Adam's.
 
     Returns:
         The loss before the step.
 
     Raises:
-        InputError: a loss that is no scalar or does not depend on the weights, derivatives that are not finite, options out of range.
+        InputError: a loss that is not a scalar or does not depend on the weights, derivatives that are not finite, options out of range.
     """
     checks.number("NewtonCG", "trust_radius", trust_radius, above=0.0)
     checks.integer("NewtonCG", "iterations", iterations, at_least=1)
     weights = [weight for weight in parameters if weight.requires_grad]
     value = loss_fn()
     if not isinstance(value, torch.Tensor) or value.ndim != 0:
-        given = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
-        raise InputError(f"grey_box.newton_cg_step: loss_fn must return a scalar tensor, say a mean, got {given}")
+        got = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
+        raise InputError(f"grey_box.newton_cg_step: loss_fn must return a scalar tensor, say a mean, got {got}")
     if not weights or not value.requires_grad:
         raise InputError("grey_box.newton_cg_step: the loss depends on no weight that requires a gradient")
     scale = _scale(scales, weights)
@@ -142,12 +146,12 @@ def newton_cg_step(
     _check_finite("gradient", gradient)
 
     def product(v: np.ndarray) -> np.ndarray:
-        if not gradient.requires_grad:  # a loss that is linear in the weights
+        if not gradient.requires_grad:  # the loss is linear in the weights
             return np.zeros(gradient.numel())
         direction = torch.from_numpy(scale * v)
-        found = _ravel(torch.autograd.grad(gradient, weights, direction, retain_graph=True, materialize_grads=True))
-        _check_finite("product with the Hessian", found)
-        return scale * found.numpy()
+        result = _ravel(torch.autograd.grad(gradient, weights, direction, retain_graph=True, materialize_grads=True))
+        _check_finite("product with the Hessian", result)
+        return scale * result.numpy()
 
     step = conjugate_gradients.solve(scale * gradient.detach().numpy(), product, trust_radius, iterations)
     _apply_step(torch.from_numpy(scale * step), weights, optimizer)
@@ -155,19 +159,19 @@ def newton_cg_step(
 
 
 def _scale(scales: Sequence[torch.Tensor] | None, weights: Sequence[torch.Tensor]) -> np.ndarray:
-    """All scales in one vector, or ones. Raises `InputError` for other shapes than the weights', and for what is not above 0."""
+    """Return all scales in one vector, or ones. Raise `InputError` if shapes differ from the weights', or scales are not positive."""
     if scales is None:
         return np.ones(sum(weight.numel() for weight in weights))
     if [tuple(scale.shape) for scale in scales] != [tuple(weight.shape) for weight in weights]:
         raise InputError("grey_box.newton_cg_step: scales must have the shapes of the weights that require a gradient")
-    found = _ravel([scale.detach() for scale in scales]).numpy()
-    if not (np.isfinite(found) & (found > 0.0)).all():
+    vector = _ravel([scale.detach() for scale in scales]).numpy()
+    if not (np.isfinite(vector) & (vector > 0.0)).all():
         raise InputError("grey_box.newton_cg_step: scales must be finite and above 0")
-    return found
+    return vector
 
 
 def _apply_step(step: torch.Tensor, weights: Sequence[torch.Tensor], optimizer: torch.optim.Optimizer | None) -> None:
-    """Add the step, all weights flattened in one vector, or give its opposite to the optimizer as the gradient."""
+    """Add the step, all weights flattened in one vector, or pass its negative to the optimizer as the gradient."""
     with torch.no_grad():
         for weight, part in zip(weights, step.split([w.numel() for w in weights]), strict=True):
             move = part.reshape(weight.shape).to(weight)
@@ -181,7 +185,7 @@ def _apply_step(step: torch.Tensor, weights: Sequence[torch.Tensor], optimizer: 
 
 
 def _ravel(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
-    """All elements in one vector on the host, double precision, differentiable."""
+    """Return all elements in one vector on the host, in double precision, differentiable."""
     return torch.cat([x.reshape(-1).to("cpu", torch.float64) for x in tensors])
 
 
@@ -192,7 +196,7 @@ def _check_finite(name: str, vector: torch.Tensor) -> None:
 
 @dataclass(frozen=True)
 class _BlackBox:
-    """f and how it is smoothed: values (K,), gradients (K, n) and Hessian-vector products (K, n) of K items, each by one call of f."""
+    """f and its smoothing options: values (K,), gradients (K, n) and Hessian-vector products (K, n) of K items, each by one call of f."""
 
     f: Callable[..., Any]
     batched: bool
@@ -200,7 +204,7 @@ class _BlackBox:
     options: SamplingOptions
     joint: bool = False
     derivatives: list[JointDerivatives] = field(default_factory=list)
-    """Of each item, from the last `first_order`, with `joint`."""
+    """With `joint`, derivatives of each item from the last `first_order`."""
 
     def values(self, phi: np.ndarray) -> np.ndarray:
         return self._evaluate(phi, np.arange(len(phi)))
@@ -235,7 +239,7 @@ class _BlackBox:
             return np.array([one.hvp(direction)[0] for one, direction in zip(self.derivatives, v, strict=True)])
 
         def call(item: int) -> _Call:
-            # Twice the samples: as many draws at each side of the difference as the gradient has, and by the seed the same ones.
+            # Twice the samples, so that each side of the difference has the same samples as the gradient.
             options = replace(self._item_options(item), samples=2 * self.options.samples)
             return lambda f: estimate_hvp(f, phi[item], v[item], self.sigma, options)[0]
 
@@ -245,10 +249,10 @@ class _BlackBox:
         return replace(self.options, seed=Key(self.options.seed).fold(item).uint32())
 
     def _batched_calls(self, calls: Sequence[_Call]) -> list[Any]:
-        """The return value of each item's call, with all their evaluations in one call of f.
+        """Return the result of each item's call, with all their evaluations in one call of f.
 
-        Where an estimator evaluates depends on its draws alone and not on values, so each is run twice: to record the points, and
-        with the values. That costs little beside rendering, which is much cheaper in one batch.
+        The points of an estimator depend on its samples, not on values. Each call therefore runs twice: to record the points, and with
+        the values. This is cheap relative to rendering, which is faster in one batch.
         """
         recorded: list[list[np.ndarray]] = []
         for call in calls:
@@ -262,7 +266,7 @@ class _BlackBox:
             recorded.append(points)
         parts = [(item, x) for item, points in enumerate(recorded) for x in points]
         answers = iter(())
-        if parts:  # none, where v is zero
+        if parts:  # there are none if v is zero
             items = np.repeat([item for item, _ in parts], [len(x) for _, x in parts])
             values = self._evaluate(np.concatenate([x for _, x in parts]), items)
             answers = iter(np.split(values, np.cumsum([len(x) for _, x in parts])[:-1]))
@@ -275,7 +279,7 @@ class _BlackBox:
                 f"grey_box.loss: f must return shape ({len(points)},) for {points.shape}, got {values.shape}"
             )
         finite = np.isfinite(values)
-        lost = np.setdiff1d(items, items[finite])  # of the others, `SmoothedFunction` drops what is not finite
+        lost = np.setdiff1d(items, items[finite])  # `SmoothedFunction` drops non-finite values of the other items
         if lost.size:
             place = np.array2string(points[items == lost[0]][0], threshold=8, precision=4)
             raise InputError(f"grey_box.loss: f is not finite at {place}" + f", item {lost[0]}" * self.batched)
@@ -283,7 +287,7 @@ class _BlackBox:
 
 
 class _Loss(torch.autograd.Function):
-    """φ (K, n) to f(φ) (K,)."""
+    """Autograd function from φ (K, n) to f(φ) (K,)."""
 
     @staticmethod
     def forward(ctx: Any, phi: torch.Tensor, box: _BlackBox) -> torch.Tensor:
@@ -299,7 +303,7 @@ class _Loss(torch.autograd.Function):
 
 
 class _Gradient(torch.autograd.Function):
-    """φ (K, n) to ∇ S f(φ) (K, n), already estimated; its derivative is the Hessian, which is symmetric: Hᵀ v = H v."""
+    """Autograd function from φ (K, n) to its estimated ∇ S f(φ) (K, n). Its derivative is the symmetric Hessian: Hᵀ v = H v."""
 
     @staticmethod
     def forward(ctx: Any, phi: torch.Tensor, gradient: torch.Tensor, box: _BlackBox) -> torch.Tensor:
@@ -314,7 +318,7 @@ class _Gradient(torch.autograd.Function):
 
 
 class _Product(torch.autograd.Function):
-    """φ and v (K, n) to ∇² S f(φ) v (K, n). Its derivative is an error, so that it is not taken for zero."""
+    """Autograd function from φ and v (K, n) to ∇² S f(φ) v (K, n). Its derivative is an error instead of zero."""
 
     @staticmethod
     def forward(ctx: Any, phi: torch.Tensor, v: torch.Tensor, box: _BlackBox) -> torch.Tensor:
