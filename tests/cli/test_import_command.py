@@ -338,7 +338,7 @@ def _top(name: str, value: Any) -> Callable[[Path], None]:
 
 
 BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "no photograph": (lambda c: shutil.rmtree(c / "images"), "head: none of its photographs is there"),
+    "no photograph": (lambda c: shutil.rmtree(c / "images"), "head: all of its photographs are missing"),
     "other proportions": (_shrink, "view_2.png: 40 x 30 pixels, but its camera has 40 x 40"),
     "a cut photograph": (lambda c: _cut(_photograph(c)), "view_2.png: cannot be read as a picture"),
     "an empty photograph": (lambda c: _photograph(c).write_bytes(b""), "view_2.png: cannot be read as a picture"),
@@ -371,7 +371,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "an unknown camera": (_top("camera_model", "EQUIRECTANGULAR"), "camera_model: expected OPENCV"),
     "a mask that is not there": (_frame("mask_path", "masks/no.png"), "masks/no.png: no such file"),
     "a raw file": (_raw, "view_2.nef: camera raw files are not read; develop them to .exr"),
-    "a photograph twice": (_frame("file_path", "images/view_1.png"), "view_1.png: given twice, with different poses"),
+    "a photograph twice": (_frame("file_path", "images/view_1.png"), "view_1.png: listed twice, with different poses"),
     "frames in a table": (_top("frames", {"0": {}}), "transforms.json: frames: expected a list of at least one frame"),
     "a frame of words": (
         _top("frames", ["images/view_0.png"]),
@@ -457,14 +457,14 @@ def _without_pose(capture: Path) -> None:
 
 
 UNUSUAL: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "EXIF rotation": (_rotate_by_exif, "9 photographs turned upright as EXIF says"),
+    "EXIF rotation": (_rotate_by_exif, "9 photographs rotated by their EXIF orientation"),
     "16 bits": (_as_16_bit, ""),
     "CMYK": (_as_cmyk, ""),
     "spaces and umlauts": (_rename, ""),
     "mixed sizes": (_larger, ""),
     "alpha": (_as_alpha, ""),
-    "a missing photograph": (_missing, "1 of 9 photographs are missing and left out, the first images/view_3.png"),
-    "a picture without a pose": (_without_pose, "1 pictures have no pose and are left out, the first another.png"),
+    "a missing photograph": (_missing, "1 of 9 photographs are missing and were skipped, the first images/view_3.png"),
+    "a picture without a pose": (_without_pose, "1 pictures have no pose and were skipped, the first another.png"),
     "a world of a million": (matrices(lambda m: np.c_[m[:, :3], m[:, 3] * [1e6, 1e6, 1e6, 1]]), ""),
     "a scale in the matrices": (matrices(lambda m: m @ np.diag([3.0, 3.0, 3.0, 1.0])), ""),
 }

@@ -273,7 +273,7 @@ def test_a_mask_of_two_photographs_is_refused(tmp_path: Path) -> None:
     for name in (*NAMES, "masks/1.png"):
         _picture(tmp_path / name)
     _transforms(tmp_path, NAMES)
-    with pytest.raises(InputError, match=r"masks/1\.png: the mask of two photographs"):
+    with pytest.raises(InputError, match=r"masks/1\.png: shared by two photographs"):
         formats.read(tmp_path)
 
 
@@ -357,5 +357,5 @@ def test_a_hundred_thousand_photographs_are_one_line(kind: str, tmp_path: Path) 
             f"{count}\n" + "1 0 1\n0 1 1\n-1 0 1\n" * (count // 3) + "0 0 1\n" * (count % 3)
         )
     read = lights.read if kind == "lights" else formats.FORMATS[kind].read
-    with pytest.raises(InputError, match=f": {count} photographs, expected at most {files.MOST}; take a part of them"):
+    with pytest.raises(InputError, match=f": {count} photographs, expected at most {files.MOST}; use a subset"):
         read(tmp_path, None)

@@ -134,5 +134,5 @@ def test_a_neighbour_whose_name_begins_alike_is_outside(tmp_path: Path) -> None:
 @pytest.mark.parametrize("write", [_transforms, _colmap])
 def test_a_name_that_no_file_can_have_is_that_of_none(write: Callable[[Path, str], None], folder: Path) -> None:
     write(folder, 300 * "x" + ".png")
-    with pytest.raises(InputError, match="none of its photographs is there"):
+    with pytest.raises(InputError, match="all of its photographs are missing"):
         formats.read(folder)

@@ -41,9 +41,9 @@ def problem(n: int = 3, **more: Any) -> ur.Problem:
         ({"sigma": 0.1, "hessian_rate": 0.5}, 'hessian_rate requires order="hvp", got'),
         ({"sigma": 0.1, "hessian_form": "banded"}, 'hessian_form must be "full" or "diagonal"'),
         ({"sigma": 0.1, "order": "hvp", "hessian_form": "diagonal"}, 'hessian_form="diagonal" requires hessian_rate'),
-        ({"sigma": 0.1, "orthogonal": True, "low_discrepancy": True}, "orthogonal draws need aggregate"),
-        ({"sigma": 0.1, "orthogonal": True, "aggregate": False}, "orthogonal draws need aggregate"),
-        ({"sigma": 0.1, "orthogonal": True, "product": True}, "orthogonal draws need aggregate"),
+        ({"sigma": 0.1, "orthogonal": True, "low_discrepancy": True}, "orthogonal requires aggregate"),
+        ({"sigma": 0.1, "orthogonal": True, "aggregate": False}, "orthogonal requires aggregate"),
+        ({"sigma": 0.1, "orthogonal": True, "product": True}, "orthogonal requires aggregate"),
     ],
 )
 def test_arguments_that_make_no_sense(arguments: dict[str, Any], message: str) -> None:
@@ -210,7 +210,7 @@ def test_a_hessian_that_is_kept_is_that_of_the_loss_and_so_is_the_gradient(joint
     estimator = ur.SmoothedDerivatives(sigma, samples=16, order="hvp", joint=joint, hessian_rate=0.3)
     hessian, found = None, []
     for step in range(600):
-        gradient, _, hessian = estimator._kept(
+        gradient, _, hessian = estimator._stored_hessian(
             lambda x: 0.5 * np.einsum("bi,ij,bj->b", x, matrix, x), at, np.full(3, sigma), step, hessian, 0.3
         )
         found.append(np.concatenate([gradient, hessian.ravel() / sigma**2]))
@@ -237,7 +237,7 @@ def test_a_diagonal_that_is_kept_is_that_of_the_loss(joint: bool, orthogonal: bo
     )
     kept, gradients = None, []
     for step in range(60):
-        gradient, _, kept = estimator._kept(
+        gradient, _, kept = estimator._stored_hessian(
             lambda x: 0.5 * (x * x) @ bend, at, np.full(n, sigma), step, kept, estimator.hessian_rate or 0.0
         )
         gradients.append(gradient)

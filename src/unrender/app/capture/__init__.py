@@ -1,1 +1,1 @@
-"""From a folder of posed photographs to a problem: cameras, masks, a first shape, an atlas, references without distortion."""
+"""Import of posed photographs as a problem: cameras, masks, initial shape, texture atlas, undistorted references."""

@@ -1,6 +1,7 @@
-"""Texture atlases by xatlas, in a process of its own with a time limit: on some meshes it does not end, and it cannot be interrupted.
+"""Texture atlases by xatlas, in a subprocess with a time limit, since xatlas does not terminate on some meshes and cannot be
+interrupted.
 
-As a program, `python -m unrender.app.capture.atlas IN.npz OUT.npz`, it is that process.
+`python -m unrender.app.capture.atlas IN.npz OUT.npz` runs this module as the subprocess.
 """
 
 from __future__ import annotations
@@ -18,31 +19,31 @@ from unrender.app.capture.mesh import Mesh, normals
 from unrender.core.errors import InputError
 
 SECONDS = 120.0
-"""Time limit; 10 000 faces take 2 seconds, 20 000 15."""
+"""Time limit in seconds; 10 000 faces take 2 seconds, 20 000 faces 15."""
 _PADDING = 3
-"""Texels between charts, of an atlas that is then scaled down a little."""
+"""Texels between charts, before the atlas is scaled down slightly."""
 _COMMAND = (sys.executable, "-m", "unrender.app.capture.atlas")
 
 
 def check_installed() -> None:
-    """Raise `InputError` where xatlas is missing."""
+    """Raise `InputError` if xatlas is missing."""
     if importlib.util.find_spec("xatlas") is None:
         raise InputError("a mesh without texture coordinates needs xatlas: pip install 'unrender[capture]'")
 
 
 def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple[str, ...] = _COMMAND) -> Mesh:
-    """The mesh with texture coordinates: one atlas without overlaps, charts about 2 texels apart.
+    """Return the mesh with texture coordinates: one atlas without overlaps, with charts about 2 texels apart.
 
-    Vertices on seams are doubled, normals are kept.
+    Vertices on seams are duplicated. Normals do not change.
 
     Args:
         mesh: at most 2^31 faces.
         resolution: texels along the atlas's sides.
         seconds: time limit.
-        command: the program, to which two files are added.
+        command: command of the subprocess, to which two file names are appended.
 
     Raises:
-        InputError: xatlas is not installed, fails, or does not end in time.
+        InputError: xatlas is not installed, fails, or exceeds the time limit.
     """
     check_installed()
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
@@ -52,7 +53,7 @@ def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple
         local = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
         np.savez(given, vertices=local, faces=mesh.faces.astype(np.uint32), resolution=resolution)
         try:
-            # Python begins its search for modules in the current directory, which may have come from anywhere.
+            # Python searches the current directory for modules first, which may be untrusted.
             done = subprocess.run(
                 [*command, str(given), str(made)],
                 timeout=seconds,
@@ -74,11 +75,11 @@ def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple
 
 
 def _environment() -> dict[str, str]:
-    """This process's, for one in another directory that does not look for modules there."""
-    found = {**os.environ, "PYTHONSAFEPATH": "1"}
-    if path := found.get("PYTHONPATH"):
-        found["PYTHONPATH"] = os.pathsep.join(os.path.abspath(place) for place in path.split(os.pathsep))
-    return found
+    """Return the environment of a subprocess that does not import modules from its current directory."""
+    environment = {**os.environ, "PYTHONSAFEPATH": "1"}
+    if path := environment.get("PYTHONPATH"):
+        environment["PYTHONPATH"] = os.pathsep.join(os.path.abspath(place) for place in path.split(os.pathsep))
+    return environment
 
 
 def _main(given: str, made: str) -> None:
@@ -94,7 +95,7 @@ def _main(given: str, made: str) -> None:
     if atlas.atlas_count != 1:
         raise SystemExit(f"its charts fill {atlas.atlas_count} atlases")
     of, kept, uv = atlas.get_mesh(0)
-    # The resolution is a hint: what was made is a little larger, and not square.
+    # xatlas treats the resolution as a hint: the atlas is slightly larger, and not square.
     uv = uv * np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)
     np.savez(made, of=of, faces=kept, uv=uv.astype(np.float32))
 

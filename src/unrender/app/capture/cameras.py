@@ -1,8 +1,8 @@
-"""Cameras: a lens, and where points of the world fall in its picture.
+"""Cameras: lens models, and the projection of world points to pictures.
 
-A camera's axes are x right, y up, z backwards (it looks along -z), right-handed, as in OpenGL. Positions in a picture are in pixels from
-its upper left corner, x to the right and y down, so that the middle of the first pixel is (0.5, 0.5). In coordinates x/z, y/z of a camera
-that looks along +z with y down, OpenCV's models of distortion apply.
+A camera's axes are x right, y up, z backwards (it looks along -z), right-handed, as in OpenGL. Positions in a picture are in pixels
+from its upper left corner, x to the right and y down, so that the middle of the first pixel is (0.5, 0.5). In coordinates x/z, y/z of a
+camera that looks along +z with y down, OpenCV's models of distortion apply.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ class Lens:
         return self.model == FISHEYE or any(self.distortion)
 
     def scaled(self, width: int, height: int) -> Lens:
-        """The lens of the same picture at another size of the same proportions."""
+        """Return the lens of the same picture at another size of the same aspect ratio."""
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     @classmethod
     def of_field_of_view(cls, radians: float, width: int, height: int) -> Lens:
-        """Square pixels, principal point in the middle, `radians` from the left edge to the right."""
+        """Return a lens with square pixels, a centred principal point, and a horizontal field of view in radians."""
         if not 1 / _WIDEST < radians < math.pi:
             limits = f"more than {1 / _WIDEST:g} and less than π radians"
             raise InputError(f"camera: expected a horizontal angle of view of {limits}, got {radians:g}")
@@ -81,9 +81,9 @@ class Lens:
 
 
 def project(lens: Lens, camera_to_world: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where points of the world fall: (N, 2) in pixels, and their depths (N,) along the view, positive in front of the camera.
+    """Project world points: return positions (N, 2) in pixels, and depths (N,) along the view, positive in front of the camera.
 
-    Positions of points that are not in front mean nothing.
+    Positions of points behind the camera are undefined.
     """
     local = (np.asarray(points, float) - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
     depth = -local[:, 2]
@@ -103,46 +103,47 @@ def project(lens: Lens, camera_to_world: np.ndarray, points: np.ndarray) -> tupl
 
 
 def _coefficients(lens: Lens) -> np.ndarray:
-    """Of a radial-tangential lens, (8,), as OpenCV orders them."""
+    """Return the coefficients of a radial-tangential lens, (8,), in OpenCV's order."""
     return np.array([*lens.distortion, *[0.0] * 8][:8], float)
 
 
 def rigid(matrix: Any, where: str) -> tuple[np.ndarray, float]:
-    """A 3 x 4 or 4 x 4 matrix [sR | t] as [R | t], (4, 4), and s. A last row of 0 0 0 w divides all others by w.
+    """Return [R | t], (4, 4), and the scale s of a 3 x 4 or 4 x 4 matrix [sR | t]. A last row of 0 0 0 w divides all others by w.
 
     Raises:
-        InputError: not finite, its axes are not orthogonal and equally long to 2 %, or mirrored, or its last row is another.
+        InputError: the matrix is not finite, its axes are not orthogonal and of equal length within 2 %, it is mirrored, or its last row
+            is different.
     """
     try:
-        given = np.asarray(matrix, float)
+        array = np.asarray(matrix, float)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: expected a matrix of numbers") from error
-    if given.shape not in ((3, 4), (4, 4)) or not np.isfinite(given).all():
-        raise InputError(f"{where}: expected a matrix of 3 x 4 or 4 x 4 finite numbers, got shape {given.shape}")
-    if len(given) == 4:
-        *rest, last = given[3]
+    if array.shape not in ((3, 4), (4, 4)) or not np.isfinite(array).all():
+        raise InputError(f"{where}: expected a matrix of 3 x 4 or 4 x 4 finite numbers, got shape {array.shape}")
+    if len(array) == 4:
+        *rest, last = array[3]
         if not np.abs(rest).max() <= _LAST_ROW * abs(last) or not last:
-            raise InputError(f"{where}: its last row is {printable(given[3].tolist())}, expected 0 0 0 1")
+            raise InputError(f"{where}: its last row is {printable(array[3].tolist())}, expected 0 0 0 1")
         with np.errstate(over="ignore"):
-            given = given / last
-    largest = float(np.abs(given[:3, :3]).max())
-    if not 0 < largest < math.inf or not np.isfinite(given).all():
-        raise InputError(f"{where}: its first three columns are no rotation")
-    axes = given[:3, :3] / largest  # so that no product overflows
+            array = array / last
+    largest = float(np.abs(array[:3, :3]).max())
+    if not 0 < largest < math.inf or not np.isfinite(array).all():
+        raise InputError(f"{where}: its first three columns are not a rotation")
+    axes = array[:3, :3] / largest  # avoids overflow in products
     determinant = float(np.linalg.det(axes))
     length = abs(determinant) ** (1 / 3)
     if length == 0 or np.abs(axes.T @ axes / length**2 - np.eye(3)).max() > 0.02:
-        raise InputError(f"{where}: its first three columns are no rotation")
+        raise InputError(f"{where}: its first three columns are not a rotation")
     if determinant < 0:
         raise InputError(f"{where}: its axes are left-handed (determinant {determinant:.3g}): one axis is mirrored")
     u, _, v = np.linalg.svd(axes)
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = u @ v, given[:3, 3]
-    return found, length * largest
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = u @ v, array[:3, 3]
+    return pose, length * largest
 
 
 def opencv() -> Any:
-    """The module `cv2`. Raises `InputError` that says how to install it."""
+    """Return the module `cv2`. Raise `InputError` with installation instructions if it is missing."""
     try:
         import cv2
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""What a folder of posed photographs holds, whatever program wrote it."""
+"""Contents of a folder of posed photographs, independent of the program that wrote it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from unrender.app.capture.cameras import Lens
 
 @dataclass(frozen=True)
 class CapturedView:
-    """One photograph, ready to be compared with a render.
+    """One photograph, prepared for comparison with a render.
 
     Attributes:
-        name: of the photograph.
+        name: name of the photograph.
         lens: a pinhole with square pixels.
         camera_to_world: (4, 4), axes right, up, backwards.
         values: (H, W, 3) float32, linear.
-        mask: (H, W) in [0, 1], which part of each pixel the object covers; None where there is no mask.
-        shown: (H, W) in [0, 1], which part of each pixel the photograph shows: less than 1 where undistorting leaves the picture.
-        held_out: whether it is for judging alone.
+        mask: (H, W) in [0, 1], coverage of each pixel by the object; None without a mask.
+        shown: (H, W) in [0, 1], fraction of each pixel inside the photograph: less than 1 where undistortion leaves the picture.
+        held_out: whether it is for evaluation only.
     """
 
     name: str
@@ -36,7 +36,7 @@ class CapturedView:
 
 
 class CapturedViews(Protocol):
-    """A list of views, or `StoredViews`, which reads each when it is asked for: take one at a time."""
+    """A list of views, or `StoredViews`, which reads each view on access: process one at a time."""
 
     def __len__(self) -> int: ...
 
@@ -50,14 +50,14 @@ class Photograph:
     """One photograph and its camera.
 
     Attributes:
-        name: as the capture calls it, for messages.
-        file: where it is.
-        lens: of the camera, None where the size of the file decides (`field_of_view`).
-        camera_to_world: (4, 4), axes of the camera as `cameras` says: x right, y up, z backwards; rotation and position alone.
-        mask: a file, None for none.
-        held_out: whether it is for judging alone; None where the capture does not say.
-        field_of_view: horizontal, in radians, where there is no lens.
-        scale: of the axes of the matrix in the file, which `camera_to_world` is without.
+        name: name in the capture, for messages.
+        file: its path.
+        lens: lens of the camera; None if it depends on the size of the file (`field_of_view`).
+        camera_to_world: (4, 4), camera axes as in `cameras`: x right, y up, z backwards; rotation and position only.
+        mask: path of the mask, or None.
+        held_out: whether it is for evaluation only; None if the capture does not specify it.
+        field_of_view: horizontal field of view in radians, if there is no lens.
+        scale: scale of the axes of the matrix in the file, which `camera_to_world` does not include.
     """
 
     name: str
@@ -75,12 +75,12 @@ class Capture:
     """Posed photographs.
 
     Attributes:
-        folder: where they are.
-        kind: the name of the format.
+        folder: their folder.
+        kind: name of the format.
         photographs: at least one.
-        axes: of the cameras in the files, a key of `conventions.AXES`.
-        world_to_camera: whether the files hold the inverse of a camera's pose.
-        notices: one line for each thing that was left out or changed.
+        axes: camera axes in the files, a key of `conventions.AXES`.
+        world_to_camera: whether the files contain the inverse of a camera's pose.
+        notices: one line for each omission or change.
     """
 
     folder: Path

@@ -1,4 +1,4 @@
-"""Conventions of camera poses: how formats name a camera's axes, and how a matrix in a file becomes a pose.
+"""Conventions of camera poses: camera axes of each format, and conversion of matrices to poses.
 
 | name | x | y | z | written by |
 |---|---|---|---|---|
@@ -22,27 +22,27 @@ AXES = {
     "opencv": np.diag([1.0, -1.0, -1.0]),
     "llff": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
-"""Of each convention, its x, y and z axis as columns in the axes right, up, backwards."""
+"""For each convention, its x, y and z axis as columns in the axes right, up, backwards."""
 
 
 def pose(matrix: object, axes: str, world_to_camera: bool, where: str) -> tuple[np.ndarray, float]:
-    """The matrix of a file as camera-to-world, (4, 4), with the axes right, up, backwards; and the scale of its axes, which is taken out.
+    """Return the matrix of a file as camera-to-world, (4, 4), with the axes right, up, backwards, and the removed scale of its axes.
 
-    Of [sR | t], world to camera, the camera is at -Rᵀ t / s. Raises `InputError`.
+    For a world-to-camera matrix [sR | t], the camera is at -Rᵀ t / s. Raises `InputError`.
     """
-    found, scale = rigid(matrix, where)
+    camera, scale = rigid(matrix, where)
     if world_to_camera:
         with np.errstate(over="ignore"):
-            found[:3, 3] /= scale
-        if not np.isfinite(found).all():
+            camera[:3, 3] /= scale
+        if not np.isfinite(camera).all():
             raise InputError(f"{where}: its axes are too short for its position")
-        found = _inverse(found)
-    found[:3, :3] = found[:3, :3] @ AXES[axes].T
-    return found, scale
+        camera = _inverse(camera)
+    camera[:3, :3] = camera[:3, :3] @ AXES[axes].T
+    return camera, scale
 
 
 def reinterpreted(capture: Capture, axes: str, world_to_camera: bool) -> Capture:
-    """The capture as it is where its files hold the other convention. Raises `InputError` for an unknown name of axes."""
+    """Return the capture for another convention of its files. Raise `InputError` for an unknown name of axes."""
     if axes not in AXES:
         raise InputError(f"axes: expected one of {', '.join(AXES)}, got {axes!r}")
     photographs = []

@@ -1,4 +1,4 @@
-"""From the levels of a photograph's file to linear values: the response curve that `--response` names."""
+"""Decoding of a photograph's file to linear values by the response curve of `--response`."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from unrender.io import images
 
 SRGB, LINEAR, FIT = "srgb", "linear", "fit"
 _LEAST, _MOST = 1.0, 4.0
-"""Exponents of cameras and screens lie between 1 and 2.6."""
+"""Range of exponents. Those of cameras and screens are between 1 and 2.6."""
 
 
 def check(response: str) -> str:
-    """The name of a response, as it was given. Raises `InputError`."""
+    """Return the name of a response unchanged. Raise `InputError` if it is invalid."""
     if response not in (SRGB, LINEAR, FIT):
         _exponent(response)
     return response
 
 
 def linear(levels: np.ndarray, response: str) -> np.ndarray:
-    """Linear values of levels in [0, 1], any shape, by a response: 0 and 1 are themselves, and a brighter level is brighter.
+    """Decode levels in [0, 1], of any shape, to linear values by a response. The curve is increasing and maps 0 and 1 to themselves.
 
-    "srgb" and "fit" take the sRGB curve, a number γ the power levels ** γ, "linear" the levels as they are.
+    "srgb" and "fit" select the sRGB curve, a number γ the power levels ** γ, and "linear" the identity.
     """
     if response in (SRGB, FIT):
         return images.srgb_to_linear(levels)

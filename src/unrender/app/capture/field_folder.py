@@ -1,4 +1,4 @@
-"""Views as the problem of a radiance field: a cube that glows and absorbs around what the cameras look at, before a sky."""
+"""Views as the problem of a radiance field: an emissive, absorbing cube around the common focus of the cameras, in front of a sky."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 
 NAMES = ("field", "light", "exposure")
-"""The unknowns that such a problem may have; the field always is."""
+"""Possible unknowns of such a problem; the field is always one."""
 GRIDS, EXTINCTION, LIGHT = "grids", "grids/extinction.vol", "grids/light.exr"
 _HARMONICS = ["emission", *(f"{COEFFICIENT}{k}" for k in range(1, 9))]
 OWN = frozenset({PROBLEM, HELD_OUT, SCENE, REFERENCES, MASKS, GRIDS, stages_file.FILE})
-"""What `write` puts into a folder."""
+"""Names that `write` creates in a folder."""
 _FIELD = "field"
-"""Id of the medium."""
+"""Id of the medium in the scene."""
 _KEYS = {
     "extinction": f"{_FIELD}.sigma_t.data",
     **{name: f"{_FIELD}.{name}.data" for name in _HARMONICS},
@@ -40,27 +40,28 @@ _KEYS = {
     "exposure": EXPOSURE,
 }
 _DEPTH = 0.5
-"""Optical depth through the cube at first: half of it is seen through."""
+"""Initial optical depth through the cube, which transmits more than half of the light."""
 _RATES = {"extinction": 0.1, "light": 0.04, "emission": 0.04, **dict.fromkeys(_HARMONICS[1:], 0.01)}
-"""First steps: of the logarithm of extinction, of the others over the photographs' mean."""
+"""Initial learning rates: of the logarithm of extinction, and of the others relative to the photographs' mean."""
 _LOGARITHM = {"bounds": [0.0, math.inf], "parameterisation": "log"}
-"""Of extinction: steps that are noise and end at 0 would leave fog wherever little is seen; as shares, they leave it as thin as it is."""
+"""Options of extinction. The logarithm makes steps relative: noisy absolute steps, clamped at 0, would leave fog in rarely seen regions."""
 _COARSER = 2
-"""Times fewer voxels a side of harmonics beyond degree 0, from 64 voxels on: what is seen changes more with the place than with the
-direction, they are 24 of 28 numbers a voxel, and a step takes its time for each."""
+"""Factor by which harmonics beyond degree 0 have fewer voxels per side, from 64 voxels on. Radiance varies more with position than with
+direction, and the harmonics are 24 of 28 numbers per voxel, which determine the time per step."""
 _COARSEST, _COARSER_FROM = 16, 64
 _METHOD = "adaptive"
 _PIXELS, _PIXELS_FOR = 4096, 32
-"""Pixels of a step up to so many voxels a side, and in proportion to them beyond: steps have a cost by the voxel, too."""
+"""Pixels per step, up to this number of voxels per side. Beyond, pixels are proportional to it, since steps also have a cost per voxel."""
 _SETTINGS = {"scheme": "uniform", "pixels": _PIXELS, "spp": 4, "beta_2": 0.99, "schedule": "exponential(150, 0.05)"}
-"""Of the stages: mini-batches of pixels of all photographs, and rates that fall, since their noise does not. Four samples a pixel: the
-residual that weights a path is that of the three others, which noise of two would drown."""
+"""Settings of the stages: mini-batches of pixels of all photographs, and decaying rates, since the noise does not decrease. A path is
+weighted by the residual of the pixel's three other samples; with fewer samples, noise would dominate this residual."""
 _LIGHT_SIZE = 16, 32
 _WHOLE = 0.999
 
 
 def cube_of(cameras: np.ndarray) -> tuple[np.ndarray, float]:
-    """The middle (3,) and half the side of the cube that the cameras look at, from their poses (V, 4, 4), axes right, up, backwards.
+    """Return the centre (3,) and half the side of the cube that the cameras look at, from their poses (V, 4, 4), axes right, up,
+    backwards.
 
     The middle is nearest to all optical axes, by least squares; the side is twice the median distance from it to the cameras.
 
@@ -84,14 +85,14 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
     """Write the problem and its stages, coarse to fine, to an empty folder.
 
     Args:
-        folder: exists.
-        name: of the problem.
-        views: of photographs; their masks are not used.
-        voxels: along a side of the cube.
-        chosen: the unknowns, of `NAMES`.
+        folder: an existing folder.
+        name: name of the problem.
+        views: views of the photographs; their masks are not used.
+        voxels: number of voxels along a side of the cube.
+        chosen: the unknowns, from `NAMES`.
 
     Raises:
-        InputError: the cameras look at no common point.
+        InputError: the cameras have no common focus.
     """
     bare = views.bare()
     middle, half = cube_of(np.array([view.camera_to_world for view in bare]))
@@ -131,24 +132,25 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
             if view.held_out == held_out
         ]
         if listed:
-            given = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
-            (folder / file).write_text(problem_text(name, listed, held_out, given, "L2", 1), encoding="utf-8")
+            unknown_tables = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
+            (folder / file).write_text(problem_text(name, listed, held_out, unknown_tables, "L2", 1), encoding="utf-8")
     note = "Each stage has twice the voxels a side. Run all: unrender run stages.toml. Written by `unrender import`."
     (folder / stages_file.FILE).write_text(stages_file.text(_stages(voxels, moved), note), encoding="utf-8")
 
 
 def _stages(voxels: int, moved: Sequence[str]) -> Stages:
-    """Coarse to fine, by halves, down to 16 voxels or so a side. Each takes as long as those before it together."""
-    keys, found, coarser = tuple(_KEYS[one] for one in moved), [], 1
+    """Return the stages from coarse to fine, in factors of 2, from about 16 voxels per side. Each takes as long as all earlier ones
+    together."""
+    keys, result, coarser = tuple(_KEYS[one] for one in moved), [], 1
     while voxels / coarser >= 1:
         side = -(-voxels // coarser)
         more = {"pixels": _PIXELS * side // _PIXELS_FOR} if side > _PIXELS_FOR else None
-        found.insert(0, Stage(f"voxels-{side}", keys, 1.0, coarser, settings=more))
+        result.insert(0, Stage(f"voxels-{side}", keys, 1.0, coarser, settings=more))
         if voxels // coarser <= _COARSEST:
             break
         coarser *= 2
-    found[1:] = [replace(stage, share=2.0**number) for number, stage in enumerate(found[1:])]
-    return Stages(Path(PROBLEM), tuple(found), _METHOD, dict(_SETTINGS), seconds=600.0)
+    result[1:] = [replace(stage, share=2.0**number) for number, stage in enumerate(result[1:])]
+    return Stages(Path(PROBLEM), tuple(result), _METHOD, dict(_SETTINGS), seconds=600.0)
 
 
 def _scene(views: Sequence[CapturedView], stems: Sequence[str], middle: np.ndarray, half: float) -> bytes:

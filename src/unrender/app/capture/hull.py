@@ -1,9 +1,8 @@
-"""The visual hull of masks: all that no photograph shows to be empty.
+"""The visual hull of masks: all points that no photograph shows to be empty.
 
-A. Laurentini, "The visual hull concept for silhouette-based image understanding", PAMI 1994. The field of a point is the least, over the
-photographs, of its distance to the mask's edge there, positive inside, in units of the world: pixels times depth over focal length. Its
-zero level is the hull, so that marching cubes place vertices within a voxel. What no mask can tell remains: concavities that no silhouette
-shows are filled.
+A. Laurentini, "The visual hull concept for silhouette-based image understanding", PAMI 1994. The field at a point is the minimum over
+the photographs of its signed distance to the mask's edge, positive inside, in world units: pixels times depth over focal length. Its
+zero level set is the hull, so marching cubes place vertices within a voxel. Concavities that no silhouette shows are filled.
 """
 
 from __future__ import annotations
@@ -23,10 +22,10 @@ from unrender.core.errors import InputError
 
 _COARSE = 32
 _REFINED = 4
-"""Voxels of the fine grid to one of the coarse one, along each axis."""
+"""Number of fine voxels per coarse voxel along each axis."""
 _CHUNK = 1 << 17
 _UNKNOWN = 1e4
-"""Distance in pixels where a photograph tells nothing."""
+"""Distance in pixels where a photograph gives no information."""
 _CRUMBS = 0.02
 _SMOOTHING = 10
 
@@ -35,28 +34,29 @@ Camera = tuple[Lens, np.ndarray]
 
 
 def shape(views: CapturedViews, resolution: int, faces: int) -> Mesh:
-    """A first shape from the masks of `views`: the hull, without loose parts of less than 2 % of its faces, smoothed, decimated.
+    """Return an initial shape from the masks of `views`: the hull without components of less than 2 % of its faces, smoothed and
+    decimated.
 
     Args:
-        views: with masks.
-        resolution: voxels along the longest side of the hull's box.
-        faces: how many triangles are kept, about.
+        views: views with masks.
+        resolution: number of voxels along the longest side of the hull's bounding box.
+        faces: approximate number of triangles.
 
     Raises:
-        InputError: no point lies inside all masks.
+        InputError: no point is inside all masks.
     """
     return decimate(smooth(without_crumbs(visual_hull(views, resolution), _CRUMBS), _SMOOTHING), faces)
 
 
 def visual_hull(views: CapturedViews, resolution: int) -> Mesh:
-    """The zero level of `field`, by marching cubes. Raises `InputError` where it is empty."""
+    """Return the zero level set of `field`, by marching cubes. Raise `InputError` if it is empty."""
     from skimage import measure
 
     cameras = [(view.lens, view.camera_to_world) for view in views]
     distances = StoredArrays(map(_distance, views))
     low, high = _box(*_first_ball(views), cameras, distances)
     spacing = float((high - low).max()) / resolution
-    counts = np.ceil((high - low) / spacing).astype(int) + 3  # a voxel of air around it
+    counts = np.ceil((high - low) / spacing).astype(int) + 3  # one empty voxel around it
     low = (low + high) / 2 - (counts - 1) / 2 * spacing
     values = _refined(cameras, distances, low, spacing, counts)
     values[0], values[-1] = np.minimum(values[0], -spacing), np.minimum(values[-1], -spacing)
@@ -65,7 +65,7 @@ def visual_hull(views: CapturedViews, resolution: int) -> Mesh:
         values[:, :, side] = np.minimum(values[:, :, side], -spacing)
     if values.max() <= 0:
         raise InputError(EMPTY)
-    # The field is a distance only near its zero level; what is far would make interpolation there uneven.
+    # The field is a distance only near its zero level set. Clamp distant values, which would distort interpolation.
     vertices, faces, _, _ = measure.marching_cubes(
         np.clip(values, -4 * spacing, 4 * spacing), 0.0, gradient_direction="ascent"
     )
@@ -76,10 +76,10 @@ EMPTY = "no point lies inside all masks: poses, masks or their order do not belo
 
 
 def field(cameras: Sequence[Camera], distances: StoredArrays, points: np.ndarray) -> np.ndarray:
-    """Of points (N, 3), (N,): positive inside. `distances` are those of the masks, in pixels."""
+    """Return the field at points (N, 3), (N,): positive inside. `distances` are those of the masks, in pixels."""
     from scipy import ndimage
 
-    found = np.full(len(points), np.inf)
+    minimum = np.full(len(points), np.inf)
     for (lens, pose), distance in zip(cameras, distances, strict=True):
         at, depth = project(lens, pose, points)
         pixels = ndimage.map_coordinates(distance, (at - 0.5).T[::-1], order=1, mode="nearest")
@@ -89,24 +89,25 @@ def field(cameras: Sequence[Camera], distances: StoredArrays, points: np.ndarray
         else:  # the object ends inside the picture
             off = np.abs(at - np.clip(at, 0, (lens.width, lens.height))).max(1)
             pixels = np.where(outside.any(1), np.minimum(pixels, 0) - off, pixels)
-        np.minimum(found, np.where(depth > 0, pixels * depth / lens.fx, -np.inf), out=found)
-    return found
+        np.minimum(minimum, np.where(depth > 0, pixels * depth / lens.fx, -np.inf), out=minimum)
+    return minimum
 
 
 def _distance(view: CapturedView) -> np.ndarray:
-    """Of a mask, (H, W): pixels to its edge, positive inside, to a fraction of a pixel where coverage tells."""
+    """Return the signed distance (H, W) in pixels to a mask's edge, positive inside, with subpixel accuracy where coverage is
+    fractional."""
     from scipy import ndimage
 
     assert view.mask is not None
     inside = view.mask > 0.5
     within, beyond = (np.asarray(ndimage.distance_transform_edt(part)) for part in (inside, ~inside))
-    found = np.where(inside, within - 0.5, 0.5 - beyond)
+    signed = np.where(inside, within - 0.5, 0.5 - beyond)
     if inside.all():
-        found = np.full(inside.shape, _UNKNOWN)
-    edge = np.abs(found) <= 0.5
-    found[edge] = view.mask[edge] - 0.5
-    found[view.shown < 0.5] = _UNKNOWN
-    return found
+        signed = np.full(inside.shape, _UNKNOWN)
+    edge = np.abs(signed) <= 0.5
+    signed[edge] = view.mask[edge] - 0.5
+    signed[view.shown < 0.5] = _UNKNOWN
+    return signed
 
 
 def _touches_edge(distance: np.ndarray) -> bool:
@@ -116,7 +117,7 @@ def _touches_edge(distance: np.ndarray) -> bool:
 def _box(
     middle: np.ndarray, radius: float, cameras: Sequence[Camera], distances: StoredArrays
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box around the hull, by coarse grids that shrink or grow, of a ball to begin with."""
+    """Return the corners of a box around the hull. Coarse grids refine it iteratively, starting from a ball."""
     low, high = middle - radius, middle + radius
     for _ in range(4):
         spacing = float((high - low).max()) / _COARSE
@@ -138,7 +139,7 @@ def _box(
 
 
 def _first_ball(views: CapturedViews) -> tuple[np.ndarray, float]:
-    """The point nearest to the rays through the middles of all masks, and a radius that no mask exceeds there."""
+    """Return the point nearest to the rays through the centroids of all masks, and the radius of a ball there that covers every mask."""
     matrix, right = np.zeros((3, 3)), np.zeros(3)
     for view in views:
         assert view.mask is not None
@@ -169,7 +170,7 @@ def _evaluated(cameras: Sequence[Camera], distances: StoredArrays, points: np.nd
 def _refined(
     cameras: Sequence[Camera], distances: StoredArrays, low: np.ndarray, spacing: float, counts: np.ndarray
 ) -> np.ndarray:
-    """The field on a grid, evaluated only where a coarser one says that its zero level may be near."""
+    """Return the field on a grid, evaluated only where a coarser grid indicates that its zero level set is near."""
     from scipy import ndimage
 
     coarse_counts = -(-(counts - 1) // _REFINED) + 1

@@ -20,12 +20,12 @@ _KINDS = (".ply", ".obj")
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh.
+    """A triangle mesh.
 
     Attributes:
         vertices: (V, 3).
         faces: (F, 3) integers, counter-clockwise seen from outside.
-        uv: (V, 2) in [0, 1]; None where there are none.
+        uv: texture coordinates (V, 2) in [0, 1], or None.
         normals: (V, 3) unit; None for those of `normals`.
     """
 
@@ -36,7 +36,7 @@ class Mesh:
 
 
 def normals(mesh: Mesh) -> np.ndarray:
-    """Of the vertices, (V, 3) unit: means of the faces' normals weighted by their areas."""
+    """Return vertex normals, (V, 3) unit: means of the faces' normals weighted by their areas."""
     corners = mesh.vertices[mesh.faces]
     weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros_like(mesh.vertices, dtype=float)
@@ -47,7 +47,7 @@ def normals(mesh: Mesh) -> np.ndarray:
 
 
 def smooth(mesh: Mesh, steps: int) -> Mesh:
-    """Taubin's smoothing, which does not shrink: so many pairs of steps of the umbrella operator, λ = .5 and µ = -.53.
+    """Apply Taubin smoothing, which does not shrink: `steps` pairs of umbrella operator steps with λ = .5 and µ = -.53.
 
     G. Taubin, "A signal processing approach to fair surface design", SIGGRAPH 1995.
     """
@@ -67,7 +67,7 @@ def smooth(mesh: Mesh, steps: int) -> Mesh:
 
 
 def without_crumbs(mesh: Mesh, share: float) -> Mesh:
-    """Without connected parts that have less than `share` of the largest part's faces."""
+    """Return the mesh without connected components that have fewer faces than `share` times those of the largest component."""
     from scipy import sparse
     from scipy.sparse import csgraph
 
@@ -76,19 +76,19 @@ def without_crumbs(mesh: Mesh, share: float) -> Mesh:
     graph = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (count, count))
     _, parts = csgraph.connected_components(graph, directed=False)
     sizes = np.bincount(parts[mesh.faces[:, 0]], minlength=parts.max() + 1)
-    kept = mesh.faces[sizes[parts[mesh.faces[:, 0]]] >= share * sizes.max()]
-    used, faces = np.unique(kept, return_inverse=True)
+    remaining = mesh.faces[sizes[parts[mesh.faces[:, 0]]] >= share * sizes.max()]
+    used, faces = np.unique(remaining, return_inverse=True)
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3))
 
 
 def check_installed() -> None:
-    """Raise `InputError` where the package that `decimate` needs is missing."""
+    """Raise `InputError` if the package that `decimate` needs is missing."""
     if importlib.util.find_spec("fast_simplification") is None:
         raise InputError("a first shape needs fast-simplification: pip install 'unrender[capture]'")
 
 
 def decimate(mesh: Mesh, faces: int) -> Mesh:
-    """At most about so many faces, by quadric error. Raises `InputError` where the package for it is missing."""
+    """Simplify to at most about `faces` faces, by quadric error. Raise `InputError` if the required package is missing."""
     if len(mesh.faces) <= faces:
         return mesh
     try:
@@ -97,16 +97,16 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
         raise InputError(
             f"a first shape needs fast-simplification ({error}): pip install 'unrender[capture]'"
         ) from error
-    # Single precision inside: about the middle, in units of the extent.
+    # The package uses single precision, so centre and normalise the vertices.
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     local: Any = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
-    vertices, kept, *_ = fast_simplification.simplify(local, mesh.faces.astype(np.int32), target_count=faces)
-    return Mesh(np.asarray(vertices, float) * extent + middle, np.asarray(kept, np.int64))
+    vertices, triangles, *_ = fast_simplification.simplify(local, mesh.faces.astype(np.int32), target_count=faces)
+    return Mesh(np.asarray(vertices, float) * extent + middle, np.asarray(triangles, np.int64))
 
 
 def read(path: Path) -> Mesh:
-    """The mesh in a PLY or OBJ file, with its texture coordinates where it has them. Raises `InputError`."""
+    """Read the mesh in a PLY or OBJ file, with its texture coordinates if present. Raise `InputError`."""
     if bounded_files.kind(path) != "file":
         raise InputError(f"--mesh {path}: {bounded_files.no_file(path)}")
     if path.suffix.lower() not in _KINDS:
@@ -136,7 +136,7 @@ def read(path: Path) -> Mesh:
 
 
 def ply(mesh: Mesh) -> bytes:
-    """The mesh as a binary PLY file with normals, and u and v where it has them."""
+    """Return the mesh as a binary PLY file with normals, and u and v if present."""
     columns = [("xyz", mesh.vertices), (("nx", "ny", "nz"), normals(mesh) if mesh.normals is None else mesh.normals)]
     columns += [] if mesh.uv is None else [("uv", mesh.uv)]
     names = [name for group, _ in columns for name in group]

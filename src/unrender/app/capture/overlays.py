@@ -1,4 +1,4 @@
-"""Pictures to check a capture by: over each photograph the mesh, its edges and the outline of the mask."""
+"""Overlays to check a capture: the mesh, its edges and the outline of the mask over each photograph."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from unrender.losses.metrics import srgb
 LEGEND = "orange: the mesh and its edges; blue: the outline of the mask; dimmed: outside the mesh"
 _MESH, _MASK = np.array([1.0, 0.55, 0.05]), np.array([0.1, 0.55, 1.0])
 _SMALLEST = 320
-"""Pixels along the shorter side of a picture to look at."""
+"""Minimum number of pixels along the shorter side of an overlay."""
 _TINT = 0.3
 _CREASE = math.cos(math.radians(50))
 _LARGEST_SHEET = 48
@@ -26,7 +26,7 @@ _LABEL = 14
 
 
 def overlay(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
-    """(h, w, 3) in [0, 1], sRGB, enlarged by a whole factor where the view is small."""
+    """Return an overlay (h, w, 3) in [0, 1], sRGB, enlarged by an integer factor for small views."""
     factor = max(1, math.ceil(_SMALLEST / max(1, min(view.lens.width, view.lens.height))))
     lens = view.lens.scaled(factor * view.lens.width, factor * view.lens.height)
     normals, distances = silhouettes.normals(lens, view.camera_to_world)
@@ -43,19 +43,19 @@ def overlay(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
 
 
 def chosen(count: int) -> list[int]:
-    """Which of so many pictures a sheet shows: at most 48, evenly."""
+    """Return the indices of at most 48 evenly spaced pictures for a contact sheet."""
     return np.unique(np.linspace(0, count - 1, min(count, _LARGEST_SHEET)).round().astype(int)).tolist()
 
 
 def thumbnail(picture: np.ndarray) -> Image.Image:
-    """A picture with values in [0, 1] as it is on a sheet, 8 bits."""
+    """Return a picture with values in [0, 1] as an 8-bit thumbnail."""
     small = Image.fromarray(_bytes(picture))
     small.thumbnail((_CELL - 4, _CELL - 4), Image.Resampling.BOX)
     return small
 
 
 def contact_sheet(thumbnails: Sequence[Image.Image], labels: Sequence[str]) -> bytes:
-    """PNG of the pictures with their labels."""
+    """Return the pictures with their labels as a PNG file."""
     columns = min(8, math.ceil(math.sqrt(len(thumbnails))))
     rows = math.ceil(len(thumbnails) / columns)
     sheet = Image.new("RGB", (columns * _CELL, rows * (_CELL + _LABEL) + _LABEL), (20, 20, 20))
@@ -69,7 +69,7 @@ def contact_sheet(thumbnails: Sequence[Image.Image], labels: Sequence[str]) -> b
 
 
 def png(picture: np.ndarray) -> bytes:
-    """A picture with values in [0, 1] as a PNG file."""
+    """Return a picture with values in [0, 1] as a PNG file."""
     return _encoded(Image.fromarray(_bytes(picture)))
 
 
@@ -83,23 +83,23 @@ def _enlarged(mask: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _outline(inside: np.ndarray) -> np.ndarray:
-    """Pixels inside with a neighbour outside."""
+    """Return the pixels inside that have a neighbour outside."""
     padded = np.pad(inside, 1, mode="edge")
     surrounded = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     return inside & ~surrounded
 
 
 def _creases(normals: np.ndarray, distances: np.ndarray, inside: np.ndarray) -> np.ndarray:
-    """Where normals turn by more than 50° or depth jumps, from a pixel to the next."""
-    found = np.zeros(inside.shape, bool)
+    """Return the pixels where, from one pixel to the next, normals change by more than 50° or depth is discontinuous."""
+    edges = np.zeros(inside.shape, bool)
     for axis in (0, 1):
         here, there = [slice(None)] * 2, [slice(None)] * 2
         here[axis], there[axis] = slice(0, -1), slice(1, None)
         a, b = tuple(here), tuple(there)
         both = inside[a] & inside[b]
-        found[a] |= both & ((normals[a] * normals[b]).sum(-1) < _CREASE)
-        found[a] |= both & (np.abs(distances[a] - distances[b]) > 0.06)
-    return found
+        edges[a] |= both & ((normals[a] * normals[b]).sum(-1) < _CREASE)
+        edges[a] |= both & (np.abs(distances[a] - distances[b]) > 0.06)
+    return edges
 
 
 def _latin(text: str) -> str:

@@ -1,13 +1,13 @@
-"""Photographs of one camera under known lights as a problem: a plate with a colour and a normal map, seen from afar.
+"""Photographs of one camera under known lights as a problem: a flat plate with a colour map and a normal map, seen from a distance.
 
-A texel is a pixel. The plate fills the picture, faces the camera, and casts no shadow on itself: where the object does, a photograph
-disagrees with the others, which the loss (L1) bears.
+A texel is a pixel. The plate fills the picture, faces the camera, and casts no shadow on itself. Where the object does, a photograph is
+inconsistent with the others, to which the loss (L1) is robust.
 
-The start is the least-squares solution of Woodham (1980). Where a pixel lies in no shadow, a matt surface shows
+The start is the least-squares solution of Woodham (1980). For an unshadowed pixel, a diffuse surface gives
 
     I_k = ρ n · l_k,   so that   ρ n = argmin Σ_k (I_k - g · l_k)²,
 
-with l_k towards light k, ρ the reflectance times the light's strength, and n the normal.
+where l_k points towards light k, ρ is the reflectance times the light's intensity, and n is the normal.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba import turntable_light
 
 _SHADOW = 0.1
-"""Of the brightest a pixel becomes: what is darker may lie in a shadow."""
+"""Fraction of a pixel's maximum brightness below which it may be in shadow."""
 _WHITE = 0.97
 _CLEARER = 0.9
-"""How much smaller the residual of values as stored has to be for them to be taken as linear."""
+"""Maximum ratio of the residuals of stored and of decoded values at which the stored values are treated as linear."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +78,14 @@ class LitViews:
 
 
 def prepare(capture: LitCapture, resolution: int, scale: float | None, hold_out: int | None) -> LitViews:
-    """Read all photographs, at most `resolution` pixels along the longer side.
+    """Read all photographs, with at most `resolution` pixels along the longer side.
 
-    Files of 8 or 16 bits are taken as sRGB, or as linear where a matt surface explains their values as stored clearly better.
+    Files of 8 or 16 bits are decoded as sRGB, or as linear if a diffuse surface fits their stored values clearly better.
 
     Args:
-        capture: what the folder holds.
+        capture: contents of the folder.
         resolution, scale: see `views.prepare`.
-        hold_out: every so many lights one is held out, 0 for none; None for 6.
+        hold_out: interval of lights that are held out, 0 for none; None for 6.
 
     Raises:
         InputError: a photograph cannot be read, has another size, or the mask is empty.
@@ -97,14 +97,14 @@ def prepare(capture: LitCapture, resolution: int, scale: float | None, hold_out:
     lens = Lens(width, height, float(width), float(width), width / 2, height / 2)
     target = pinhole(lens, min(1.0, resolution / max(width, height)) if scale is None else scale)
     resample = Resampling(lens, target)
-    found = []
+    resampled = []
     for path in capture.photographs:
         read = pictures.read(path).values
         if read.shape[:2] != (height, width):
             has = f"{read.shape[1]} x {read.shape[0]} pixels, the first photograph {width} x {height}"
-            raise InputError(f"{path}: {has}: one camera that stands still has one size")
-        found.append(resample.apply(read)[0])
-    mask = np.ones(found[0].shape[:2], np.float32)
+            raise InputError(f"{path}: {has}: expected one size for a static camera")
+        resampled.append(resample.apply(read)[0])
+    mask = np.ones(resampled[0].shape[:2], np.float32)
     if capture.mask is not None:
         given = pictures.read_mask(capture.mask)
         if given.shape != (height, width):
@@ -112,21 +112,21 @@ def prepare(capture: LitCapture, resolution: int, scale: float | None, hold_out:
         mask = np.clip(resample.apply(given[..., None])[0][..., 0], 0, 1)
         if not (mask > 0.999).any():
             raise InputError(f"{capture.mask}: empty (black); expected white on the object")
-    count = len(found)
+    count = len(resampled)
     held_out = tuple(bool(every and index % every == every // 2) for index in range(count))
     if count - sum(held_out) < 4:
         held_out = (False,) * count
     views = LitViews(
-        tuple(path.name for path in capture.photographs), np.array(found), capture.directions, mask, held_out, False
+        tuple(path.name for path in capture.photographs), np.array(resampled), capture.directions, mask, held_out, False
     )
-    if float(views.values.max()) > 1.001:  # no photograph's of 8 or 16 bits
+    if float(views.values.max()) > 1.001:  # not from files of 8 or 16 bits
         return views
     stored = replace(views, values=srgb(views.values).astype(np.float32), linear=True)
     return stored if _residual(stored) < _CLEARER * _residual(views) else views
 
 
 def _residual(views: LitViews) -> float:
-    """Relative root mean square residual of least squares where no shadow falls and nothing is white."""
+    """Return the relative root mean square residual of least squares over unshadowed, unsaturated pixels."""
     chosen = views.training
     values = views.values[chosen][:, views.mask > 0.999].mean(-1)
     clear = lit(values) & (values < _WHITE).all(0)
@@ -139,14 +139,14 @@ def _residual(views: LitViews) -> float:
 
 
 def lit(values: np.ndarray) -> np.ndarray:
-    """Of brightnesses (N, ...) under N lights: whether none is so dark beside the brightest that a shadow may fall there."""
+    """Return, for brightnesses (N, ...) under N lights, whether all are bright enough relative to the brightest to exclude shadows."""
     return (values > _SHADOW * values.max(0)).all(0) & (values.max(0) > 0)
 
 
 def least_squares(values: np.ndarray, directions: Sequence[np.ndarray] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (..., 3) of unit length and reflectances (..., 3) per channel, of linear values (N, ..., 3) under N lights.
+    """Return unit normals (..., 3) and reflectances (..., 3) per channel, for linear values (N, ..., 3) under N lights.
 
-    Shadows count as if they were dark colours. Normals are of the mean of the channels; where all is black, they face the camera.
+    Shadows are treated as dark colours. Normals come from the mean of the channels; those of black pixels face the camera.
     """
     lights = np.asarray(directions, float)
     flat = np.asarray(values, float).reshape(len(lights), -1, 3)
@@ -159,45 +159,45 @@ def least_squares(values: np.ndarray, directions: Sequence[np.ndarray] | np.ndar
 
 
 NAMES = ("colour", "normal", "exposure")
-"""The unknowns that such a problem may have."""
+"""Possible unknowns of such a problem."""
 _COLOUR, _NORMAL = "base-colour.exr", "normal.exr"
 OWN = frozenset({PROBLEM, HELD_OUT, SCENE, REFERENCES, MASKS, TEXTURES})
-"""What `write` puts into a folder."""
+"""Names that `write` creates in a folder."""
 _KEYS = {
     "colour": "plate.bsdf.nested_bsdf.reflectance.data",
     "normal": "plate.bsdf.normalmap.data",
     "exposure": EXPOSURE,
 }
 _BRIGHTEST = 0.8
-"""Reflectance of the brightest pixels but one in a hundred."""
+"""Reflectance of the 99th percentile of brightness."""
 _FAR, _DISTANCE = 1e4, 100.0
-"""Of the light, and of the camera in half the plate's width: nearly orthographic, and recorded kernels make its rays themselves."""
+"""Distances of the light, and of the camera in half plate widths: nearly orthographic, with a sensor that recorded kernels support."""
 
 
 def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> None:
     """Write the problem to an empty folder.
 
     Args:
-        folder: exists.
-        name: of the problem.
-        views: of photographs.
-        chosen: the unknowns, of `NAMES`.
+        folder: an existing folder.
+        name: name of the problem.
+        views: views of the photographs.
+        chosen: the unknowns, from `NAMES`.
 
     Raises:
-        InputError: the mask leaves no whole pixel, or an unknown is none of such a problem.
+        InputError: the mask covers no pixel completely, or an unknown is not supported.
     """
     if others := [one for one in chosen if one not in NAMES]:
         raise InputError(
-            f"--unknowns {others[0]}: of one camera under known lights, expected some of {', '.join(NAMES)}"
+            f"--unknowns {others[0]}: for one camera under known lights, expected some of {', '.join(NAMES)}"
         )
     for part in (REFERENCES, MASKS, TEXTURES):
         (folder / part).mkdir()
     inside: np.ndarray = np.asarray(ndimage.binary_erosion(views.mask > 0.999, np.ones((3, 3)), border_value=1))
     if not inside.any():
-        raise InputError(f"{name}: the mask leaves no whole pixel; give a larger --resolution")
+        raise InputError(f"{name}: the mask covers no pixel completely; give a larger --resolution")
     chosen_views = views.training
-    seen: np.ndarray = views.values[chosen_views]
-    _, colour = least_squares(seen[:, inside], views.directions[chosen_views])
+    training_values: np.ndarray = views.values[chosen_views]
+    _, colour = least_squares(training_values[:, inside], views.directions[chosen_views])
     strength = max(float(np.quantile(colour.max(1), 0.99)) / _BRIGHTEST, 1e-4)
     height, width = views.mask.shape
     write_exr(np.full((height, width, 3), np.median(colour) / strength, np.float32), folder / TEXTURES / _COLOUR)
@@ -218,7 +218,7 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
 
 
 def _scene(views: LitViews, strength: float) -> bytes:
-    """The camera looks along -z at a plate of width 2; a sensor for each light, told apart by time."""
+    """Return the scene. The camera looks along -z at a plate of width 2; each light has its own sensor, distinguished by time."""
     root = Xml.Element("scene", version="3.0.0")
     height, width = views.mask.shape
     for index, photograph in enumerate(views.names):
@@ -254,7 +254,7 @@ def _scene(views: LitViews, strength: float) -> bytes:
 
 
 def _towards(direction: np.ndarray) -> np.ndarray:
-    """The shortest rotation that takes z, from where the lamp shines, to a direction with z > 0, (3, 3)."""
+    """Return the shortest rotation from z, the lamp's direction, to a direction with z > 0, (3, 3)."""
     x, y, z = direction
     k = np.array([[0, 0, x], [0, 0, y], [-x, -y, 0]])
     return np.eye(3) + k + k @ k / (1 + z)

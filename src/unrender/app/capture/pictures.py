@@ -1,4 +1,4 @@
-"""Reading photographs: pixels as stored, turned upright only where the camera says so, in linear values; and what their masks hold."""
+"""Reading of photographs as linear values, and of masks. Pixels are rotated only if the camera requires it."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _PILLOW_KINDS = {
     "PPM": ("PPM",),
     "TGA": ("TGA",),
 }
-"""Kinds of files that Pillow decodes, with Pillow's names of their formats. Pillow opens no file by another plugin."""
+"""{kind of file: Pillow's name of the format} for files that Pillow decodes. Other Pillow plugins are not used."""
 _PILLOW_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr")
-"""Modes of 8 bits or fewer a channel. Pillow clips what has more."""
+"""Pillow modes of at most 8 bits per channel. Pillow clips others."""
 _ORIENTATION = 0x0112
 _QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 3}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
-"""Quarter turns against the clock that EXIF's orientation asks for; 2, 4, 5 and 7 mirror, too."""
+"""{EXIF orientation: counter-clockwise quarter turns}; orientations 2, 4, 5 and 7 are also mirrored."""
 _MIRRORED = (2, 4, 5, 7)
 _LONGEST_SIDE = 1 << 15
-"""In pixels, exclusive: OpenCV's `remap` takes no more."""
+"""Exclusive limit of a side in pixels, set by OpenCV's `remap`."""
 _BROKEN = (OSError, ValueError, SyntaxError, struct.error, Image.DecompressionBombError)
 _RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".heic", ".heif")
 
@@ -46,7 +46,7 @@ class Pixels:
 
     Attributes:
         values: (H, W, 3) float32, linear.
-        alpha: (H, W) float32 in [0, 1]; None where the file has none, or it is 1 everywhere.
+        alpha: (H, W) float32 in [0, 1]; None if the file has none, or if it is 1 everywhere.
     """
 
     values: np.ndarray
@@ -54,9 +54,9 @@ class Pixels:
 
 
 def _stored_size(path: Path) -> tuple[int, int, int]:
-    """Width and height of the pixels as stored, and EXIF's orientation (1 where there is none). From the file's header alone.
+    """Return width and height of the stored pixels, and EXIF's orientation (1 if absent), from the file's header.
 
-    Raises `InputError` where the file is no picture, or too large a one.
+    Raises `InputError` if the file is not a picture, or is too large.
     """
     if path.suffix.lower() in _RAW:
         raise InputError(f"{path}: camera raw files are not read; develop them to .exr (linear), .png or .tif (sRGB)")
@@ -76,28 +76,28 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
 
 
 def _orientation(picture: Image.Image) -> int:
-    """EXIF's, 1 where there is none or it cannot be read."""
+    """Return EXIF's orientation, 1 if it is absent or unreadable."""
     try:
         return int(picture.getexif().get(_ORIENTATION, 1))
-    except Exception:  # what cameras and editors write there is often broken, and Pillow throws whatever it meets
+    except Exception:  # EXIF data is often malformed, and Pillow raises many types of exceptions
         return 1
 
 
 def _oriented_size(width: int, height: int, orientation: int) -> tuple[int, int]:
-    """Width and height as EXIF's orientation shows the picture."""
+    """Return width and height after applying EXIF's orientation."""
     return (height, width) if orientation in _QUARTER_TURNS else (width, height)
 
 
 def read(path: Path, orientation: int = 1, response: str = decoding.SRGB) -> Pixels:
-    """The photograph in a file. 8- and 16-bit integers are decoded, floating-point numbers are linear; CMYK becomes RGB.
+    """Read a photograph. 8- and 16-bit integers are decoded, floating-point numbers are linear; CMYK becomes RGB.
 
     Args:
         path: the file.
-        orientation: EXIF's, to turn the pixels by; 1 for as stored.
-        response: of integers, see `decoding.linear`.
+        orientation: EXIF orientation to apply; 1 for none.
+        response: response of integers, see `decoding.linear`.
 
     Raises:
-        InputError: the file cannot be read, or not all of it.
+        InputError: the file cannot be read completely.
     """
     array = _decode(path)
     if array is None:
@@ -117,7 +117,7 @@ def read(path: Path, orientation: int = 1, response: str = decoding.SRGB) -> Pix
 
 
 def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
-    """A mask, (H, W) float32 in [0, 1]: alpha where a file has it and it is not 1 everywhere, else the mean of its channels as stored."""
+    """Read a mask, (H, W) float32 in [0, 1]: alpha if it is present and not 1 everywhere, else the mean of the stored channels."""
     _stored_size(path)
     array = _decode(path)
     if array is not None:
@@ -132,27 +132,27 @@ def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
 
 
 def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
-    """Width, height and orientation with which a photograph is to be read, so that it has the lens's proportions.
+    """Return width, height and orientation with which a photograph has the lens's aspect ratio.
 
-    Cameras are calibrated on pixels, and most programs take them as stored. So EXIF's orientation is applied only where the picture has the
-    lens's proportions when it is turned, and does not as it is stored.
+    Cameras are calibrated on pixels, and most programs use them as stored. EXIF's orientation is therefore applied only if the rotated
+    picture has the lens's aspect ratio and the stored one does not.
 
     Raises:
-        InputError: it has them neither way.
+        InputError: neither has it.
     """
     width, height, orientation = _stored_size(path)
     if lens is None or _proportional(width, height, lens):
         return width, height, 1
-    turned = _oriented_size(width, height, orientation)
-    if turned != (width, height) and _proportional(*turned, lens):
-        return *turned, orientation
+    rotated_size = _oriented_size(width, height, orientation)
+    if rotated_size != (width, height) and _proportional(*rotated_size, lens):
+        return *rotated_size, orientation
     raise InputError(
-        f"{path}: {width} x {height} pixels, but its camera has {lens.width} x {lens.height}: other proportions"
+        f"{path}: {width} x {height} pixels, but its camera has {lens.width} x {lens.height}: expected the same aspect ratio"
     )
 
 
 def _proportional(width: int, height: int, lens: Lens) -> bool:
-    """Whether a picture is the lens's to half a pixel along its shorter side."""
+    """Return whether the aspect ratio equals the lens's within half a pixel along the shorter side."""
     x, y = width / lens.width, height / lens.height
     return abs(x - y) * min(lens.width, lens.height) <= 1.0 + 1e-6 and abs(x / y - 1) < 0.02
 
@@ -171,7 +171,7 @@ def _decode(path: Path) -> np.ndarray | None:
 
 
 def _header(path: Path) -> image_size.Header:
-    """Return the header of a photograph or mask. Raises `InputError` where it is of no kind that is read, or too large."""
+    """Return the header of a photograph or mask. Raise `InputError` if its kind is not supported, or it is too large."""
     try:
         header = image_size.read_photograph_header(path)
     except InputError as error:
@@ -182,7 +182,7 @@ def _header(path: Path) -> image_size.Header:
 
 
 def _is_16_bit(header: image_size.Header) -> bool:
-    """Whether a PNG file has 16 bits a channel, which Pillow would cut to 8."""
+    """Return whether a PNG file has 16 bits per channel, which Pillow would truncate to 8."""
     return header.kind == "PNG" and header.bits == 16
 
 
@@ -191,7 +191,7 @@ def _opened(path: Path, header: image_size.Header) -> Iterator[Image.Image]:
     """Open a file by Pillow, by the plugin of the kind that its header has and by no other. Errors of Pillow become `InputError`."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of sizes, where our own limit is as large, and of broken EXIF
+            warnings.simplefilter("ignore")  # Pillow's size limit equals ours, and malformed EXIF is handled
             with (
                 bounded_files.open_regular(path) as file,
                 Image.open(file, formats=_PILLOW_KINDS[header.kind]) as picture,

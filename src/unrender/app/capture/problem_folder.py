@@ -40,13 +40,13 @@ MESH = "asset.ply"
 LIGHT = "textures/light.exr"
 _FOLDERS = (REFERENCES, MASKS, TEXTURES)
 OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, stages_file.FILE, *_FOLDERS})
-"""What `write` puts into a folder."""
+"""Names that `write` creates in a folder."""
 _LIGHT_SIZE = 16, 32
 _MAX_DEPTH = 3
 _WHOLE = 0.999
 _BAND_WEIGHT = 0.1
 _WHITE = 0.95
-"""Of a saturated pixel, linear: resizing mixes it with its neighbours."""
+"""Minimum linear value of a saturated pixel, below 1 since resizing averages neighbours."""
 
 
 def write(
@@ -63,18 +63,18 @@ def write(
     """Write the problem and its stages to an empty folder.
 
     Args:
-        folder: exists.
-        name: of the problem.
-        views: of photographs.
-        mesh: with texture coordinates.
-        silhouettes: of it.
+        folder: an existing folder.
+        name: name of the problem.
+        views: views of the photographs.
+        mesh: mesh with texture coordinates.
+        silhouettes: silhouettes of the mesh.
         texture: texels along the sides of the textures.
-        chosen: the unknowns, of `unknowns.NAMES`.
-        band: pixels along the border of the masks that count little, of training views.
-        turntable: whether the light stands still before the cameras.
+        chosen: the unknowns, from `unknowns.NAMES`.
+        band: width in pixels of the border of training masks with reduced weight.
+        turntable: whether the light is fixed relative to the cameras.
 
     Raises:
-        InputError: a mask leaves no whole pixel.
+        InputError: a mask covers no pixel completely.
     """
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
     (folder / MESH).write_bytes(ply(mesh))
@@ -92,15 +92,15 @@ def write(
         (folder / MASKS / f"{stem}.png").write_bytes(png(np.repeat(weights[..., None], 3, 2)))
     for file, values in unknowns.textures(chosen, texture).values():
         write_exr(values, folder / TEXTURES / file)
-    # Under an even light, a surface shows its base colour times the light's radiance.
+    # Under uniform light, a surface shows its base colour times the light's radiance.
     radiance = max(float(np.median(level)) / unknowns.COLOUR, 1e-4)
     write_exr(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
-    # Numbers above 1 are no photograph's of 8 or 16 bits, which end at white.
+    # Values above 1 cannot come from files of 8 or 16 bits.
     white = clipped and brightest <= 1.001
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
     tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), turntable)
     _write_problems(folder, name, views, stems, tables, loss)
-    note = "Each stage begins with what the one before it found. Run all: unrender run stages.toml"
+    note = "Each stage starts from the result of the previous stage. Run all: unrender run stages.toml"
     stages = unknowns.stages(chosen, Path(PROBLEM), turntable)
     text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
     (folder / stages_file.FILE).write_text(text, encoding="utf-8")
@@ -109,7 +109,7 @@ def write(
 def _write_problems(
     folder: Path, name: str, views: CapturedViews, stems: Sequence[str], tables: Sequence[dict], loss: Any
 ) -> None:
-    """The files of the training views and of those that are held out; `tables`: of the parameters."""
+    """Write the problem files of the training views and of the held-out views. `tables` are those of the parameters."""
     for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
         sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
         moved = [table for table in tables if not (held_out and table["key"] in OF_PHOTOGRAPHS)]
@@ -123,31 +123,33 @@ def _write_problems(
 
 
 def to_world(camera_to_world: np.ndarray) -> np.ndarray:
-    """The pose of a camera as `to_world` of Mitsuba's sensors, (4, 4)."""
+    """Return the pose of a camera as `to_world` of Mitsuba's sensors, (4, 4)."""
     return camera_to_world @ MITSUBA_TO_OPENGL
 
 
 def _loss_mask(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
-    """Which pixels count: wholly covered by the object, the mesh and the photograph, and so are their eight neighbours."""
+    """Return the pixels of the loss: they and their eight neighbours are covered completely by the object, the mesh and the photograph."""
     from scipy import ndimage
 
     inside = (view.shown > _WHOLE) & silhouettes.mask(view.lens, view.camera_to_world)
     if view.mask is not None:
         inside &= view.mask > _WHOLE
-    found = ndimage.binary_erosion(inside, np.ones((3, 3)), border_value=1)
-    found = found if found.any() else inside
-    if not found.any():
-        raise InputError(f"{printable(view.name)}: mesh and mask share no whole pixel; give a larger --resolution")
-    return found
+    mask_of_loss = ndimage.binary_erosion(inside, np.ones((3, 3)), border_value=1)
+    mask_of_loss = mask_of_loss if mask_of_loss.any() else inside
+    if not mask_of_loss.any():
+        raise InputError(
+            f"{printable(view.name)}: mesh and mask have no complete pixel in common; give a larger --resolution"
+        )
+    return mask_of_loss
 
 
 def _banded(mask: np.ndarray, band: int) -> np.ndarray:
-    """Weights of pixels: 1 inside, little within `band` pixels of the border."""
+    """Return pixel weights: 1 inside, reduced within `band` pixels of the border."""
     from scipy import ndimage
 
     if not band:
         return mask.astype(np.float32)
-    # What lies outside of the picture is no border of the object.
+    # The edge of the picture is not a border of the object.
     distance = ndimage.distance_transform_edt(np.pad(mask, band + 1, mode="edge"))
     assert isinstance(distance, np.ndarray)
     inner = distance[band + 1 : -band - 1, band + 1 : -band - 1] > band
@@ -159,7 +161,7 @@ def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Seque
     corners = np.array([mesh.vertices.min(0), mesh.vertices.max(0)])
     radius = float(np.linalg.norm(corners[1] - corners[0])) / 2
     distances = [float(np.linalg.norm(view.camera_to_world[:3, 3] - corners.mean(0))) for view in views]
-    # The same for all cameras: else each has a kernel of its own where views are rendered one by one.
+    # Equal values for all cameras avoid one kernel per camera when views are rendered one by one.
     clip = max(min(distances) - radius, radius / 100) / 10, 10 * (max(distances) + radius)
     for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
         sensor = sensor_element(view, stem, *clip)
@@ -175,7 +177,7 @@ def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Seque
 
 
 def _light(root: Xml.Element, views: CapturedViews, radius: float, turntable: bool) -> None:
-    """An environment map; of a turntable, one that turns with the cameras."""
+    """Add an environment map; for a turntable, one that rotates with the cameras."""
     if turntable:
         root = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
         turns = light_turns(np.array([view.camera_to_world for view in views]))
@@ -188,7 +190,7 @@ def _light(root: Xml.Element, views: CapturedViews, radius: float, turntable: bo
 
 
 def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
-    """A principled BSDF whose textures lie over the atlas, within a normal map where that is unknown."""
+    """Add a principled BSDF with textures of the atlas, inside a normal map if that is unknown."""
     textures = unknowns.textures(chosen, 1)
     if "normalmap" in textures:
         shape = Xml.SubElement(shape, "bsdf", type="normalmap")
@@ -201,12 +203,12 @@ def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
 
 
 def sensor_element(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
-    """The camera of a view, as the scene has it."""
+    """Return the sensor of a view as a scene element."""
     lens = view.lens
     sensor = Xml.Element("sensor", type="perspective", id=f"camera-{stem}")
     add_value(sensor, "string", "fov_axis", "x")
     add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(lens.width / (2 * lens.fx))))
-    # Mitsuba moves the picture against the principal point, in units of its sides.
+    # Mitsuba shifts the picture opposite to the principal point, in units of its sides.
     add_value(sensor, "float", "principal_point_offset_x", 0.5 - lens.cx / lens.width)
     add_value(sensor, "float", "principal_point_offset_y", 0.5 - lens.cy / lens.height)
     add_value(sensor, "float", "near_clip", near)

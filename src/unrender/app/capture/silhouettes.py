@@ -1,4 +1,4 @@
-"""Silhouettes of a mesh in photographs, and how far they agree with the masks."""
+"""Silhouettes of a mesh in photographs, and their overlap with the masks."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ __all__ = ["Silhouettes", "overlap"]
 
 
 class Silhouettes:
-    """What rays through the middles of pixels meet of a mesh.
+    """Intersections of rays through pixel centres with a mesh.
 
     Args:
-        mesh: moved about its middle and scaled to a unit box inside, so that single precision suffices wherever it is.
+        mesh: it is centred and scaled to a unit box internally, so that single precision suffices at any position.
     """
 
     def __init__(self, mesh: Mesh):
@@ -34,18 +34,18 @@ class Silhouettes:
         self._scene: Any = mi.load_dict({"type": "scene", "mesh": made})
 
     def mask(self, lens: Lens, camera_to_world: np.ndarray) -> np.ndarray:
-        """(H, W), whether the ray through the middle of a pixel meets the mesh."""
+        """Return (H, W), whether the ray through a pixel's centre hits the mesh."""
         return np.array(self._scene.ray_test(self._rays(lens, camera_to_world))).reshape(lens.height, lens.width)
 
     def normals(self, lens: Lens, camera_to_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normals in the camera's axes, (H, W, 3), 0 where nothing is met; and distances in units of the mesh's extent, (H, W)."""
+        """Return normals in the camera's axes, (H, W, 3), 0 without a hit, and distances in units of the mesh's extent, (H, W)."""
         import drjit as dr
         import mitsuba as mi
 
-        found = self._scene.ray_intersect(self._rays(lens, camera_to_world))
-        met = found.is_valid()
-        normal = np.array(dr.select(met, found.sh_frame.n, mi.Normal3f(0))).T @ camera_to_world[:3, :3]
-        distance = np.array(dr.select(met, found.t, 0))
+        hits = self._scene.ray_intersect(self._rays(lens, camera_to_world))
+        valid = hits.is_valid()
+        normal = np.array(dr.select(valid, hits.sh_frame.n, mi.Normal3f(0))).T @ camera_to_world[:3, :3]
+        distance = np.array(dr.select(valid, hits.t, 0))
         return normal.reshape(lens.height, lens.width, 3), distance.reshape(lens.height, lens.width)
 
     def _rays(self, lens: Lens, camera_to_world: np.ndarray) -> Any:
@@ -61,11 +61,11 @@ class Silhouettes:
 
 
 def overlap(silhouettes: Silhouettes, views: CapturedViews) -> list[float]:
-    """Intersection over union of the mesh's silhouette and the mask, for each view with a mask, where the photograph shows anything."""
-    found = []
+    """Return the intersection over union of the mesh's silhouette and the mask, for each view with a mask, inside the photograph."""
+    ratios = []
     for view in views:
         if view.mask is not None:
             known = view.shown > 0.5
             mask, silhouette = (view.mask > 0.5) & known, silhouettes.mask(view.lens, view.camera_to_world) & known
-            found.append(float((mask & silhouette).sum() / max(1, (mask | silhouette).sum())))
-    return found
+            ratios.append(float((mask & silhouette).sum() / max(1, (mask | silhouette).sum())))
+    return ratios

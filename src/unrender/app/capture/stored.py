@@ -1,4 +1,4 @@
-"""Arrays and views that wait in a file without a name, so that memory does not grow with the number of photographs."""
+"""Arrays and views in an anonymous temporary file, so that memory does not grow with the number of photographs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _NONE = np.zeros(0, np.float32)
 
 
 class StoredArrays:
-    """Arrays of float32, each read when it is asked for.
+    """Arrays of float32, each read on access.
 
     Args:
-        arrays: taken one by one.
+        arrays: consumed one by one.
     """
 
     def __init__(self, arrays: Iterable[np.ndarray] = ()):
-        self._file = tempfile.TemporaryFile(prefix="unrender-")  # noqa: SIM115 (it lives as long as this does)
+        self._file = tempfile.TemporaryFile(prefix="unrender-")  # noqa: SIM115 (it is open as long as this object exists)
         weakref.finalize(self, self._file.close)
         self._places: list[tuple[int, tuple[int, ...]]] = []
         for array in arrays:
@@ -48,10 +48,10 @@ class StoredArrays:
 
 
 class StoredViews:
-    """Views with masks or without, each read when it is asked for. Names, poses and lenses stay in memory.
+    """Views with or without masks, each read on access. Names, poses and lenses stay in memory.
 
     Args:
-        views: taken one by one.
+        views: consumed one by one.
     """
 
     def __init__(self, views: Iterable[CapturedView] = ()):
@@ -70,14 +70,14 @@ class StoredViews:
         self._indices = range(len(self._views))
 
     def of(self, held_out: bool) -> StoredViews:
-        """Those that are held out, or those that are not: another look at the same arrays."""
-        found = object.__new__(StoredViews)
-        found.__dict__.update(self.__dict__)
-        found._indices = [index for index in self._indices if self._views[index][0].held_out == held_out]
-        return found
+        """Return the held-out or the other views, which share the stored arrays."""
+        subset = object.__new__(StoredViews)
+        subset.__dict__.update(self.__dict__)
+        subset._indices = [index for index in self._indices if self._views[index][0].held_out == held_out]
+        return subset
 
     def bare(self) -> list[CapturedView]:
-        """All views without their arrays."""
+        """Return all views without their arrays."""
         return [self._views[index][0] for index in self._indices]
 
     @property

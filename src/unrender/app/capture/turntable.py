@@ -1,7 +1,7 @@
-"""Captures on a turntable: the camera and the light stand still while the object turns, and poses are in the object's world.
+"""Turntable captures: camera and light are fixed while the object rotates, and poses are in the object's frame.
 
-The light then turns in that world, by the same angle about the table's axis as the camera. Whether a capture is one shows in the
-background: it stands still in the photographs although the poses differ.
+In that frame the light rotates about the table's axis by the same angle as the camera. The background identifies such a capture: it is
+the same in all photographs although the poses differ.
 """
 
 from __future__ import annotations
@@ -12,54 +12,55 @@ from unrender.app.capture.capture import CapturedViews
 
 _LIKENESS = 0.4
 _BLUR = 1 / 32
-"""Of the picture's longer side: tripods and crops move a little."""
+"""Blur relative to the picture's longer side, which tolerates small movements of tripod and crop."""
 _FEWEST_PIXELS = 200
 _FEWEST_VIEWS = 4
 _CONTRAST = 0.01
-"""Standard deviation of the background, as displayed, below which it tells nothing."""
+"""Minimum standard deviation of an informative background, in display values."""
 _ANGLE = np.radians(20)
 _LEVEL = 0.98
-"""Mean of the axis as the cameras see it, at least: their height above the table hardly changes."""
+"""Minimum length of the mean axis in camera coordinates: the cameras' elevation is nearly constant."""
 
 
 def axis(poses: np.ndarray) -> np.ndarray:
-    """The table's axis, upwards, (3,) unit: the direction in the world that differs least as the cameras see it.
+    """Return the table's axis, upwards, (3,) unit: the world direction that varies least in camera coordinates.
 
     Args:
         poses: (N, 4, 4) camera to world, axes right, up, backwards.
     """
     mean = np.mean(poses[:, :3, :3].transpose(0, 2, 1), 0)
-    found = np.linalg.svd(mean)[2][0]
-    return found if (mean @ found)[1] >= 0 else -found
+    direction = np.linalg.svd(mean)[2][0]
+    return direction if (mean @ direction)[1] >= 0 else -direction
 
 
 def light_turns(poses: np.ndarray) -> np.ndarray:
-    """Rotations (N, 3, 3), from the axes of the light's map to the world's, for light that stands still before each camera.
+    """Return rotations (N, 3, 3) from the axes of the light's map to the world's, for a light that is fixed relative to each camera.
 
-    The map's y is the table's axis, its z points towards the camera as seen from above.
+    The map's y axis is the table's axis; its z axis points towards the camera as seen from above.
     """
     up = axis(poses)
-    found = []
+    rotations = []
     for pose in poses[:, :3, :3]:
-        # The camera's backward axis, or, where it looks down along the table's axis, what is below in its picture.
+        # Use the camera's backward axis or, if it looks down along the table's axis, the downward direction of its picture.
         towards = max((pose[:, 2], -pose[:, 1]), key=lambda v: float(np.linalg.norm(v - up * (v @ up))))
         z = towards - up * (towards @ up)
         z /= np.linalg.norm(z)
-        found.append(np.stack([np.cross(up, z), up, z], 1))
-    return np.array(found)
+        rotations.append(np.stack([np.cross(up, z), up, z], 1))
+    return np.array(rotations)
 
 
 def stands_still(views: CapturedViews) -> bool:
-    """Whether the background is the same in photographs whose poses differ by more than 20 degrees, all from one height."""
+    """Return whether the background is equal in photographs whose poses differ by more than 20 degrees, all from one elevation."""
     poses = np.array([view.camera_to_world for view in views])
     seen = poses[:, :3, :3].transpose(0, 2, 1) @ axis(poses)
     return float(np.linalg.norm(seen.mean(0))) > _LEVEL and likeness(views) > _LIKENESS
 
 
 def likeness(views: CapturedViews) -> float:
-    """The mean correlation of two photographs' backgrounds, over pairs whose poses differ by more than 20 degrees; 0 where it is unknown.
+    """Return the mean correlation of two photographs' backgrounds, over pairs whose poses differ by more than 20 degrees; 0 if it is
+    unknown.
 
-    Of the background's variation along each row alone: what is above and what is below are alike wherever one stands.
+    Only the background's variation along each row counts, since vertical variation is similar from every viewpoint.
     """
     from scipy import ndimage
 

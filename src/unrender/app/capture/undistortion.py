@@ -1,8 +1,8 @@
-"""Photographs as a pinhole camera with square pixels would have taken them, at a chosen resolution: what Mitsuba's `perspective` renders.
+"""Undistortion of photographs to a pinhole camera with square pixels, at a chosen resolution: what Mitsuba's `perspective` renders.
 
-Every pixel of the result is divided into n x n, n the pixels of the photograph along one of its sides; each part is looked up where the
-lens has it (bicubic), and the mean of the parts is taken, in linear values. Without distortion and by a whole factor that is the mean of
-the photograph's own pixels.
+Every pixel of the result is divided into n x n parts, where n is the number of photograph pixels along one of its sides. Each part is
+interpolated at its position under the lens model (bicubic), and the parts are averaged in linear values. Without distortion and for an
+integer factor, the result is the mean of the photograph's pixels.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from unrender.app.capture.cameras import FISHEYE, Lens, opencv
 from unrender.core.errors import InputError
 
 _MARGIN = 0.5
-"""In pixels of the photograph: how far a position may lie outside the middle of its outermost pixels."""
+"""Maximum distance in photograph pixels of a position outside the centres of the outermost pixels."""
 _SAMPLES = 4096
 _SIDE = 8192
-"""OpenCV's `remap` takes pictures of less than 2^15 a side; larger results are made in parts."""
+"""Maximum side of a tile. OpenCV's `remap` requires sides below 2^15, so larger results are computed in tiles."""
 
 
 def pinhole(lens: Lens, scale: float) -> Lens:
-    """The camera of the result: no distortion, square pixels, `scale` (at most 1) times as many along each side.
+    """Return the camera of the result: no distortion, square pixels, and `scale` (at most 1) times as many along each side.
 
-    The scale is the same along both sides, exactly: what is left of a last pixel is cropped. The principal point goes with it.
+    The scale is exactly equal along both sides: a fractional last pixel is cropped. The principal point is scaled accordingly.
 
     Raises:
-        InputError: no whole pixel is left along a side.
+        InputError: no complete pixel remains along a side.
     """
     width, height = (math.floor(scale * side + 1e-9) for side in (lens.width, lens.height))
     if min(width, height) < 1:
@@ -66,20 +66,21 @@ class Resampling:
         return same and not self.source.distorts
 
     def apply(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The result (h, w, C) of a picture (H, W, C), not below 0, and which part of each pixel the photograph shows, (h, w) in [0, 1]."""
+        """Return the result (h, w, C) of a picture (H, W, C), clamped to at least 0, and the fraction of each pixel inside the
+        photograph, (h, w)."""
         height, width, n = self.target.height, self.target.width, self.parts
         if self._is_whole:
             blocks = values[: n * height, : n * width].reshape(height, n, width, n, -1)
             return blocks.mean((1, 3), dtype=np.float32), np.ones((height, width), np.float32)
-        found = np.empty((height, width, values.shape[2]), np.float32)
+        result = np.empty((height, width, values.shape[2]), np.float32)
         shown = np.empty((height, width), np.float32)
         rows = max(1, _SIDE // self.parts)
         columns = max(1, 4 * _SIDE // self.parts - 1)
         for top in range(0, height, rows):
             for left in range(0, width, columns):
                 here = slice(top, min(top + rows, height)), slice(left, min(left + columns, width))
-                found[here], shown[here] = self._part(values, here)
-        return found, shown
+                result[here], shown[here] = self._part(values, here)
+        return result, shown
 
     def _part(self, values: np.ndarray, here: tuple[slice, slice]) -> tuple[np.ndarray, np.ndarray]:
         cv2, n = opencv(), self.parts
@@ -92,8 +93,8 @@ class Resampling:
         return total / np.maximum(shown, 1e-6)[..., None], shown
 
     def _map(self, rows: slice, columns: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the parts of these pixels are in the photograph, and whether it shows them. The middle of the first pixel is 0, as OpenCV
-        counts."""
+        """Return the positions of the parts of these pixels in the photograph, and whether they are inside it. As in OpenCV, the centre
+        of the first pixel is 0."""
         cv2, n, source, target = opencv(), self.parts, self.source, self.target
         size = ((columns.stop - columns.start) * n, (rows.stop - rows.start) * n)
         into = np.array(
@@ -123,9 +124,9 @@ class Resampling:
 
 
 def _farthest(lens: Lens, within: float) -> float:
-    """The tangent of the angle to the axis, at most `within`, up to which a lens's picture grows with it.
+    """Return the tangent of the maximum angle to the axis, at most `within`, up to which the lens's radial mapping increases.
 
-    A polynomial fitted to a lens turns back somewhere outside its picture, and would show the picture a second time there.
+    A polynomial lens model decreases somewhere outside its picture, and would show the picture a second time there.
     """
     r = np.linspace(0, within, _SAMPLES)
     k = [*lens.distortion, *[0.0] * 8]

@@ -1,4 +1,4 @@
-"""The unknowns of an asset by name: their keys, textures, bounds and first values, and the stages that recover them."""
+"""Unknowns of an asset by name: their keys, textures, bounds and initial values, and the stages that recover them."""
 
 from __future__ import annotations
 
@@ -21,46 +21,46 @@ from unrender.rendering.vignetting import VIGNETTING
 NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure", "vignetting", "response", "poses")
 DEFAULT = ("colour", "roughness", "metallic", "light")
 OF_HULL = ("colour", "roughness", "metallic", "normal", "light")
-"""Likewise, of a hull, whose own normals know no hollows."""
+"""Default unknowns for a hull, whose normals lack concavities."""
 _MATERIALS = ("colour", "light", "roughness", "metallic")
 COLOUR, ROUGHNESS = 0.4, 0.6
 _SMOOTHEST, _SMOOTHEST_WITH_NORMALS = 0.02, 0.25
-"""Least roughness. Where a lobe is narrower than a texel of the light, derivatives by normals, which grow as its inverse square, are
-noise."""
+"""Minimum roughness, without and with normals. If a lobe is narrower than a texel of the light, derivatives by normals, which grow with
+its inverse square, are mostly noise."""
 _METALLIC = 0.1
-"""Above 0, which is a bound."""
+"""Initial value, above the bound 0."""
 _FLAT = (0.5, 0.5, 1.0)
-"""The normal map of a surface as it is."""
+"""Normal map value that does not change the surface normal."""
 _STRENGTH, _VERTEX_RATE = 20.0, 1e-3
-"""Of large steps, and the first step of vertices as a share of the mesh's diagonal."""
+"""Strength of the large-steps preconditioner, and initial learning rate of vertices relative to the mesh's diagonal."""
 _COARSER = 4
 _OF_PICTURES = ("exposure", "vignetting", "response")
-"""Unknowns that move in all stages."""
+"""Unknowns that are optimised in all stages."""
 _NORMALS_RATE, _LATE = 0.01, {"learning_rate": 0.02}
-"""First steps of a normal map; and the rate of `auto` for the others from then on, a fifth of that of the first stages: they settle."""
+"""Initial learning rate of a normal map, and later rate of `auto` for the others, a fifth of that of the first stages."""
 _DETAIL = {**_LATE, "correlation": 1 / 128}
-"""Of what comes last: what is broad has been found, and detail hardly moves along gradients that are smoothed as far."""
+"""Settings of the last stages: coarse structure has converged, and detail needs gradients with less smoothing."""
 _POSE_RATE = 0.05
-"""First step of poses, in degrees and units like them."""
+"""Initial learning rate of poses, in degrees and equivalent units."""
 _RESPONSE_RATE = 0.2
-"""First step of the response's contrast and brightness."""
+"""Initial learning rate of the response's contrast and brightness."""
 
 
 def parse(text: str) -> tuple[str, ...]:
-    """ "colour,light" as names in the order of `NAMES`. Raises `InputError`."""
-    given = [name.strip() for name in text.split(",") if name.strip()]
-    if not given:
+    """Parse a list such as "colour,light" to names in the order of `NAMES`. Raise `InputError`."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
         raise InputError(f"--unknowns: expected some of {', '.join(NAMES)}, such as {','.join(DEFAULT)}")
-    for name in given:
+    for name in names:
         if name not in NAMES:
             expected = did_you_mean(name, NAMES) or f"; expected some of {', '.join(NAMES)}"
             raise InputError(f"--unknowns: no {name}{expected}")
-    check_response(given)
-    return tuple(name for name in NAMES if name in given)
+    check_response(names)
+    return tuple(name for name in NAMES if name in names)
 
 
 def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
-    """{name: the parameter's key} of all names; under a normal map, the material is nested, and so is the light of a turntable."""
+    """Return {name: the parameter's key} of all names. A normal map nests the material, and a turntable nests the light's map."""
     material = "asset.bsdf.nested_bsdf" if "normal" in unknowns else "asset.bsdf"
     return {
         "colour": f"{material}.base_color.data",
@@ -77,7 +77,7 @@ def keys(unknowns: Sequence[str], turntable: bool = False) -> dict[str, str]:
 
 
 def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False) -> list[dict[str, Any]]:
-    """The [[parameters]] of a problem file. `diagonal`: of the mesh's bounding box, > 0."""
+    """Return the [[parameters]] of a problem file. `diagonal` is that of the mesh's bounding box, > 0."""
     of = keys(unknowns, turntable)
     unit = {"bounds": [0.0, 1.0]}
     more: dict[str, dict[str, Any]] = {
@@ -99,7 +99,8 @@ def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False
 
 
 def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndarray]]:
-    """{attribute of the material: (file below textures, first values (size, size, C))}; of `normalmap` that of the map around it."""
+    """Return {attribute of the material: (file in the texture folder, initial values (size, size, C))}; `normalmap` belongs to the map
+    around it."""
     found = {"base_color": ("base-colour.exr", np.full((size, size, 3), COLOUR, np.float32))}
     if "roughness" in unknowns:
         found["roughness"] = ("roughness.exr", np.full((size, size, 1), ROUGHNESS, np.float32))
@@ -111,22 +112,22 @@ def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndar
 
 
 def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:
-    """Materials and light at low resolution, then in full, then normals, then the detail of all, then the shape.
+    """Return the stages: materials and light at low resolution, then at full resolution, normals, detail of all, and the shape.
 
-    What was moved before keeps moving, from the normals on by shorter steps, and at last by gradients that are smoothed over few texels.
-    Poses move from the second stage on, when there is a texture to see them by.
+    Unknowns of earlier stages remain active, with smaller rates from the normals on and with less gradient smoothing at the end. Poses
+    are active from the second stage on, since they require a texture.
     """
-    of, found = keys(unknowns, turntable), []
+    of, result = keys(unknowns, turntable), []
     moved: list[str] = []
 
     def add(
         name: str, more: Sequence[str], share: float, coarser: int = 1, settings: dict[str, Any] | None = None
     ) -> None:
-        given = [one for one in more if one in unknowns]
-        if given:
-            moved.extend(one for one in given if one not in moved)
+        new = [one for one in more if one in unknowns]
+        if new:
+            moved.extend(one for one in new if one not in moved)
             moving = [one for one in NAMES if one in unknowns and one in (*moved, *_OF_PICTURES)]
-            found.append(Stage(name, tuple(of[one] for one in moving), share, coarser, settings=settings))
+            result.append(Stage(name, tuple(of[one] for one in moving), share, coarser, settings=settings))
 
     add("coarse-materials", _MATERIALS, 1.0, _COARSER)
     add("materials", (*_MATERIALS, "poses"), 3.0)
@@ -134,4 +135,4 @@ def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> S
     add("detail", tuple(moved), 4.0, settings=_DETAIL)
     add("shape", ("shape",), 1.0, settings=_DETAIL)
     rest = [name for name in _OF_PICTURES if name in unknowns]
-    return Stages(problem, tuple(found or [Stage("photographs", tuple(of[name] for name in rest))]))
+    return Stages(problem, tuple(result or [Stage("photographs", tuple(of[name] for name in rest))]))

@@ -1,4 +1,4 @@
-"""From photographs to the views of a problem: without distortion, with their masks, and which of them are held out."""
+"""Preparation of photographs as views of a problem: undistortion, masks, and the held-out split."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ def prepare(
     progress: Callable[[int, int], None] = lambda done, count: None,
     response: str = decoding.SRGB,
 ) -> tuple[StoredViews, list[str]]:
-    """Read, undistort and check all photographs, one by one; results of the chosen resolution wait in a temporary file.
+    """Read, undistort and check all photographs, one by one. Results of the chosen resolution are stored in a temporary file.
 
     Args:
-        capture: what the folder holds.
-        resolution: pixels along a view's longer side, at most.
-        scale: in place of `resolution`, a factor of each photograph's own, at most 1.
-        hold_out: every so many photographs one is held out, the first among them; 0 for none; None for the capture's own split, or 8.
-        progress: called with how many are done, and how many there are.
-        response: of files of 8 or 16 bits, see `decoding.linear`.
+        capture: contents of the folder.
+        resolution: maximum number of pixels along a view's longer side.
+        scale: factor of each photograph's own resolution, at most 1, instead of `resolution`.
+        hold_out: interval of held-out photographs, beginning with the first; 0 for none; None for the capture's own split, or 8.
+        progress: function of the number of processed photographs and their total.
+        response: response of files of 8 or 16 bits, see `decoding.linear`.
 
     Returns:
         The views in the capture's order, and notices.
 
     Raises:
-        InputError: a photograph or mask cannot be read or does not fit its camera, some photographs have masks and others do not, or a mask
-            is empty or inverted.
+        InputError: a photograph or mask cannot be read or does not fit its camera, some photographs have masks and others do not, or a
+            mask is empty or inverted.
     """
     if scale is not None and not 0 < scale <= 1:
         raise InputError(f"--scale {scale:g}: expected more than 0 and at most 1")
@@ -61,7 +61,7 @@ def prepare(
     _check_masks(looks)
     notices = []
     if turned:
-        notices.append(f"{len(turned)} photographs turned upright as EXIF says, the first {printable(turned[0])}")
+        notices.append(f"{len(turned)} photographs rotated by their EXIF orientation, the first {printable(turned[0])}")
     return views, notices
 
 
@@ -106,7 +106,7 @@ def _mask(photograph: Photograph, lens: Lens, target: Lens, orientation: int) ->
     values = pictures.read_mask(photograph.mask, 1)
     height, width = values.shape
     if orientation != 1 and abs(width / height - lens.width / lens.height) > 0.02 * lens.width / lens.height:
-        values = pictures.read_mask(photograph.mask, orientation)  # as the photograph is
+        values = pictures.read_mask(photograph.mask, orientation)  # with the photograph's orientation
         height, width = values.shape
     if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height, width, height):
         has = f"{width} x {height} pixels, and its photograph {lens.width} x {lens.height}"
@@ -116,7 +116,7 @@ def _mask(photograph: Photograph, lens: Lens, target: Lens, orientation: int) ->
 
 @dataclass(frozen=True)
 class _Mask:
-    """What is checked of a mask: the shares of the picture and of its edge that it covers."""
+    """Coverage of a mask: the fractions of the picture and of its edge."""
 
     name: str
     share: float

@@ -15,13 +15,13 @@ from unrender.io import toml_lines
 
 PROBLEM, SCENE = "problem.toml", "scene.xml"
 REFERENCES, MASKS, TEXTURES = "references", "masks", "textures"
-"""Folders of an import."""
+"""Folder names of an import."""
 
 
 def problem_text(
     name: str, views: Sequence[dict[str, Any]], held_out: bool, parameters: Sequence[dict], loss: Any, max_depth: int
 ) -> str:
-    """A problem file. `views`, `parameters`: its tables; `loss`: as it has it; `held_out`: whether it is for judging alone."""
+    """Return a problem file. `views` and `parameters` are its tables, `loss` its loss; `held_out` marks it for evaluation only."""
     head = {
         "scene": SCENE,
         "name": f"{name} (held out)"[:200] if held_out else name[:200],
@@ -29,28 +29,28 @@ def problem_text(
         "loss": loss,
     }
     tables = [("parameters", table) for table in parameters] + [("views", view) for view in views]
-    what = "Photographs that are held out, for judging alone." if held_out else "Photographs to recover an asset from."
-    # A table under a heading of its own for each, as people write them; tomli_w would put them into one line each.
+    what = "Held-out photographs, for evaluation only." if held_out else "Photographs to recover an asset from."
+    # Write each table under its own heading for readability; tomli_w would write one line per table.
     parts = [f"# {what} Written by `unrender import`.\n", tomli_w.dumps(head)]
     parts += [toml_lines.array_table(heading, table) for heading, table in tables]
     return "\n".join(parts)
 
 
 def add_value(parent: Xml.Element, kind: str, name: str, value: object) -> None:
-    """A property of a plugin; `kind`: "string", "float", ..."""
+    """Add a property of a plugin; `kind` is "string", "float", ..."""
     text = repr(value) if isinstance(value, float) else str(value)
     Xml.SubElement(parent, kind, name=name, value=text)
 
 
 def add_texture(parent: Xml.Element, name: str, file: str, raw: bool, pixels: bool = False) -> None:
-    """A picture as the property `name` of a BSDF.
+    """Add a bitmap texture as the property `name` of a BSDF.
 
     Args:
         parent: the BSDF.
-        name: of the property.
-        file: below the folder of textures.
-        raw: whether it holds other things than colours.
-        pixels: whether texels are pixels of a picture, whose first row is at v = 1: then nothing is interpolated.
+        name: name of the property.
+        file: path inside the texture folder.
+        raw: whether the values are not colours.
+        pixels: whether texels are pixels of a picture, whose first row is at v = 1. Then they are not interpolated.
     """
     texture = Xml.SubElement(parent, "texture", type="bitmap", name=name)
     for key, value in (("filename", f"{TEXTURES}/{file}"), ("format", "variant"), ("wrap_mode", "clamp")):
@@ -65,7 +65,7 @@ def add_texture(parent: Xml.Element, name: str, file: str, raw: bool, pixels: bo
 
 
 def write_exr(values: np.ndarray, path: Path, half: bool = False) -> None:
-    """(H, W, C) as OpenEXR, 32 bits, or 16."""
+    """Write (H, W, C) as OpenEXR with 32 bits, or 16."""
     import mitsuba as mi
 
     with variant.two_threads():

@@ -1,4 +1,4 @@
-"""Which format a folder of posed photographs has, and reading it."""
+"""Formats of posed photographs: recognition and reading."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ FORMATS = {
     "colmap": _Format(colmap.recognise, colmap.read, "cameras and images (.bin or .txt), here or in sparse/0"),
     "llff": _Format(llff.recognise, llff.read, "poses_bounds.npy"),
 }
-"""By name, in the order in which a folder that has several is read."""
+"""{name: format}, in order of precedence if a folder has several."""
 
 
 LIGHTS = "lights"
-"""The format of `lights`, which is no capture with poses."""
+"""Name of the format of `lights`, which has no poses."""
 
 
 def is_lit(folder: Path, kind: str | None) -> bool:
-    """Whether a folder holds photographs of one camera under known lights, to be read as such."""
+    """Return whether a folder contains photographs of one camera under known lights, to be read as such."""
     if kind is not None:
         return kind == LIGHTS and lights.recognise(folder)
     return lights.recognise(folder) and not any(each.recognise(folder) for each in FORMATS.values())
 
 
 def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Capture:
-    """The capture in a folder.
+    """Read the capture in a folder.
 
     Args:
-        folder: where it is.
-        kind: a key of `FORMATS`; None for the first whose files are there.
-        masks: a folder of masks named like the photographs; None for those that the format names or that lie beside the photographs.
+        folder: folder of the capture.
+        kind: a key of `FORMATS`; None for the first whose files exist.
+        masks: a folder of masks named like the photographs; None for masks that the format names or that are next to the photographs.
 
     Raises:
-        InputError: no such folder, none of the formats, or files that cannot be read; which file, and what was expected.
+        InputError: the folder does not exist, has none of the formats, or contains unreadable files.
     """
     for given, name in ((folder, "FOLDER"), (masks, "--masks")):
         if given is not None and bounded_files.kind(given) != "folder":
@@ -66,7 +66,7 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
         if kind in (None, name) and each.recognise(folder):
             capture = each.read(folder, masks)
             if not capture.photographs:
-                raise InputError(f"{folder}: none of its photographs is there")
+                raise InputError(f"{folder}: all of its photographs are missing")
             _check_places(capture, masks)
             _check_photographs(capture)
             _check_masks(capture)
@@ -79,7 +79,7 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
 
 
 def _check_places(capture: Capture, masks: Path | None) -> None:
-    """Raise `InputError` where a photograph or a mask lies outside of the capture's folder; masks may lie in `masks`, too."""
+    """Raise `InputError` if a photograph or a mask is outside the capture's folder; masks may also be in `masks`."""
     for photograph in capture.photographs:
         confinement.check(photograph.file, [capture.folder], f"{capture.folder}: it names the photograph")
         if photograph.mask is not None:
@@ -88,18 +88,18 @@ def _check_places(capture: Capture, masks: Path | None) -> None:
 
 
 def _check_photographs(capture: Capture) -> None:
-    """Raise `InputError` where a photograph was taken by two cameras."""
+    """Raise `InputError` if a photograph has two cameras."""
     cameras: dict[Path, np.ndarray] = {}
     for photograph in capture.photographs:
         pose = cameras.setdefault(photograph.file.resolve(), photograph.camera_to_world)
         if not np.array_equal(pose, photograph.camera_to_world):
             raise InputError(
-                f"{capture.folder}: {printable(photograph.name)}: given twice, with different poses; expected one each"
+                f"{capture.folder}: {printable(photograph.name)}: listed twice, with different poses; expected one pose"
             )
 
 
 def _check_masks(capture: Capture) -> None:
-    """Raise `InputError` where two photographs have one mask."""
+    """Raise `InputError` if two photographs share a mask."""
     owners: dict[Path, Path] = {}
     for photograph in capture.photographs:
         if photograph.mask is not None:
@@ -107,5 +107,5 @@ def _check_masks(capture: Capture) -> None:
             if other != photograph.file:
                 two = f"{printable(str(other))} and {printable(str(photograph.file))}"
                 raise InputError(
-                    f"{photograph.mask}: the mask of two photographs, {two}; put masks into folders as the photographs are"
+                    f"{photograph.mask}: shared by two photographs, {two}; put masks into folders like those of the photographs"
                 )

@@ -1,8 +1,8 @@
 """COLMAP's sparse models: `cameras` and `images`, as text or binary.
 
-A camera has a model, its size and its parameters; an image has a unit quaternion (w, x, y, z) and a translation, which take points of the
-world to the camera (x right, y down, z forwards), and the number of its camera. Positions in pictures are in pixels from the upper left
-corner: the middle of the first pixel is (0.5, 0.5). Points of the model are not read.
+A camera has a model, its size and its parameters. An image has a unit quaternion (w, x, y, z) and a translation, which map world points
+to the camera (x right, y down, z forwards), and the id of its camera. Positions in pictures are in pixels from the upper left corner:
+the centre of the first pixel is (0.5, 0.5). Points of the model are not read.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _Parts = Callable[[Numbers], tuple[Numbers, str, Numbers]]
 
 @dataclass(frozen=True)
 class _Model:
-    """Of a camera: its number in binary files, how many parameters it has, and what they are: (fx, fy, cx, cy), kind, distortion."""
+    """Camera model: its id in binary files, its number of parameters, and their conversion to (fx, fy, cx, cy), kind, distortion."""
 
     number: int
     count: int
@@ -60,17 +60,17 @@ MODELS = {
     "SIMPLE_RADIAL_FISHEYE": _Model(8, 4, _one_focal(FISHEYE)),
     "RADIAL_FISHEYE": _Model(9, 5, _one_focal(FISHEYE)),
 }
-"""Camera models that OpenCV has, too."""
+"""Camera models that OpenCV supports as well."""
 _BY_NUMBER = {model.number: name for name, model in MODELS.items()}
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder has such a model, or a folder in it that COLMAP would make."""
+    """Return whether a folder has such a model, or a subfolder that COLMAP would create."""
     return _place(folder) is not None
 
 
 def read(folder: Path, masks: Path | None = None) -> Capture:
-    """The capture of such a folder. Raises `InputError`."""
+    """Read the capture of such a folder. Raise `InputError`."""
     found = _place(folder)
     if found is None:
         raise InputError(f"{folder}: no cameras and images of COLMAP")
@@ -119,7 +119,7 @@ class _Image:
 
 
 def _matrix(image: _Image, path: Path) -> np.ndarray:
-    """World to camera, (3, 4)."""
+    """Return the world-to-camera matrix, (3, 4)."""
     q = np.array(image.quaternion)
     length = float(np.linalg.norm(q))
     if not np.isfinite([length, *image.translation]).all() or abs(length - 1) > 0.01:
@@ -167,7 +167,7 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, Lens]]:
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    """Every second line: the others list points, and may be empty."""
+    """Yield the images, which are every second line. The other lines list points, and may be empty."""
     for index, (number, line) in enumerate(_lines(path)):
         if index % 2:
             continue

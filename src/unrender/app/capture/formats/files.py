@@ -1,4 +1,4 @@
-"""Finding photographs and their masks by the names that formats give them."""
+"""Search for photographs and masks by the names in a format's files."""
 
 from __future__ import annotations
 
@@ -9,24 +9,22 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable, shorten
 
 PICTURES = (".png", ".jpg", ".jpeg", ".exr", ".tif", ".tiff", ".webp", ".tga", ".bmp", ".hdr", ".ppm", ".pfm")
-"""Endings of photographs."""
+"""File extensions of photographs."""
 MOST = 10_000
-"""Photographs of a capture at most: looking for the files and masks of many more takes hours."""
+"""Maximum number of photographs of a capture, since the search for files and masks of more takes hours."""
 _WITHOUT_ENDING = (*PICTURES, ".PNG", ".JPG", ".JPEG", "_rgb.exr", "_rgba.png")
-"""Tried in turn where a format names a photograph without its ending."""
+"""Extensions that are tried in order if a format names a photograph without its extension."""
 _MASK_FOLDERS = ("masks", "mask")
 
 
 def check_count(count: int, where: Path) -> None:
     """Raise `InputError` for more than `MOST` photographs."""
     if count > MOST:
-        raise InputError(
-            f"{where}: {count} photographs, expected at most {MOST}; take a part of them, such as every tenth"
-        )
+        raise InputError(f"{where}: {count} photographs, expected at most {MOST}; use a subset, such as every tenth")
 
 
 def is_file(path: Path) -> bool:
-    """Whether the file exists. A name that the system does not allow counts as absent."""
+    """Return whether the file exists. A name that the system does not allow counts as absent."""
     try:
         return path.is_file()
     except OSError:
@@ -34,14 +32,14 @@ def is_file(path: Path) -> bool:
 
 
 def pictures(folder: Path) -> list[Path]:
-    """The pictures of a folder in the order of their names, none where there is no such folder."""
+    """Return the pictures of a folder in the order of their names; none if the folder does not exist."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES and path.is_file())
 
 
 def find_picture(folder: Path, name: str) -> Path | None:
-    """The file of a photograph that a format calls `name`, relative to `folder`; None where there is none."""
+    """Return the file of a photograph that a format calls `name`, relative to `folder`; None if it does not exist."""
     name = name.replace("\\", "/")
     for candidate in (folder / name, *(folder / f"{name}{ending}" for ending in _WITHOUT_ENDING)):
         if is_file(candidate):
@@ -50,12 +48,12 @@ def find_picture(folder: Path, name: str) -> Path | None:
 
 
 def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | None = None) -> Path | None:
-    """The mask of a photograph; None where there is none.
+    """Return the mask of a photograph, or None.
 
-    Looked for in this order: in the folder `given`, and nowhere else where there is one; the file that the format names; beside the
-    photograph as NAME_mask.png; in a folder that is called after the photograph's, as train_mask is after train; in masks or mask, in
-    `folder` or beside the photograph's folder. There it has the photograph's name, with or without its ending before its own; the path
-    from `folder` or a folder in it to the photograph, the longest first, goes before the name alone.
+    Search order: only the folder `given`, if there is one; the file that the format names; NAME_mask.png next to the photograph; a
+    folder named after the photograph's, such as train_mask for train; masks or mask, in `folder` or next to the photograph's folder.
+    There it has the photograph's name, with or without the original extension before its own. Longer relative paths of the photograph
+    take precedence over its bare name.
     """
     relative = _relative(folder, photograph)
     if given is not None:
@@ -78,7 +76,7 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
 
 
 def _relative(folder: Path, photograph: Path) -> list[Path]:
-    """images/left/1.png, left/1.png and 1.png of a photograph images/left/1.png of `folder`."""
+    """Return images/left/1.png, left/1.png and 1.png for a photograph images/left/1.png of `folder`."""
     parts = photograph.relative_to(folder).parts if photograph.is_relative_to(folder) else (photograph.name,)
     ends = [parts[index:] for index in range(len(parts))]
     return [Path(*end) for end in ends if ".." not in end]
@@ -95,14 +93,14 @@ def _of_name(folder: Path, relative: Iterable[Path]) -> Path | None:
 
 
 def left_out(missing: list[str], count: int) -> tuple[str, ...]:
-    """A notice on photographs whose poses are known and whose files are not there."""
+    """Return a notice on photographs with known poses but missing files."""
     if not missing:
         return ()
-    return (f"{len(missing)} of {count} photographs are missing and left out, the first {printable(missing[0])}",)
+    return (f"{len(missing)} of {count} photographs are missing and were skipped, the first {printable(missing[0])}",)
 
 
 def without_pose(folders: Iterable[Path], used: Collection[Path]) -> tuple[str, ...]:
-    """A notice on pictures that lie beside the photographs and have no pose."""
+    """Return a notice on pictures next to the photographs that have no pose."""
     known = {path.resolve() for path in used}
     rest = [
         path
@@ -112,4 +110,4 @@ def without_pose(folders: Iterable[Path], used: Collection[Path]) -> tuple[str, 
     ]
     if not rest:
         return ()
-    return (f"{len(rest)} pictures have no pose and are left out, the first {printable(rest[0].name)}",)
+    return (f"{len(rest)} pictures have no pose and were skipped, the first {printable(rest[0].name)}",)

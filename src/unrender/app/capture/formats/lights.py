@@ -1,8 +1,8 @@
-"""One camera, several distant lights: `lights.txt` and a photograph for each, as collections for photometric stereo have them.
+"""One camera, several distant lights: `lights.txt` and a photograph for each, the format of photometric stereo data sets.
 
-The first line is their count, then a line of three numbers for each, a direction towards the light: x right, y up, z towards the camera.
-Photographs follow in the order of their names, numbers in them by value (`cat.2` before `cat.10`). A picture whose name has "mask" in it is
-the mask. The camera is taken as orthographic.
+The first line is the number of lights, followed by a line of three numbers for each, a direction towards the light: x right, y up, z
+towards the camera. Photographs follow in the order of their names, with numbers compared by value (`cat.2` before `cat.10`). A picture
+with "mask" in its name is the mask. The camera is assumed to be orthographic.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from unrender.io import bounded_files, confinement
 FILE = "lights.txt"
 _LARGEST = 1 << 20
 _FEWEST = 4
-"""Three unknowns of a pixel, and one photograph to tell whether they are right."""
+"""Minimum number of lights: three unknowns per pixel, and one equation to verify them."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class LitCapture:
     """Photographs of one camera under one light each.
 
     Attributes:
-        folder: where they are.
+        folder: their folder.
         photographs: files, at least four.
         directions: (N, 3) unit, towards the lights: x right, y up, z towards the camera.
-        mask: a file, white on the object; None for none.
+        mask: a file, white on the object, or None.
     """
 
     folder: Path
@@ -42,12 +42,12 @@ class LitCapture:
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder has such a file."""
+    """Return whether a folder has such a file."""
     return (folder / FILE).is_file()
 
 
 def read(folder: Path, mask: Path | None = None) -> LitCapture:
-    """The capture of such a folder; `mask`: a folder with one mask, None for the folder itself. Raises `InputError`."""
+    """Read the capture of such a folder. `mask` is a folder with one mask, None for the folder itself. Raise `InputError`."""
     directions = _directions(folder / FILE)
     files.check_count(len(directions), folder / FILE)
     pictures = sorted(files.pictures(folder), key=_by_number)
@@ -56,11 +56,11 @@ def read(folder: Path, mask: Path | None = None) -> LitCapture:
     photographs = tuple(path for path in pictures if "mask" not in path.name.lower())
     if len(photographs) != len(directions):
         many = f"{len(directions)} lights, and {len(photographs)} photographs"
-        raise InputError(f"{folder / FILE}: {many}: they belong together in the order of names, so none may be missing")
+        raise InputError(f"{folder / FILE}: {many}: they are matched in the order of names, so none may be missing")
     masks = files.pictures(mask) if mask is not None else [path for path in pictures if "mask" in path.name.lower()]
     if len(masks) > 1 or (mask is not None and not masks):
         place = folder if mask is None else mask
-        raise InputError(f"{place}: expected one mask, got {len(masks)}, the camera stands still")
+        raise InputError(f"{place}: expected one mask, since the camera is static, got {len(masks)}")
     for path in photographs:
         confinement.check(path, [folder], f"{folder}: it has the photograph")
     for path in masks:
@@ -93,6 +93,6 @@ def _directions(path: Path) -> np.ndarray:
 
 
 def _by_number(path: Path) -> list[tuple[int, int | str]]:
-    """Numbers in a name count by value."""
+    """Return a sort key that compares numbers in a name by value."""
     parts = re.split(r"(\d{1,18})", path.name.lower())
     return [(0, int(part)) if index % 2 else (1, part) for index, part in enumerate(parts)]

@@ -1,8 +1,8 @@
 """LLFF's `poses_bounds.npy`: a row of 17 numbers for each picture of `images/`, in the order of their names.
 
 The first 15 are a matrix of 3 x 5: [R | t | (height, width, focal)]. R's columns are the camera's axes down, right, backwards in the
-world, t is its position; the focal length is in pixels of a picture of that height and width, of which the files may be smaller copies.
-Then nearest and farthest depth, which are not needed. The principal point is in the middle.
+world, and t is its position. The focal length is in pixels of a picture of that height and width; the files may be smaller copies. The
+last two numbers, nearest and farthest depth, are not needed. The principal point is centred.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _FOLDERS = ("images", "images_2", "images_4", "images_8")
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder has such a file."""
+    """Return whether a folder has such a file."""
     return (folder / FILE).is_file()
 
 
 def read(folder: Path, masks: Path | None = None) -> Capture:
-    """The capture of such a folder. Raises `InputError`."""
+    """Read the capture of such a folder. Raise `InputError`."""
     path = folder / FILE
     rows = bounded_files.read_array(path, _LARGEST)
     if rows.ndim != 2 or rows.shape[1] != 17 or not len(rows) or not np.isfinite(rows).all():
@@ -42,7 +42,7 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
     pictures = [path for path in pictures if path.stem not in masks_beside]
     if len(pictures) != len(rows):
         many = f"{len(rows)} poses, and {place} has {len(pictures)} pictures"
-        raise InputError(f"{path}: {many}: they belong together in the order of names, so none may be missing")
+        raise InputError(f"{path}: {many}: they are matched in the order of names, so none may be missing")
     photographs = []
     for index, (row, file) in enumerate(zip(rows.astype(float), pictures, strict=True)):
         where = f"{path}: row {index}"

@@ -1,9 +1,10 @@
-"""`transforms.json` as NeRF, instant-ngp and nerfstudio write it, and `transforms_train.json` with `transforms_test.json`.
+"""`transforms.json` of NeRF, instant-ngp and nerfstudio, and `transforms_train.json` with `transforms_test.json`.
 
-A frame has `file_path` (with or without ending, relative to the file) and `transform_matrix`: camera to world, axes right, up, backwards.
-Intrinsics stand at the top or in a frame, which has precedence: `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in pixels, `camera_angle_x` in radians
-where there is no `fl_x`; OpenCV's `k1`, `k2`, `p1`, `p2`, `k3`, or `k1` to `k4` of a fisheye (`camera_model` = "OPENCV_FISHEYE", or
-`is_fisheye`). Stanford-ORB and Synthetic4Relight have the second form, each with masks where `files.find_mask` looks.
+A frame has `file_path` (with or without extension, relative to the file) and `transform_matrix`: camera to world, axes right, up,
+backwards. Intrinsics are at the top level or in a frame, which takes precedence: `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` in pixels,
+`camera_angle_x` in radians without `fl_x`; OpenCV's `k1`, `k2`, `p1`, `p2`, `k3`, or `k1` to `k4` of a fisheye (`camera_model` =
+"OPENCV_FISHEYE", or `is_fisheye`). Stanford-ORB and Synthetic4Relight use the second form, with masks in the locations of
+`files.find_mask`.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ _PERSPECTIVES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL
 
 
 def recognise(folder: Path) -> bool:
-    """Whether a folder has such a file."""
+    """Return whether a folder has such a file."""
     return any((folder / name).is_file() for name in (ONE, TRAINING))
 
 
 def read(folder: Path, masks: Path | None = None) -> Capture:
-    """The capture of such a folder. Raises `InputError`."""
+    """Read the capture of such a folder. Raise `InputError`."""
     sources: list[tuple[Path, bool | None]] = [(folder / ONE, None)]
     if not sources[0][0].is_file():
         sources = [(folder / TRAINING, False), (folder / TEST, True)]
@@ -85,7 +86,7 @@ def _photograph(
 
 
 def _lens(numbers: Mapping[str, Any], where: str) -> tuple[Lens | None, float]:
-    """The lens; or none, and the horizontal angle of view."""
+    """Return the lens; or None, and the horizontal field of view."""
     model = numbers.get("camera_model", "OPENCV")
     if model not in (*_FISHEYES, *_PERSPECTIVES):
         raise InputError(f"{where}: camera_model: expected OPENCV, OPENCV_FISHEYE or PINHOLE, got {str(model)[:60]!r}")
