@@ -364,7 +364,7 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     ),
     "no matrix": (_frame("transform_matrix", None), "frames[2]: transform_matrix: expected a matrix"),
     "NaN": (_frame("transform_matrix", [[float("nan")] * 4] * 4), "frames[2]: transform_matrix: expected a matrix"),
-    "a shear": (_frame("transform_matrix", [[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "columns are no rotation"),
+    "a shear": (_frame("transform_matrix", [[1, 1, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "columns are not a rotation"),
     "a mirror": (_frame("transform_matrix", np.diag([1, 1, -1, 1]).tolist()), "one axis is mirrored"),
     "a focal length of 0": (_top("fl_x", 0), "fx: expected a focal length in pixels, got 0"),
     "a focal length in words": (_top("fl_x", "50 mm"), "fl_x: expected a number, got '50 mm'"),

@@ -212,7 +212,7 @@ def test_a_temporary_folder_that_others_can_change_is_not_used(monkeypatch: pyte
 
 def test_ray_without_tokens_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(ray._raylet, "AuthenticationTokenLoader")
-    line = r"cannot ask for a token; install a newer one: pip install 'ray>=2\.52'"
+    line = r"does not support tokens; install a newer version: pip install 'ray>=2\.52'"
     with pytest.raises(InputError, match=line), private_cluster(ray):
         pass
 

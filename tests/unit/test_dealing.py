@@ -317,7 +317,7 @@ def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
     with pytest.raises(ur.InputError, match="a control variate of images and mini-batches of pixels at once"):
         ur.optimize(dealt(analytic.problem(views=2), 2), remembering, adam, steps=1)
     with (
-        pytest.raises(ur.InputError, match="one view, which cannot be dealt to 2"),
+        pytest.raises(ur.InputError, match="one view, which cannot be distributed to 2"),
         ur.app.distribute(analytic.problem(), 2),
     ):
         pass

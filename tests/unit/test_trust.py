@@ -42,7 +42,7 @@ def test_a_cluster_without_a_token_is_refused(home: Path, monkeypatch: pytest.Mo
     for mode in (None, "disabled", "token"):
         if mode:
             monkeypatch.setenv("RAY_AUTH_MODE", mode)
-        with pytest.raises(InputError, match=r"cluster at a:1 is joined without a token.*--insecure"):
+        with pytest.raises(InputError, match=r"cluster at a:1 does not require a token.*--insecure"):
             check_token("a:1")
     monkeypatch.setenv("RAY_AUTH_TOKEN", "x")
     check_token("a:1")

@@ -1,1 +1,1 @@
-"""One run over many workers: a problem's views are dealt to them, and each computes its part of every step."""
+"""Distributed runs: a problem's views are distributed to workers, and each computes its part of every step."""

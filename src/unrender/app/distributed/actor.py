@@ -1,4 +1,4 @@
-"""The process that holds shares of a problem's views. Imports nothing at first that imports Dr.Jit: the variant is chosen before."""
+"""Process that holds shares of a problem's views. It must choose the variant before it imports modules that import Dr.Jit."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a worker runs.
+    """Location of a worker.
 
     Attributes:
-        machine: its name.
-        process: its number.
-        free: bytes of memory that it could have if it were alone: of the GPU, or of the machine.
-        gpu: which GPU, "" for none.
+        machine: name of the machine.
+        process: process id.
+        free: bytes of memory available to it if it were alone, of the GPU or of the machine.
+        gpu: its GPU, "" for none.
     """
 
     machine: str
@@ -46,17 +46,17 @@ class ViewWorker:
         self._shares: dict[int, ViewShare] = {}
 
     def place(self) -> Place:
-        """Where it runs. Its first answer says that it is ready."""
+        """Return the location of the worker. The first answer signals that it is ready."""
         gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "") if self._variant.startswith("cuda") else ""
         free = _free_gpu_memory() if gpu else limits.free_memory()
         return Place(socket.gethostname(), os.getpid(), free, gpu)
 
     def alive(self) -> bool:
-        """Answers while the others compute: it has a thread of its own."""
+        """Return True, from a separate thread while others compute."""
         return True
 
     def hold(self, share: int, views: tuple[int, ...], blob: bytes) -> None:
-        """Make a share of the problem, in place of an earlier one. Raises `InputError` where it cannot be made here."""
+        """Build a share of the problem, replacing an earlier one. Raise `InputError` if this fails."""
         from unrender.app.distributed.share import ViewShare
         from unrender.app.distributed.transfer import unpacked
         from unrender.core.errors import InputError
@@ -72,7 +72,7 @@ class ViewWorker:
         self._shares.pop(share, None)
 
     def run(self, share: int, call: Call, arrays: dict[int, Any]) -> Reply:
-        """See `ViewShare.run`; `arrays` are the call's."""
+        """Run a call, see `ViewShare.run`; `arrays` are the call's."""
         from dataclasses import replace
 
         return self._shares[share].run(replace(call, arrays=arrays))
@@ -85,13 +85,13 @@ class ViewWorker:
 
 
 def _free_gpu_memory() -> int:
-    """Bytes that the visible GPU has left; 0 where that is unknown."""
+    """Return the free bytes of the visible GPU; 0 if unknown."""
     import subprocess
 
     device = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0]
     words = ["nvidia-smi", f"--id={device}", "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
     try:
-        told = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True).stdout
-        return int(told.split()[0]) << 20
+        output = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True).stdout
+        return int(output.split()[0]) << 20
     except (OSError, subprocess.SubprocessError, ValueError, IndexError):
         return 0

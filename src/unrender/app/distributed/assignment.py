@@ -1,4 +1,4 @@
-"""Which worker has which views, and how what they found is summed. Nothing here needs Ray."""
+"""Distribution of views to workers, and sums of their results. This module does not need Ray."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from unrender.scene.problem import Problem
 
 
 def assign(pixels: Sequence[int], workers: int) -> tuple[tuple[int, ...], ...]:
-    """The views of each worker, ascending: the largest view that is left goes to who has the fewest pixels so far, the first of these.
+    """Return the views of each worker, ascending. The largest remaining view goes to the first worker with the fewest pixels so far.
 
     Args:
-        pixels: of each view, at least one view.
-        workers: how many, >= 1; no more than there are views get any.
+        pixels: number of pixels of each view, at least one view.
+        workers: number of workers, >= 1; at most one per view is used.
     """
     shares: list[list[int]] = [[] for _ in range(min(workers, len(pixels)))]
     loads = [0] * len(shares)
@@ -32,7 +32,7 @@ def assign(pixels: Sequence[int], workers: int) -> tuple[tuple[int, ...], ...]:
 
 
 def total(parts: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """The sum of trees in the order in which they come, in double precision. {} for none, or empty ones.
+    """Return the sum of trees in order, in double precision; {} for none, or empty ones.
 
     Args:
         parts: trees of equal keys, shapes and types.
@@ -47,75 +47,75 @@ def total(parts: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 _SIZES = 16
-"""A share's part of a mini-batch is filled up to one of so many sizes, since each is a kernel of its own."""
+"""Number of distinct sizes that a share's part of a mini-batch is padded to, since each size needs its own kernel."""
 
 
 def split(problem: Problem, sample: PixelSample, shares: Sequence[Sequence[int]]) -> list[Batch | None]:
-    """Each share's pixels, in the mini-batch's order; None where it has none.
+    """Return the pixels of each share, in the mini-batch's order; None for a share without pixels.
 
-    What fills up has weight 0, and the random numbers of the mini-batch's first pixel.
+    Padding has weight 0, and the random numbers of the mini-batch's first pixel.
 
     Args:
-        problem: the whole one.
-        sample: of pixels of all views.
-        shares: the views of each.
+        problem: the full problem.
+        sample: pixels of all views.
+        shares: views of each share.
     """
     views, pixels = (arrays.numpy(x).astype(np.uint32) for x in (sample.views, sample.pixels))
     weights = arrays.numpy(sample.weights).reshape(-1)
     unit = max(1, -(-len(views) // _SIZES))
-    found: list[Batch | None] = []
+    result: list[Batch | None] = []
     for share in shares:
         local = np.full(len(problem.views), len(share), np.uint32)
         local[list(share)] = np.arange(len(share))
-        mine = np.flatnonzero(local[views] < len(share))
-        if not len(mine):
-            found.append(None)
+        own = np.flatnonzero(local[views] < len(share))
+        if not len(own):
+            result.append(None)
             continue
-        fill = -len(mine) % unit if len(shares) > 1 else 0
+        fill = -len(own) % unit if len(shares) > 1 else 0
 
         def filled(values: np.ndarray, fill: int = fill) -> np.ndarray:
             return np.concatenate([values, np.zeros(fill, values.dtype)])
 
-        found.append(
+        result.append(
             Batch(
-                filled(local[views[mine]]),
-                filled(pixels[mine]),
-                filled(weights[mine]),
-                filled(mine.astype(np.uint32)),
+                filled(local[views[own]]),
+                filled(pixels[own]),
+                filled(weights[own]),
+                filled(own.astype(np.uint32)),
                 len(views),
             )
         )
-    return found
+    return result
 
 
 def joined(parts: Sequence[tuple[Batch, DrawStatistics]]) -> DrawStatistics | None:
-    """What the samples of all shares tell, in the mini-batch's order; None where no share was asked."""
+    """Return the pixel statistics of all shares, in the mini-batch's order; None if no share returned any."""
     if not parts:
         return None
     squares, moments = (np.zeros((parts[0][0].count, 3)) for _ in range(2))
     for batch, draws in parts:
-        drawn = batch.weights > 0
-        squares[batch.positions[drawn]] = draws.squares[drawn]
-        moments[batch.positions[drawn]] = draws.moments[drawn]
+        valid = batch.weights > 0
+        squares[batch.positions[valid]] = draws.squares[valid]
+        moments[batch.positions[valid]] = draws.moments[valid]
     return DrawStatistics(squares, moments)
 
 
 _COPIES = 8
-"""Of each parameter in a worker: current and previous, both scenes' own, the gradients of both, what is sent and what arrived."""
+"""Copies of each parameter in a worker: current, previous, both scenes' own, both gradients, sent and received."""
 _REMEMBERED = 24
-"""Images of a view that a control variate remembers: itself, its variance and ten statistics, before and after a step."""
+"""Images per view in the memory of a control variate: itself, its variance and ten statistics, before and after a step."""
 _PLAIN = 4
-"""Images of a view otherwise: reference, rendering, loss derivative and mask."""
+"""Other images per view: reference, rendering, loss derivative and mask."""
 _FLOAT = 4
 
 
 def needed(problem: Problem, views: Sequence[int], remembers: bool) -> tuple[dict[str, int], int]:
-    """Bytes of a worker's memory for each parameter, and for these views.
+    """Return the bytes of a worker's memory for each parameter, and for these views.
 
     Args:
-        problem: the whole one.
-        views: of the share.
-        remembers: whether the image estimator remembers views.
+        problem: the full problem.
+        views: views of the share.
+        remembers: whether the image estimator has memory of views.
     """
     parameters = {key: _COPIES * _FLOAT * math.prod(shape) for key, shape in problem.shapes().items()}
     resolutions = problem.renderer.resolutions()
@@ -124,12 +124,12 @@ def needed(problem: Problem, views: Sequence[int], remembers: bool) -> tuple[dic
 
 
 def check(problem: Problem, shares: Sequence[Sequence[int]], free: Sequence[tuple[str, int]], remembers: bool) -> None:
-    """Raise `InputError` where a share does not fit: with its size, and what would fit.
+    """Raise `InputError` if a share does not fit, stating its size and what would fit.
 
     Args:
-        problem: the whole one.
-        shares: the views of each.
-        free: where each lives, and bytes that it may have; 0 for unknown.
+        problem: the full problem.
+        shares: views of each share.
+        free: machine of each share, and its available bytes; 0 for unknown.
         remembers: see `needed`.
     """
     for views, (where, room) in zip(shares, free, strict=True):
@@ -140,8 +140,8 @@ def check(problem: Problem, shares: Sequence[Sequence[int]], free: Sequence[tupl
         if left > 0 and len(views) > 1 and images // len(views) <= left:
             fitting = left * len(views) // images
             raise InputError(
-                f"workers: {len(views)} views and what is remembered of them are {_size(images)} on {where}, which has "
-                f"{_size(left)} for them: {fitting} would fit; take {-(-len(problem.views) // fitting)} workers or more on as many machines"
+                f"workers: {len(views)} views need {_size(images)} with their image statistics, but {where} has {_size(left)} for them; "
+                f"{fitting} would fit: use at least {-(-len(problem.views) // fitting)} workers on as many machines"
             )
         key = max(parameters, key=lambda name: parameters[name])
         rest = room - images - sum(parameters.values()) + parameters[key]

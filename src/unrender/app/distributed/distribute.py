@@ -1,4 +1,4 @@
-"""`unrender.deal`: a problem whose views are dealt to workers."""
+"""`unrender.app.distribute`: distributes a problem's views to workers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from unrender.scene.problem import Problem
 _log = logging.getLogger("unrender")
 _LEAST_STORE = 256 << 20
 _GRADIENTS, _DOUBLE, _SLACK = 3, 8, 1.5
-"""Gradients in a reply at most, bytes of a number, and what a store is larger than its contents by."""
+"""Maximum number of gradients in a reply, bytes of a number, and ratio of a store's size to its contents."""
 
 
 @contextlib.contextmanager
@@ -35,44 +35,44 @@ def distribute(
     tell: Callable[[str], None] = _log.warning,
     insecure: bool = False,
 ) -> Iterator[Problem]:
-    """The problem, its views dealt to workers: within the context, `optimize` and `resume` have them compute its gradients.
+    """Yield the problem with its views distributed to workers. Within the context, `optimize` and `resume` compute its gradients there.
 
-        with unrender.app.distribute(problem, workers=4) as dealt:
-            result = unrender.optimize(dealt, "rcv", steps=300)
+        with unrender.app.distribute(problem, workers=4) as distributed:
+            result = unrender.optimize(distributed, "rcv", steps=300)
 
-    Each worker is a process by Ray, with a GPU or some of the processor's threads, and keeps its views: their references, and what image
-    estimators remember of them. In each step it is sent the parameters that changed, and answers with gradient and loss, which are summed
-    in a fixed order in double precision. Random numbers do not depend on the number of workers, so results are those of one process up to
-    rounding, and to the bit for equal numbers of workers (with one thread each; with more, threads add to a gradient in the order
-    they finish). Optimizer, checkpoints and history stay in this process; a run folder can be resumed with any number of workers or none.
+    Each worker is a Ray process with a GPU or some of the processor's threads. It holds its views: their references, and the memory of
+    image estimators. In each step it receives the parameters that changed, and returns gradient and loss, which are summed in a fixed
+    order in double precision. Random numbers do not depend on the number of workers. Results therefore equal those of one process up to
+    rounding, and to the bit for equal numbers of workers (with one thread each; with more, threads add to a gradient in the order they
+    finish). Optimizer, checkpoints and history stay in this process. A run folder can be resumed with any number of workers or none.
 
-    A worker that dies or answers no more costs no step: others take its views over, repeat its steps since what it remembered was last
-    collected, and the run goes on to the same result.
+    A worker that dies or stops responding loses no step: others take over its views and repeat its steps since its memory was last
+    collected, and the run continues to the same result.
 
     Args:
-        problem: with at least one view; there are no more workers than views.
-        workers: how many; "auto", one for each GPU or core; "HOST:PORT" of a Ray cluster, or "NUMBER@HOST:PORT".
-        compress: whether parameters are sent as float16 differences from what the workers have, and gradients come back in single, not
-            double, precision: half the bytes, and gradients at values that differ from the run's by up to 2⁻¹¹ of the last step.
-            Checkpoints of such a run can be resumed by such a run alone.
-        variant: Mitsuba's, of the workers.
-        threads: of the processor for each worker; None for its share.
-        tell: is told of workers that are lost or lag, a line each.
+        problem: problem with at least one view; there is at most one worker per view.
+        workers: number of workers; "auto", one for each GPU or core; "HOST:PORT" of a Ray cluster, or "NUMBER@HOST:PORT".
+        compress: whether parameters are sent as float16 differences from the workers' values, and gradients are returned in single
+            instead of double precision. This halves the traffic, and gradients are at values that differ from the run's by up to 2⁻¹¹
+            of the last step. Checkpoints of such a run can only be resumed with `compress`.
+        variant: Mitsuba variant of the workers.
+        threads: processor threads per worker; None for its share.
+        tell: function that receives a line for each lost or lagging worker.
         insecure: whether to join a cluster that other users can enter.
 
     Raises:
         InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; the problem cannot be sent,
-            has too few views, or does not fit a worker's memory; workers are lost again and again.
+            has too few views, or does not fit a worker's memory; workers are lost repeatedly.
     """
     parsed = workers if isinstance(workers, Workers) else Workers.parse(str(workers), "workers")
     parsed = replace(parsed, insecure=parsed.insecure or insecure)
     views = len(problem.views)
     if parsed.count is not None and parsed.count > 1 and views == 1:
         raise InputError(
-            f"workers: {problem.name} has one view, which cannot be dealt to {parsed.count}; use one process"
+            f"workers: {problem.name} has one view, which cannot be distributed to {parsed.count} workers; use one process"
         )
     if parsed.count is not None and parsed.count > views:
-        tell(f"workers: {views} for {views} views, in place of {parsed.count}")
+        tell(f"workers: using {views} workers for {views} views instead of {parsed.count}")
         parsed = replace(parsed, count=views)
     with connect(parsed, variant, store_bytes=_store_bytes(problem, parsed), most=views) as cluster:
         if threads is not None and cluster.address is None:
@@ -89,7 +89,7 @@ def distribute(
 
 
 def _store_bytes(problem: Problem, workers: Workers) -> int:
-    """Of a cluster that is started here: room for the replies of all workers at once, within half of what shared memory has left."""
+    """Return the object store size of a local cluster: room for the replies of all workers, at most half of the free shared memory."""
     numbers = sum(math.prod(shape) for shape in problem.shapes().values())
     count = workers.count or min(len(problem.views), cores())
     try:

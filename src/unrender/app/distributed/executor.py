@@ -1,4 +1,4 @@
-"""The driver of a problem whose views are dealt: from a request of an estimator to calls of the shares, and from their replies to a sum."""
+"""Driver of a distributed problem: converts an estimator's request to calls of the shares, and sums their replies."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ from unrender.runs.folder.state import pack, unpack
 from unrender.scene.problem import Problem
 
 _MOST_LOSSES = 5
-"""Times that shares may be lost in one step."""
+"""Maximum number of times that shares may be lost in one step."""
 _PICTURES_EVERY = 25
-"""Steps between images for people to look at."""
+"""Interval in steps of images for display."""
 
 
 @dataclass
 class Traffic:
-    """What went between driver and workers in the last step.
+    """Traffic between driver and workers in the last step.
 
     Attributes:
         sent, received: bytes of arrays, of all shares together.
         seconds: from the first call to the last reply, of a gradient and of a pilot before it.
-        busy: seconds that the slowest share computed.
-        lost: shares lost so far.
-        repeated: steps repeated for them so far.
+        busy: computation time of the slowest share in seconds.
+        lost: number of shares lost so far.
+        repeated: number of steps repeated for lost shares so far.
     """
 
     sent: int = 0
@@ -66,14 +66,14 @@ class DistributedExecutor:
     """An `Executor` whose worker processes hold shares of the views; it sums their gradients in the order of the shares.
 
     Args:
-        problem: the whole one.
-        shares: the views of each.
-        hosts: where they live.
+        problem: the full problem.
+        shares: views of each share.
+        hosts: hosts of the shares.
         compress: see `Outbox`.
         variant: see `Executor.variant`.
 
     Attributes:
-        traffic: of the last step.
+        traffic: traffic of the last step.
     """
 
     def __init__(
@@ -117,18 +117,20 @@ class DistributedExecutor:
             )
         image = found.image.inner if isinstance(found.image, Denoised) else found.image
         if not isinstance(image, (Plain, RecursiveControlVariate)):
-            raise InputError(f"{name}: what {type(image).__name__} remembers of views cannot be dealt to workers")
+            raise InputError(
+                f"{name}: the memory of {type(image).__name__} cannot be distributed to workers; use another image estimator"
+            )
         if isinstance(found, MetaEstimator) and not (isinstance(found.pixels, All) or isinstance(image, Plain)):
             raise InputError(
                 f"{name}: a control variate of images and mini-batches of pixels at once cannot be dealt to workers; leave out one"
             )
         for key in (key for key, unknown in self._problem.unknowns.items() if unknown.remeshing is not None):
-            raise InputError(f"{key}: remeshing: meshes of distributed runs keep their triangles; leave it out")
+            raise InputError(f"{key}: remeshing is not supported in distributed runs; leave it out")
         assignment.check(self._problem, self._shares, self._hosts.room(), not isinstance(image, Plain))
 
     def estimate_gradient(self, problem: Problem, request: GradientRequest) -> GradientSample:
         del problem  # each share has its own
-        self._restart_traffic()
+        self._reset_traffic()
         memory = self._memory(request.state)
         sample = None if request.batch is None else request.batch.sample
         call, sent = self._call(request, memory)
@@ -142,14 +144,14 @@ class DistributedExecutor:
         replies = self._replies(calls, sent, memory)
         self._in_step = False
         if isinstance(kept, Memory):
-            self._bound(kept)
+            self._collect_if_long(kept)
         found = self._sample(request, [replies[index] for index in sorted(replies)], kept)
         told = [(part, replies[index].draws) for index, part in enumerate(parts) if part is not None]
         return replace(found, draws=joined([(part, draws) for part, draws in told if draws is not None]))
 
     def trace_pilot(self, problem: Problem, request: PilotRequest) -> list[np.ndarray]:
         del problem
-        self._restart_traffic()
+        self._reset_traffic()
         known, tangents = self._outbox.numbered(request.parameters), self._outbox.once(request.tangents)
         sent = {one.number: one for tree in (known, tangents) for one in tree.values()}
         references = [arrays.numpy(reference) for reference in request.references]
@@ -169,8 +171,8 @@ class DistributedExecutor:
                 whole[positions] = part[: len(positions)]
         return found
 
-    def _restart_traffic(self) -> None:
-        """Unless a step has begun, count anew."""
+    def _reset_traffic(self) -> None:
+        """Reset the traffic counters at the start of a step."""
         if not self._in_step:
             self.traffic = Traffic(lost=self.traffic.lost, repeated=self.traffic.repeated)
         self._in_step = True
@@ -202,10 +204,10 @@ class DistributedExecutor:
     def restore(self, saved: Any) -> None:
         self._outbox.restore(saved)
 
-    # ------------------------------------------------------------------ from a request to calls
+    # ------------------------------------------------------------------ requests to calls
 
     def _memory(self, state: Any) -> Memory | None:
-        """What the workers are to remember of a state; handed over to them where they do not have it."""
+        """Return the workers' memory of a state; transfer it to them if they do not have it."""
         if not isinstance(state, RecursiveControlVariateState) or not state.views:
             return None
         if isinstance(state.views, Memory):
@@ -214,7 +216,7 @@ class DistributedExecutor:
         return self._memories.stored(tuple(packed))
 
     def _call(self, request: GradientRequest, memory: Memory | None) -> tuple[Call, dict[int, Sent]]:
-        """The call that all shares have in common, and its arrays."""
+        """Return the call that all shares have in common, and its arrays."""
         sent: dict[int, Sent] = {}
 
         def named(found: Mapping[str, Sent]) -> dict[str, int]:
@@ -249,7 +251,7 @@ class DistributedExecutor:
         return call, sent
 
     def _addressed(self, share: int, call: Call, sent: Mapping[int, Sent]) -> Call:
-        """The call with the arrays that a share lacks, and without what it need not keep."""
+        """Return the call with the arrays that a share lacks, and with the numbers that it may drop."""
         present = self._arrays[share]
         missing = {number: one.payload(present) for number, one in sorted(sent.items()) if number not in present}
         old = present - set(sent) - self._recent[share]
@@ -263,10 +265,10 @@ class DistributedExecutor:
             self._present[share].add(call.result)
         return replace(call, arrays=missing, drop_arrays=tuple(sorted(old)), drop_memories=tuple(sorted(gone)))
 
-    # ------------------------------------------------------------------ calls, and shares that are lost
+    # ------------------------------------------------------------------ calls and lost shares
 
     def _replies(self, calls: Mapping[int, Call], sent: Mapping[int, Sent], memory: Memory | None) -> dict[int, Reply]:
-        """All replies. A share that is lost is given what it remembered, by repeating its steps, and called again."""
+        """Return all replies. The memory of a lost share is restored by repeating its steps, and the share is called again."""
         found: dict[int, Reply] = {}
         started, busy = time.perf_counter(), 0.0
         for share in self._hosts.movable():
@@ -299,12 +301,12 @@ class DistributedExecutor:
                 present[share] = set()
 
     def _ensured(self, shares: Iterable[int], recipe: Recipe) -> list[int]:
-        """Those shares that remember what a recipe makes, made again where need be; without those that were lost meanwhile."""
+        """Return those shares that have the memory of a recipe, restored if necessary, without shares that were lost meanwhile."""
         made = [share for share in shares if self._ensure(share, recipe)]
         return [share for share in made if recipe.number in self._present[share]]
 
     def _ensure(self, share: int, recipe: Recipe) -> bool:
-        """See that a share remembers what a recipe makes; false where it was lost meanwhile."""
+        """Restore the memory of a recipe on a share; return False if the share was lost meanwhile."""
         if recipe.number in self._present[share]:
             return True
         chain = recipe.chain()
@@ -323,10 +325,10 @@ class DistributedExecutor:
                 return False
         return True
 
-    # ------------------------------------------------------------------ what is remembered, collected
+    # ------------------------------------------------------------------ collection of memories
 
-    def _bound(self, memory: Memory) -> None:
-        """Collect what is remembered where it would take many steps to make it again."""
+    def _collect_if_long(self, memory: Memory) -> None:
+        """Collect a memory if restoring it would take many steps."""
         if memory.recipe.is_long(self._collection):
             self._collect(memory.recipe)
 
@@ -344,10 +346,10 @@ class DistributedExecutor:
                 recipe.store(tuple(found[share] for share in shares))
                 self._collection = sum(payload_bytes(packed.tensors) for packed in found.values())
                 return
-        raise InputError(f"workers: some were lost {_MOST_LOSSES} times while what they remember was collected")
+        raise InputError(f"workers: some were lost {_MOST_LOSSES} times while their memory was collected")
 
     def _views(self, recipe: Recipe) -> tuple[Any, ...]:
-        """What is remembered of each view, in the views' order."""
+        """Return the memory of each view, in the views' order."""
         self._collect(recipe)
         assert recipe.stored is not None
         found: dict[int, Any] = {}
@@ -355,7 +357,7 @@ class DistributedExecutor:
             found |= zip(share, unpack(packed), strict=True)
         return tuple(found[view] for view in sorted(found))
 
-    # ------------------------------------------------------------------ from replies to a sum
+    # ------------------------------------------------------------------ replies to a sum
 
     def _sample(self, request: GradientRequest, replies: Sequence[Reply], kept: Any) -> GradientSample:
         def summed(of: Callable[[Reply], Mapping[str, np.ndarray]]) -> Tree:
@@ -388,5 +390,5 @@ class DistributedExecutor:
 
 
 def _snapshot(state: RecursiveControlVariateState) -> Snapshot | None:
-    """The snapshot of a state with all views."""
+    """Return the snapshot of a state with all views."""
     return RecursiveControlVariate().prepare(None, state).snapshot  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""What workers remember of views, as the driver knows it: by number, with what it takes to make it again."""
+"""The workers' memories of views as the driver tracks them: by number, with the steps that restore them."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ more: then collections send no more than steps do."""
 
 @dataclass(eq=False)
 class Recipe:
-    """How what is remembered after a step was made.
+    """Steps that restore the memory after a step.
 
     Attributes:
-        number: the memory's.
-        base: of the memory before the step; None where nothing was remembered, or what came of the step is stored.
-        call: that makes it of that; None where it is stored.
-        sent: the arrays of the call.
-        stored: what each share remembers, where it was collected.
-        steps, bytes: to be repeated from the last stored one on.
+        number: number of the memory.
+        base: recipe of the memory before the step; None without memory, or if the result is stored.
+        call: call that computes it from `base`; None if it is stored.
+        sent: arrays of the call.
+        stored: the memory of each share, if it was collected.
+        steps, bytes: steps to repeat since the last stored memory, and their bytes.
     """
 
     number: int
@@ -39,12 +39,12 @@ class Recipe:
     bytes: int = 0
 
     def store(self, packed: tuple[Packed, ...]) -> None:
-        """Keep what was collected; nothing before it will be repeated."""
+        """Store a collected memory, so that earlier steps need not be repeated."""
         self.stored, self.base, self.call, self.sent = packed, None, None, {}
         self.steps = self.bytes = 0
 
     def is_long(self, size: int) -> bool:
-        """Whether it is time to collect.
+        """Return whether the memory should be collected.
 
         Args:
             size: bytes of the last collection; 0 before there was one.
@@ -52,7 +52,7 @@ class Recipe:
         return self.steps >= _MOST_STEPS or self.bytes >= max(_MOST_BYTES, size)
 
     def chain(self) -> list[Recipe]:
-        """The recipes from the last stored one, or the first step, to this."""
+        """Return the recipes from the last stored one, or the first step, to this one."""
         found: list[Recipe] = [self]
         while found[-1].stored is None and found[-1].base is not None:
             found.append(found[-1].base)
@@ -60,12 +60,13 @@ class Recipe:
 
 
 class Memory:
-    """Stands for what workers remember of all views, in the state of an image estimator. Workers drop it when it is gone.
+    """Placeholder of the workers' memory of all views in the state of an image estimator. Workers drop the memory when this object
+    dies.
 
-    No dataclass: Dr.Jit would look for arrays in it.
+    This is not a dataclass, since Dr.Jit would search it for arrays.
 
     Args:
-        recipe: of what it stands for.
+        recipe: recipe of the memory.
     """
 
     def __init__(self, recipe: Recipe):
@@ -85,7 +86,7 @@ class Memories:
         self._alive: weakref.WeakValueDictionary[int, Memory] = weakref.WeakValueDictionary()
 
     def after(self, base: Memory | None, call: Call, sent: dict[int, Sent]) -> tuple[Memory, Call]:
-        """What will be remembered after a call, and the call that says so."""
+        """Return the memory after a call, and the call with its number."""
         number = next(self._numbers)
         call = replace(call, result=number)
         before = None if base is None else base.recipe
@@ -94,11 +95,11 @@ class Memories:
         return self._noted(Recipe(number, before, call, sent, None, steps, size)), call
 
     def stored(self, packed: tuple[Packed, ...]) -> Memory:
-        """What each share is to remember."""
+        """Return a memory that each share has to load."""
         return self._noted(Recipe(next(self._numbers), stored=packed))
 
     def is_alive(self, number: int) -> bool:
-        """Whether anybody still refers to it."""
+        """Return whether the memory is still referenced."""
         return number in self._alive
 
     def _noted(self, recipe: Recipe) -> Memory:

@@ -1,4 +1,4 @@
-"""What the driver sends to the worker that has a share of the views, and what comes back: NumPy arrays, numbers and frozen components."""
+"""Messages between the driver and the worker of a share of the views: NumPy arrays, numbers and frozen components."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from unrender.pixels.base import DrawStatistics
 from unrender.rendering.renderer import Space
 
 References = dict[str, int]
-"""{parameter: number of the array that it is}."""
+"""{parameter: number of its array}."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Difference:
     values: np.ndarray
 
     def applied(self, base: np.ndarray) -> np.ndarray:
-        """The array."""
+        """Return the array: the base plus the difference."""
         return (base + self.values.astype(base.dtype)).astype(base.dtype)
 
 
@@ -44,13 +44,13 @@ class Pair:
 
 @dataclass(frozen=True)
 class ImageState:
-    """The state of an image estimator that remembers its views.
+    """State of an image estimator with memory of its views.
 
     Attributes:
-        parameters: of the last step that rendered whole views; None before the first.
-        memory: the number of what is remembered of the views; None before the first step.
+        parameters: parameters of the last step that rendered full views; None before the first.
+        memory: number of the memory of the views; None before the first step.
         snapshot: whether it is prepared for pixel mini-batches.
-        step: as of `RecursiveControlVariateState`.
+        step: as in `RecursiveControlVariateState`.
     """
 
     parameters: References | None
@@ -61,14 +61,14 @@ class ImageState:
 
 @dataclass(frozen=True)
 class Batch:
-    """The part of a pixel mini-batch that is of a worker's views; all (N,).
+    """The pixels of a mini-batch that belong to a worker's views; all arrays (N,).
 
     Attributes:
         views: index of each pixel's view among the worker's.
         pixels: row-major index within its film.
-        weights: see `PixelSample`; 0 for pixels that fill up.
-        positions: index within the mini-batch, by which random numbers are drawn.
-        count: pixels of the whole mini-batch.
+        weights: see `PixelSample`; 0 for padding pixels.
+        positions: index within the mini-batch, which determines the random numbers.
+        count: number of pixels of the full mini-batch.
     """
 
     views: np.ndarray
@@ -80,7 +80,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Pilot:
-    """A `PilotRequest` beside what a `Call` has.
+    """Data of a `PilotRequest` that a `Call` does not contain.
 
     Attributes:
         references: (N, 3) each, of the call's pixels.
@@ -91,22 +91,22 @@ class Pilot:
 
 @dataclass(frozen=True)
 class Call:
-    """One gradient of a share of the views: a `GradientRequest` in numbers.
+    """Request for the gradient of a share of the views: a `GradientRequest` with numbered arrays.
 
     Attributes:
         arrays: {number: array} that the worker does not have yet.
-        drop_arrays, drop_memories: numbers of what it need not keep.
-        parameters: the current ones.
+        drop_arrays, drop_memories: numbers that the worker may drop.
+        parameters: the current parameters.
         image: the image estimator.
-        state: its state; None for one that remembers nothing.
-        result: the number of what will be remembered after this step; None for nothing.
-        replay: whether only that is wanted.
-        pictures: whether the images are wanted, too.
-        single: whether gradients are to be in single precision; else they are in double.
-        spp, adjoint_spp, key, pair, tolerance, fresh: of the request.
-        batch: the pixels; None for whole views.
-        pilot: whether no gradient is wanted, but what paths through these pixels find.
-        tangents: along which the squared derivatives of the pixels are wanted; {} where they are not.
+        state: its state; None for one without memory.
+        result: number of the memory after this step; None for none.
+        replay: whether only this memory is needed.
+        pictures: whether images are requested.
+        single: whether gradients are returned in single instead of double precision.
+        spp, adjoint_spp, key, pair, tolerance, fresh: fields of the request.
+        batch: the pixels; None for full views.
+        pilot: whether the paths of these pixels are requested instead of a gradient.
+        tangents: tangents for the squared derivatives of the pixels; {} if they are not requested.
     """
 
     parameters: References
@@ -132,17 +132,17 @@ class Call:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a call.
+    """Result of a call.
 
     Attributes:
-        gradient, previous, fresh, paired: summed over the share's views in double precision; {} where not wanted.
-        losses: {view: loss}, by the problem's own index; of a mini-batch under -1.
-        samples: paths traced.
-        images: {view: (H, W, 3)} where they were wanted.
-        info: {name: {view: array}} likewise.
-        seconds: that it took.
-        paths: what a pilot found of each of the call's pixels.
-        draws: what the samples of a mini-batch's pixels tell, in the batch's order; None where it was not wanted.
+        gradient, previous, fresh, paired: sums over the share's views in double precision; {} if not requested.
+        losses: {view: loss}, by the problem's own index; for a mini-batch with the key -1.
+        samples: number of paths traced.
+        images: {view: (H, W, 3)} if requested.
+        info: {name: {view: array}} if requested.
+        seconds: duration.
+        paths: results of a pilot for each of the call's pixels.
+        draws: statistics of a mini-batch's pixels, in the batch's order; None if not requested.
     """
 
     gradient: dict[str, np.ndarray]
@@ -159,7 +159,7 @@ class Reply:
 
 
 def payload_bytes(message: Any) -> int:
-    """Bytes of the arrays in a message."""
+    """Return the bytes of the arrays in a message."""
     if isinstance(message, np.ndarray):
         return message.nbytes
     if isinstance(message, (Difference, Batch, DrawStatistics, Pilot)):

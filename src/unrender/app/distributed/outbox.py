@@ -1,4 +1,4 @@
-"""Parameters on their way to workers: each array is sent once, whole or as a float16 difference."""
+"""Parameters sent to workers: each array is sent once, in full or as a float16 difference."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from unrender.core import arrays
 from unrender.core.trees import Tree
 
 _RECENT = 4
-"""Arrays of each parameter that are known again: the current one, and those that states of earlier steps hold."""
+"""Number of recent arrays per parameter that are recognised: the current one, and those in states of earlier steps."""
 _MOST = 65504.0
 """The largest float16."""
 
@@ -24,9 +24,9 @@ class Sent:
     """An array as workers have it.
 
     Attributes:
-        number: its name.
-        value: on the host.
-        difference: from an earlier one; None where it is sent whole.
+        number: its number.
+        value: its value on the host.
+        difference: difference from an earlier one; None if it is sent in full.
     """
 
     number: int
@@ -34,19 +34,19 @@ class Sent:
     difference: Difference | None = None
 
     def payload(self, present: set[int]) -> np.ndarray | Difference:
-        """What a worker that has these arrays needs in order to have this one."""
+        """Return the data that a worker with these arrays needs to obtain this one."""
         if self.difference is not None and self.difference.base in present:
             return self.difference
         return self.value
 
 
 class Outbox:
-    """Numbers arrays, and knows again those that it has numbered.
+    """Assigns numbers to arrays, and recognises arrays that have one.
 
     Args:
-        compress: whether an array is sent as its float16 difference from the one sent before it of the same parameter. Workers then have
-            a value that differs from the driver's by half a unit in the 11th bit of that difference; the next difference is from what
-            they have, so errors do not add up. What a run's next steps depend on is in `snapshot`.
+        compress: whether an array is sent as its float16 difference from the previous one of the same parameter. Workers then have
+            a value that differs from the driver's by at most half a unit in the 11th bit of that difference. The next difference refers
+            to the workers' value, so errors do not accumulate. `snapshot` contains what the next steps of a run depend on.
     """
 
     def __init__(self, compress: bool = False):
@@ -56,25 +56,25 @@ class Outbox:
         self._last: dict[str, tuple[Any, Sent]] = {}
 
     def numbered(self, tree: Tree) -> dict[str, Sent]:
-        """The tree as workers are to have it."""
+        """Return the tree in the form that workers receive."""
         return {key: self._sent(key, value) for key, value in tree.items()}
 
     def once(self, tree: Tree) -> dict[str, Sent]:
-        """A tree that is sent for one call alone, whole."""
+        """Return a tree that is sent in full for one call."""
         return {key: Sent(self._next(), arrays.numpy(value)) for key, value in tree.items()}
 
     def values(self, tree: Mapping[str, Sent]) -> References:
-        """The tree by number."""
+        """Return the numbers of a tree."""
         return {key: sent.number for key, sent in tree.items()}
 
     def snapshot(self) -> dict[str, Any] | None:
-        """The last arrays, and what workers have in their place; None where these are the same."""
+        """Return the last arrays and the workers' values of them; None if they are equal."""
         if not self.compress:
             return None
         return {key: {"exact": exact, "sent": sent.value} for key, (exact, sent) in self._last.items()}
 
     def restore(self, saved: Mapping[str, Any] | None) -> None:
-        """Go on from a `snapshot`."""
+        """Continue from a `snapshot`."""
         self._known.clear()
         self._last.clear()
         for key, pair in (saved or {}).items():
@@ -97,7 +97,7 @@ class Outbox:
         return self._note(key, value, Sent(self._next(), host))
 
     def _note(self, key: str, exact: Any, sent: Sent) -> Sent:
-        self._known[id(exact)] = exact, sent  # held, so that its id is not given to another
+        self._known[id(exact)] = exact, sent  # hold a reference, so that its id is not reused
         self._last[key] = exact, sent
         while len(self._known) > _RECENT * len(self._last):
             self._known.popitem(last=False)

@@ -1,4 +1,4 @@
-"""Shares in Ray actors: what is lost, hangs or lags is noticed, and lives elsewhere from then on."""
+"""Shares in Ray actors. Lost, hanging or slow actors are detected, and their shares move to others."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from unrender.core.text import one_line
 from unrender.runs.folder.state import Packed
 
 _POLL, _PATIENCE, _ANSWER = 1.0, 4.0, 8.0
-"""Seconds between looks; without a reply until a worker is asked whether it is there; and until it has to have said so."""
+"""Seconds between polls, without a reply before a worker is pinged, and before a pinged worker must have answered."""
 _START = 60.0
-"""Seconds that all workers together at first, or one where none is left, may take to be there."""
+"""Maximum start time in seconds of all initial workers together, or of one if none is left."""
 _LONGEST, _MANY_TIMES = 1800.0, 50.0
-"""Seconds that a step may take at most, and times its usual ones, a minute more: a worker that answers, but never ends."""
+"""Maximum duration of a step in seconds, and relative to its usual duration plus a minute, for a worker that answers but hangs."""
 _COMPILING = 3
-"""Steps of a share in a new place, until its kernels are compiled."""
+"""Number of steps of a share on a new worker until its kernels are compiled."""
 _LAGGING, _IN_A_ROW, _LEAST = 4.0, 5, 0.05
-"""Times the others' median, steps in a row, and seconds, from which a worker counts as lagging."""
+"""Factor of the others' median, consecutive steps, and minimum seconds from which a worker counts as lagging."""
 _SUCCESSORS = 3
-"""Workers that are started in place of ones that lagged, at most: where a machine is slow, the next one there lags, too."""
+"""Maximum number of workers that replace lagging ones, since the next worker on a slow machine lags too."""
 
 
 @dataclass(eq=False)
@@ -36,10 +36,10 @@ class _Worker:
     """An actor.
 
     Attributes:
-        handle: Ray's.
+        handle: Ray's actor handle.
         place: where it runs; None until it is ready.
-        first: the reference to its first answer.
-        shares: that it holds.
+        first: reference to its first answer.
+        shares: shares that it holds.
     """
 
     handle: Any
@@ -50,8 +50,8 @@ class _Worker:
 
 @dataclass
 class _Lag:
-    """How a share's worker keeps up: its mean seconds a step of late, for how many steps they were far above the others', and the most
-    that is usual."""
+    """Timing of a share's worker: recent mean seconds per step, the number of steps far above the others', and the maximum usual
+    duration."""
 
     steps: int = 0
     seconds: float = 0.0
@@ -60,18 +60,18 @@ class _Lag:
 
 
 class RayHosts:
-    """`Hosts` of Ray: an actor for each share. Where one dies, or answers no more, a survivor takes its shares over, and another actor is
-    started, to which they go when it is ready. Shares of an actor that lags go to another that does not.
+    """`Hosts` of Ray: an actor for each share. If an actor dies or stops responding, another one takes over its shares. A replacement
+    is started, to which they move when it is ready. Shares of a lagging actor move to another one.
 
     Args:
-        cluster: that is connected.
-        shares: the views of each.
-        blobs: the problem of each, see `transfer.packed`.
-        threads: of each worker; None for its share of the processor.
-        tell: is told what happens, a line each.
+        cluster: a connected cluster.
+        shares: views of each share.
+        blobs: the problem of each share, see `transfer.packed`.
+        threads: threads of each worker; None for its share of the processor.
+        tell: function that receives one-line messages on events.
 
     Raises:
-        InputError: no worker starts, or the problem cannot be made there.
+        InputError: no worker starts, or the problem cannot be built there.
     """
 
     def __init__(
@@ -99,14 +99,14 @@ class RayHosts:
         for index, worker in enumerate(self._of):
             worker.shares.add(index)
         self._collected({index: self._holding(index) for index in range(len(shares))})
-        self._emptied.clear()  # nothing was in them
+        self._emptied.clear()  # new shares have no memory to restore
 
     @property
     def count(self) -> int:
         return len(self._views)
 
     def room(self) -> list[tuple[str, int]]:
-        """See `Hosts.room`: workers of one machine, or of one GPU, share what it has."""
+        """Return the machine and available bytes of each share. Workers of one machine, or of one GPU, share its memory."""
         places = [worker.place or Place("?", 0, 0) for worker in self._of]
         together = collections.Counter((place.machine, place.gpu) for place in places)
         return [(place.machine, place.free // together[place.machine, place.gpu]) for place in places]
@@ -140,7 +140,7 @@ class RayHosts:
         return self._collected({share: self._called(share, "fetch", share, number) for share in range(self.count)})
 
     def movable(self) -> list[int]:
-        """See `Hosts.movable`: one share of a worker that lags; else those of workers that have two more than another, until none has."""
+        """Return one share of a lagging worker, or else the shares whose move would balance the numbers of shares per worker."""
         for worker in [worker for worker in self._starting if self._is_done(worker)]:
             self._starting.remove(worker)
             if worker.place is not None:
@@ -156,7 +156,7 @@ class RayHosts:
         return found
 
     def move(self, share: int) -> None:
-        """See `Hosts.move`. Nothing where the share has moved meanwhile, or there is nowhere else."""
+        """Move a share. Do nothing if it has moved meanwhile, or there is no other worker."""
         if share not in self.movable():
             return
         old, lag = self._of[share], self._lags[share]
@@ -170,7 +170,7 @@ class RayHosts:
         old.shares.discard(share)
         self._hold(share, new)
         if self._of[share] is old or old not in self._workers:
-            return  # the new one was lost meanwhile, or the old one
+            return  # the new or the old worker was lost meanwhile
         if old.shares or not lagged:
             old.handle.drop.remote(share)
             return
@@ -183,10 +183,10 @@ class RayHosts:
     def _is_behind(self, worker: _Worker) -> bool:
         return any(self._lags[share].behind >= _IN_A_ROW for share in worker.shares)
 
-    # ------------------------------------------------------------------ replies, and what does not come
+    # ------------------------------------------------------------------ replies and lost workers
 
     def _put(self, arrays: Mapping[int, dict[int, Any]]) -> dict[int, Any]:
-        """What is sent to each share: by way of the object store, once for all that lack the same, where there are several."""
+        """Return the arrays to send to each share. Arrays that several shares lack are put into the object store once."""
         groups: dict[tuple[int, ...], list[int]] = {}
         for share, values in arrays.items():
             groups.setdefault((*sorted(values),), []).append(share)
@@ -199,7 +199,7 @@ class RayHosts:
         return found
 
     def _called(self, share: int, name: str, *arguments: Any) -> Any:
-        """The reference to what a share's worker will answer. Large arguments go by way of the object store, too."""
+        """Return the reference to the answer of a share's worker. Ray stores large arguments in the object store."""
         return self._guarded(lambda: getattr(self._of[share].handle, name).remote(*arguments))
 
     def _guarded(self, action: Callable[[], Any]) -> Any:
@@ -209,7 +209,7 @@ class RayHosts:
             raise InputError(f"workers: {_reason(error)}") from error
 
     def _collected(self, references: Mapping[int, Any]) -> dict[int, Any]:
-        """What came of calls to shares; without those of workers that were lost, whose shares live elsewhere afterwards."""
+        """Return the results of calls to shares, without those of lost workers, whose shares are on other workers afterwards."""
         found: dict[int, Any] = {}
         open_ = dict(references)
         started = last = time.monotonic()
@@ -218,14 +218,14 @@ class RayHosts:
             self._cluster.head.check()
             waiting = list(open_.values())
             done = self._ray.wait(waiting, num_returns=1, timeout=_POLL)[0]
-            if done:  # all that are there by now: one at a time would take time by the square of their number
+            if done:  # fetch all available results, since one at a time would take quadratic time
                 done = set(self._ray.wait(waiting, num_returns=len(waiting), timeout=0)[0])
             for share in [share for share, reference in open_.items() if reference in done]:
                 last = time.monotonic()
                 try:
                     found[share] = self._ray.get(open_.pop(share), timeout=_ANSWER)
                 except Exception as error:
-                    self._judge(share, error, lost)
+                    self._classify_error(share, error, lost)
             now = time.monotonic()
             late = [share for share in open_ if now - started > self._limit(share)]
             if open_ and not done and now - last > _PATIENCE:
@@ -243,13 +243,13 @@ class RayHosts:
         return _LONGEST if usual is None else 60.0 + _MANY_TIMES * usual
 
     def _silent(self, shares: Mapping[int, Any]) -> list[int]:
-        """Shares whose worker does not say that it is there."""
+        """Return the shares whose worker does not answer a ping."""
         asked = {share: self._of[share].handle.alive.options(concurrency_group="answers").remote() for share in shares}
         done, _ = self._ray.wait(list(asked.values()), num_returns=len(asked), timeout=_ANSWER)
         return [share for share, reference in asked.items() if reference not in done]
 
-    def _judge(self, share: int, error: Exception, lost: list[_Worker]) -> None:
-        """Whether an error means that a worker is lost; raise `InputError` where it means anything else."""
+    def _classify_error(self, share: int, error: Exception, lost: list[_Worker]) -> None:
+        """Add the worker to `lost` if the error means that it is lost; raise `InputError` otherwise."""
         kinds = self._ray.exceptions
         cause = getattr(error, "cause", None)
         if isinstance(cause, UnrenderError):
@@ -271,7 +271,7 @@ class RayHosts:
         return _Worker(handle, handle.place.remote())
 
     def _is_done(self, worker: _Worker, timeout: float = 0.0) -> bool:
-        """Whether a worker that was started is ready, or will never be; its `place` tells which."""
+        """Return whether a worker is ready or has failed, which its `place` distinguishes."""
         done, _ = self._ray.wait([worker.first], timeout=timeout)
         if not done:
             return False
@@ -283,7 +283,7 @@ class RayHosts:
         return True
 
     def _await(self, worker: _Worker) -> None:
-        """Wait until a worker is ready; it is given up where that takes too long."""
+        """Wait until a worker is ready; stop it if this takes too long."""
         if not self._is_done(worker, _START) or worker.place is None:
             self._kill(worker)
 
@@ -307,7 +307,7 @@ class RayHosts:
             )
 
     def _replace(self, worker: _Worker) -> None:
-        """Give the shares of a worker that was lost to others; nothing where that is done already."""
+        """Move the shares of a lost worker to others; do nothing if this is already done."""
         if not worker.shares:
             return
         shares, worker.shares = sorted(worker.shares), set()
@@ -322,7 +322,7 @@ class RayHosts:
             self._starting.remove(first)
             if first.place is None:
                 raise InputError(
-                    "workers: all were lost, and no other could be started; unrender resume goes on from the last checkpoint"
+                    "workers: all were lost, and no other could be started; run unrender resume to continue from the last checkpoint"
                 )
             self._workers.append(first)
         views = ", ".join(str(view) for share in shares for view in self._views[share])
@@ -333,7 +333,7 @@ class RayHosts:
             self._hold(share, new)
 
     def _hold(self, share: int, worker: _Worker) -> bool:
-        """Let a worker hold a share; where it is lost meanwhile, another does, and the answer is false."""
+        """Assign a share to a worker; return False if that is lost meanwhile and another worker takes over."""
         self._of[share : share + 1] = [worker]
         self._emptied.add(share)
         worker.shares.add(share)
@@ -346,7 +346,7 @@ class RayHosts:
         with contextlib.suppress(Exception):
             self._ray.kill(worker.handle)
 
-    # ------------------------------------------------------------------ who lags
+    # ------------------------------------------------------------------ lagging workers
 
     def _observe(self, replies: Mapping[int, Reply]) -> None:
         if len(replies) < len(self._of):
@@ -364,11 +364,11 @@ class RayHosts:
             lag.usual = reply.seconds if lag.usual is None else max(reply.seconds, 0.9 * lag.usual)
 
     def _median_of_others(self, worker: _Worker, ordered: list[float]) -> float | None:
-        """The median seconds a step of shares on other workers; None where there is none.
+        """Return the median seconds per step of shares on other workers; None if there are none.
 
         Args:
-            worker: whose shares are left out.
-            ordered: of all shares, ascending.
+            worker: worker whose shares are excluded.
+            ordered: seconds of all shares, ascending.
         """
         others = list(ordered)
         for share in worker.shares:
@@ -384,7 +384,7 @@ def _where(worker: _Worker) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """What Ray says, in one line: the last of its traceback."""
+    """Return the last line of Ray's traceback, as one line."""
     cause = getattr(error, "cause", None) or error
     lines = [line.strip() for line in str(cause).splitlines() if line.strip()]
     return one_line(f"{type(cause).__name__}: {lines[0] if lines else ''}"[:300])

@@ -1,4 +1,4 @@
-"""A share of a problem's views where it lives: references, what image estimators remember of them, and the gradients of both."""
+"""A share of a problem's views on its worker: references, memory of image estimators, and gradients."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from unrender.scene.problem import Problem
 
 
 class ViewShare:
-    """Some views of a problem, as a worker holds them. Mutable: it keeps what the driver numbers and has not told it to drop.
+    """Some views of a problem on a worker. It is mutable: it stores numbered arrays and memories until the driver drops them.
 
-    Equal calls on equal arrays and memories give equal replies, whichever worker holds the share.
+    Equal calls with equal arrays and memories give equal replies, independent of the worker.
 
     Args:
-        problem: of these views alone.
-        views: their indices in the whole problem, by which their random numbers are drawn.
+        problem: problem with these views only.
+        views: their indices in the full problem, which determine their random numbers.
     """
 
     def __init__(self, problem: Problem, views: tuple[int, ...]):
@@ -41,7 +41,7 @@ class ViewShare:
         self._snapshot: tuple[int, Any] | None = None
 
     def run(self, call: Call) -> Reply:
-        """The gradient of the share's views, and what is remembered after it."""
+        """Return the gradient of the share's views, and store the memory after it."""
         started = time.perf_counter()
         self._receive(call)
         if call.pilot is not None:
@@ -83,14 +83,14 @@ class ViewShare:
         )
 
     def store(self, number: int, packed: Packed) -> None:
-        """Remember what another worker did."""
+        """Store the memory of another worker."""
         self._memories[number] = unpack(packed)
 
     def fetch(self, number: int) -> Packed:
-        """What is remembered, to be stored elsewhere."""
+        """Return a memory, packed for storage elsewhere."""
         return pack(self._memories[number])
 
-    # ------------------------------------------------------------------ the parts of a call
+    # ------------------------------------------------------------------ parts of a call
 
     def _receive(self, call: Call) -> None:
         for number, value in call.arrays.items():
@@ -152,9 +152,9 @@ class ViewShare:
         return tuple(request.carry_out(self.problem))
 
     def _replayed(self, call: Call, request: GradientRequest) -> tuple[Any, ...]:
-        """What a step of whole views leaves, without its gradient."""
+        """Return the memory after a step of full views, without its gradient."""
         groups = leave_one_out_groups(call.spp, call.adjoint_spp)
-        kept = tuple(
+        memory = tuple(
             call.image.estimate(
                 self.problem,
                 request.parameters,
@@ -167,8 +167,8 @@ class ViewShare:
             )[1]
             for index, frame in self._whole()
         )
-        arrays.evaluate(kept)
-        return kept
+        arrays.evaluate(memory)
+        return memory
 
     def _remember(self, call: Call, kept: tuple[Any, ...]) -> None:
         if call.result is not None:
@@ -184,30 +184,31 @@ class Hosts(Protocol):
         ...
 
     def room(self) -> list[tuple[str, int]]:
-        """The machine that each share lives on, and bytes of memory that it may have; 0 for unknown."""
+        """Return the machine of each share, and its available bytes; 0 for unknown."""
         ...
 
     def run(self, calls: Mapping[int, Call]) -> dict[int, Reply]:
-        """The replies of shares to their calls, all at once; without those that were lost meanwhile, which hold nothing any more but are
-        there again. Raises `InputError` where they cannot be."""
+        """Run the calls of all shares concurrently and return their replies. Replies of shares that were lost meanwhile are missing;
+        these shares exist again without memory. Raise `InputError` if they cannot be restored."""
         ...
 
     def emptied(self) -> set[int]:
-        """Shares that have been lost since this was last asked, also those whose reply had come: they hold nothing any more."""
+        """Return the shares that were lost since the last call of this method, including those that replied before. They have no
+        memory."""
         ...
 
     def store(self, share: int, number: int, packed: Packed) -> bool:
-        """See `ViewShare.store`; false where the share was lost."""
+        """Store a memory on a share, see `ViewShare.store`; return False if the share was lost."""
         ...
 
     def fetch(self, number: int) -> dict[int, Packed]:
-        """See `ViewShare.fetch`, of all shares; without those that were lost."""
+        """Return a memory of all shares, see `ViewShare.fetch`, without lost shares."""
         ...
 
     def movable(self) -> list[int]:
-        """Shares that had better live elsewhere."""
+        """Return the shares that should move to another worker."""
         ...
 
     def move(self, share: int) -> None:
-        """Let a share live elsewhere, where it holds nothing yet."""
+        """Move a share to another worker, where it has no memory yet."""
         ...

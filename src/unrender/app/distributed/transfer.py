@@ -1,4 +1,4 @@
-"""A problem on its way to workers: each makes it again with its own views alone, and reads their references itself."""
+"""Transfer of a problem to workers: each builds it with its own views only, and reads their references itself."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _Given = TypeVar("_Given", View, Parameter)
 
 
 class _Parts(NamedTuple):
-    """The arguments of `Problem`, and the sensors that have exposures or corrected poses; None where these are no parameters."""
+    """Arguments of `Problem`, and the sensors that have exposures or poses; None if these are not parameters."""
 
     scene: Any
     parameters: Any
@@ -36,15 +36,15 @@ class _Parts(NamedTuple):
 
 
 def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
-    """What `unpacked` makes the problem of these views of: references that were given as files go as names.
+    """Return the serialised problem of these views for `unpacked`. References that were given as files are sent as paths.
 
     Args:
-        problem: the whole one.
-        views: indices of those that are to go.
+        problem: the full problem.
+        views: indices of the views.
         ray: the module.
 
     Raises:
-        InputError: it was made of what cannot be sent: a loaded scene, or a function or object tied to this process.
+        InputError: the problem cannot be sent: it has a loaded scene, or a function or object of this process.
     """
     given = [_located(problem.given_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
@@ -69,7 +69,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     except (TypeError, ValueError, AttributeError, RecursionError, OSError) as error:
         reason = " ".join(str(error).split())[:200]
         raise InputError(
-            f"workers: {problem.name} cannot be sent to them ({reason}); take a problem file with a scene in XML, or a "
+            f"workers: {problem.name} cannot be sent to them ({reason}); use a problem file with a scene in XML, or a "
             "scene as a dictionary of plain values"
         ) from error
     except Exception as error:  # pickle.PicklingError, of cloudpickle's own kinds
@@ -78,7 +78,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
 
 
 def unpacked(blob: bytes, ray: Any) -> Problem:
-    """The problem again. The variant must be in use. Raises `InputError` where a file is missing here."""
+    """Return the problem. The variant must be active. Raise `InputError` if a file is missing on this machine."""
     parts: _Parts = ray.cloudpickle.loads(blob)
     scene = parts.scene
     if parts.sensors is not None:
@@ -108,7 +108,7 @@ def _scene(problem: Problem) -> Any:
     pair = getattr(renderer, "pair", None)
     description = getattr(pair, "description", None)
     if description is None:
-        return renderer  # one that is no Mitsuba scene
+        return renderer  # not a Mitsuba scene
     if getattr(pair, "single", False):
         raise InputError(
             "workers: a loaded scene cannot be sent to them; give its XML file, its dictionary, or a function that returns one"
@@ -117,7 +117,7 @@ def _scene(problem: Problem) -> Any:
 
 
 def _located(given: _Given, *names: str) -> _Given:
-    """The same, its files named in full: workers have folders of their own."""
+    """Return the object with absolute file names, since workers have other working directories."""
     found = {name: value for name in names if isinstance(value := getattr(given, name), (str, Path))}
     located: dict[str, Any] = {name: Path(value).absolute() for name, value in found.items()}
     if isinstance(given, View) and given.known is not None:
@@ -127,7 +127,7 @@ def _located(given: _Given, *names: str) -> _Given:
 
 
 def _pickler(ray: Any) -> Any:
-    """Pickles functions by value, and the objects of Mitsuba's that dictionaries hold by what they are made of."""
+    """Return a pickler that serialises functions by value, and Mitsuba objects of dictionaries by their contents."""
 
     class Pickler(ray.cloudpickle.CloudPickler):
         def reducer_override(self, obj: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Worker processes on one machine or many, by Ray: which there are, what each may use, how one gets ready. Ray is imported on `connect`."""
+"""Worker processes on one machine or many, by Ray: their number, resources and start. Ray is imported by `connect` only."""
 
 from unrender.app.distributed.cluster.connection import Cluster, connect, load_ray
 from unrender.app.distributed.cluster.tasks import Ended, Executor, InProcess, OnWorkers

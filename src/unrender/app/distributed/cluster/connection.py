@@ -1,4 +1,4 @@
-"""Starting Ray on this machine, or joining a cluster of it."""
+"""Start of Ray on this machine, or connection to a cluster."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def reach(address: str, seconds: float) -> None:
 
 
 class HeadNode:
-    """Looks after the head node for whoever waits for workers: these go on for a while without it, but nothing can be started or found.
+    """Monitor of the head node. Workers continue for some time without it, but nothing can be started or found.
 
     Args:
         address: HOST:PORT; "" for none, which is never lost.
-        clock: seconds.
-        reach: see above.
+        clock: function that returns seconds.
+        reach: function that connects to the address.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class HeadNode:
         self._looked = self._answered = clock()
 
     def check(self) -> None:
-        """Look, at most every few seconds. Raises `InputError` where it has not answered for a while."""
+        """Check the head node, at most every few seconds. Raise `InputError` if it has not answered for some time."""
         now = self._clock()
         if not self._address or now - self._looked < _LOOK:
             return
@@ -67,7 +67,7 @@ class HeadNode:
             if now - self._answered > _PATIENCE:
                 reason = error.strerror or str(error)
                 raise InputError(
-                    f"workers: the cluster's head node at {self._address} is lost ({reason}); start one, and go on with unrender resume "
+                    f"workers: the cluster's head node at {self._address} is lost ({reason}); start one, and continue with unrender resume "
                     "or unrender sweep DIR"
                 ) from error
 
@@ -81,7 +81,7 @@ _SETTINGS = {
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
     "RAY_IGNORE_UNHANDLED_ERRORS": "1",
 }
-"""No telemetry, no metrics, nothing on standard error that is not an error; the environment's own settings win."""
+"""No telemetry, no metrics, and only errors on standard error. Settings in the environment take precedence."""
 _STORE_BYTES = 256 << 20
 _ANSWER_SECONDS = 10.0
 _NAMESPACE = "unrender"
@@ -89,13 +89,13 @@ _NAMESPACE = "unrender"
 
 @dataclass(frozen=True)
 class Cluster:
-    """Ray, connected.
+    """A connected Ray cluster.
 
     Attributes:
         ray: the module.
-        variant: that the workers compute with: what `prepare_worker` is to be given.
-        share: how many workers there are to be, and what each may use.
-        address: of the cluster; None for one that was started here.
+        variant: variant of the workers, for `prepare_worker`.
+        share: number of workers, and resources of each.
+        address: address of the cluster; None for a local one.
         head: its head node.
     """
 
@@ -107,23 +107,23 @@ class Cluster:
 
     @property
     def resources(self) -> dict[str, float]:
-        """What to ask Ray for, for each worker: `task.options(**cluster.resources)`. CUDA_VISIBLE_DEVICES follows from it."""
+        """Return the resources of each worker for Ray: `task.options(**cluster.resources)`. Ray sets CUDA_VISIBLE_DEVICES accordingly."""
         return {"num_cpus": self.share.cpus, "num_gpus": self.share.gpus}
 
 
 def load_ray() -> Any:
-    """The module `ray`, told to be silent.
+    """Return the module `ray`, configured to be silent.
 
     Raises:
-        InputError: it is not installed; one line that says what to install.
+        InputError: it is not installed; the message states what to install.
     """
     for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
-    if has_token() and "ray" not in sys.modules:  # which has read the mode by then, unlike the processes that it starts
+    if has_token() and "ray" not in sys.modules:  # an imported ray has read the mode already
         os.environ.setdefault("RAY_AUTH_MODE", "token")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of its own dependencies
+            warnings.simplefilter("ignore")  # warnings of its dependencies
             import ray
     except ImportError as error:
         raise InputError(f"workers need Ray ({error}): pip install 'unrender[ray]'") from error
@@ -132,7 +132,8 @@ def load_ray() -> Any:
 
 
 def _silence(ray: Any) -> None:
-    """No paragraphs about workers that died: who began their tasks says so. Ray has no setting for that, so what it lacks is no error."""
+    """Suppress Ray's messages about dead workers, which this package reports itself. Ray has no setting for this, so failures are
+    ignored."""
     with contextlib.suppress(Exception):
         ray._private.worker.print_to_stdstream = lambda *_, **__: None
 
@@ -141,24 +142,24 @@ def _silence(ray: Any) -> None:
 def connect(
     workers: Workers, name: str = "auto", store_bytes: int = _STORE_BYTES, most: int | None = None
 ) -> Iterator[Cluster]:
-    """Start Ray on this machine, or join a cluster; leave it at the end, and stop what was started here.
+    """Start Ray on this machine, or join a cluster; disconnect at the end, and stop a local cluster.
 
-    A cluster that is started here lets in nobody but this user. One that was started elsewhere is joined where it looks closed, too.
-    Handlers of SIGTERM and SIGINT stay as they are. A process has one connection at a time.
+    Only this user can enter a local cluster. An existing cluster is joined if it appears to be closed to others. Handlers of SIGTERM
+    and SIGINT do not change. A process has at most one connection.
 
     Args:
-        workers: how many, and where. Without an address the cluster is the one that the environment variable RAY_ADDRESS names, if set.
-        name: of Mitsuba's variant; "auto" for CUDA where there are GPUs, else LLVM.
-        store_bytes: of shared memory for what workers pass to one another; of a cluster started here.
-        most: workers that there is work for, see `share`.
+        workers: number of workers, and address. Without an address, the environment variable RAY_ADDRESS is used, if set.
+        name: Mitsuba variant; "auto" for CUDA if there are GPUs, else LLVM.
+        store_bytes: shared memory for objects of a local cluster.
+        most: maximum useful number of workers, see `share`.
 
     Raises:
-        InputError: Ray is not installed, there is no cluster at the address, it is open to other users, it has no GPU though `name` asks
-            for one, or the process is connected already.
+        InputError: Ray is not installed, there is no cluster at the address, it is open to other users, it has no GPU though `name`
+            requires one, or the process is already connected.
     """
     ray = load_ray()
     if ray.is_initialized():
-        raise InputError("workers: this process is connected to Ray already")
+        raise InputError("workers: this process is already connected to Ray")
     address = workers.address or os.environ.get("RAY_ADDRESS") or None
     with contextlib.ExitStack() as stack:
         if address is None:
@@ -207,7 +208,7 @@ def _init(ray: Any, address: str | None, given: dict[str, Any]) -> None:
 
 
 def _machines(ray: Any) -> list[tuple[float, float]]:
-    """(cores, GPUs) of each machine of the cluster."""
+    """Return (cores, GPUs) of each machine of the cluster."""
     alive = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     return [(resources.get("CPU", 0.0), resources.get("GPU", 0.0)) for resources in alive]
 
@@ -219,7 +220,7 @@ def _is_located(address: str) -> bool:
 
 
 def _check_answers(address: str) -> None:
-    """Raise `InputError` where nobody listens, which Ray takes two minutes to say."""
+    """Raise `InputError` if nothing listens at the address, which Ray would report only after two minutes."""
     if not _is_located(address):
         return
     try:
@@ -236,22 +237,22 @@ def _leave(ray: Any) -> None:
 
 @contextlib.contextmanager
 def _own_signals() -> Iterator[None]:
-    """Handlers of signals are afterwards what they were before: Ray sets one of its own for SIGTERM."""
+    """Restore the signal handlers afterwards, since Ray installs its own for SIGTERM."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    told = 0
+    received = 0
     try:
         yield
-    except SystemExit as end:  # what Ray's handler makes of it
-        told = end.code if end.code == signal.SIGTERM else 0
-        if not told:
+    except SystemExit as end:  # raised by Ray's handler
+        received = end.code if end.code == signal.SIGTERM else 0
+        if not received:
             raise
     finally:
         for number, handler in before.items():
             if handler is not None:
                 signal.signal(number, handler)
-    if told:
+    if received:
         signal.raise_signal(signal.SIGTERM)
         raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""A cluster of this machine that no other user can enter: its folder, its token and its network addresses."""
+"""A local cluster that no other user can enter: its folder, token and network addresses."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from unrender.core.errors import InputError
 
 _PREFIX, _LOCK = "unrender-ray-", "lock"
 _LONGEST = 107 - len("/unrender-ray-12345678/r/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store")
-"""Characters of the folder that holds the cluster's, at most: a socket's path has 107 bytes."""
+"""Maximum length of the folder that contains the cluster's, since a socket's path is limited to 107 bytes."""
 _YOUNG = 60.0
-"""Seconds until a folder without a lock counts as left over."""
+"""Seconds until a folder without a lock counts as abandoned."""
 _WATCHER = """
 import os, shutil, sys, time
 os.read(0, 1)
@@ -32,7 +32,7 @@ for _ in range(100):
         break
     time.sleep(0.1)
 """
-"""A process that removes the folder when its standard input ends, which a killed parent's does, too."""
+"""Program that removes the folder when its standard input ends, even if the parent process is killed."""
 _ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
 
 
@@ -40,8 +40,8 @@ _ENVIRONMENT = ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH", "RAY_E
 def private_cluster(ray: Any) -> Iterator[dict[str, Any]]:
     """Prepare the start of a cluster that only this user's processes can enter.
 
-    The token lives in the environment of these processes, which other users cannot read, and is never written. All services listen on the
-    loopback interface. What Ray writes lies below a folder of mode 0700.
+    The token is in the environment of these processes, which other users cannot read, and is never written. All services listen on the
+    loopback interface. Ray's files are below a folder of mode 0700.
 
     Args:
         ray: the module.
@@ -50,9 +50,9 @@ def private_cluster(ray: Any) -> Iterator[dict[str, Any]]:
         Arguments of `ray.init`.
 
     Raises:
-        InputError: no folder is safe, or this version of Ray knows no token.
+        InputError: no folder is safe, or this version of Ray does not support tokens.
     """
-    _clear_token_cache(ray)  # raises before anything is made
+    _clear_token_cache(ray)  # raises before any changes
     before = {name: os.environ.get(name) for name in _ENVIRONMENT}
     constants = ray._private.ray_constants
     networked = constants.ENABLE_RAY_CLUSTER
@@ -92,13 +92,13 @@ def check_private(ray: Any) -> None:
 
 
 def _clear_token_cache(ray: Any) -> None:
-    """Let Ray read the environment's token and mode anew."""
+    """Make Ray read the environment's token and mode again."""
     try:
         ray._raylet.Config.initialize("")
         ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
     except AttributeError as error:
         raise InputError(
-            f"workers: Ray {ray.__version__} cannot ask for a token; install a newer one: pip install 'ray>=2.52'"
+            f"workers: Ray {ray.__version__} does not support tokens; install a newer version: pip install 'ray>=2.52'"
         ) from error
 
 
@@ -135,7 +135,8 @@ def _watched(folder: Path) -> Iterator[None]:
 
 
 def _base() -> Path:
-    """Return the folder for the cluster's: the temporary one, or the system's where that has a long name or is open."""
+    """Return the parent folder for the cluster's folder: the temporary folder, or the system's if that has a long path or is not
+    private."""
     reasons = []
     for name in dict.fromkeys((tempfile.gettempdir(), "/tmp", "/var/tmp")):
         place = Path(os.path.realpath(name))

@@ -1,4 +1,4 @@
-"""Independent tasks, in this process or on workers. A worker's death costs its task alone, which is begun again elsewhere."""
+"""Independent tasks, in this process or on workers. A worker's death affects its task only, which is restarted elsewhere."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from unrender.core.text import one_line
 
 _ATTEMPTS = 3
 _GRACE_SECONDS = 4.0
-"""After an interrupt, for tasks to save what they have reached."""
+"""Time for tasks to save their state after an interrupt, in seconds."""
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A task that came to an end.
+    """A completed task.
 
     Attributes:
-        key: its own.
-        value: what its function returned; None where it failed.
-        message: why it failed, one line; "" where it did not.
-        attempts: how often it was begun.
+        key: its key.
+        value: result of its function; None if it failed.
+        message: reason of the failure, one line; "" on success.
+        attempts: number of starts.
     """
 
     key: Any
@@ -39,7 +39,7 @@ class Executor(Protocol):
 
     @property
     def slots(self) -> int:
-        """How many tasks may be under way."""
+        """Return the maximum number of concurrent tasks."""
         ...
 
     @property
@@ -48,23 +48,23 @@ class Executor(Protocol):
         ...
 
     def start(self, key: Any, *arguments: Any) -> None:
-        """Begin a task, where `pending` is below `slots`."""
+        """Start a task, if `pending` is below `slots`."""
         ...
 
     def wait(self, seconds: float) -> list[Ended]:
-        """Tasks that have come to an end, in the order in which they were begun; [] where none has after so many seconds.
+        """Return completed tasks in the order of their start; [] if none completes within `seconds`.
 
-        An interrupt (`KeyboardInterrupt`) passes through once the tasks under way have been told to stop.
+        An interrupt (`KeyboardInterrupt`) propagates after the running tasks were told to stop.
         """
         ...
 
 
 @dataclass
 class InProcess:
-    """One task at a time, in this process, carried out by `wait`.
+    """Executor that runs one task at a time in this process, in `wait`.
 
     Attributes:
-        function: of the arguments given to `start`.
+        function: function of the arguments of `start`.
     """
 
     function: Callable[..., Any]
@@ -79,19 +79,19 @@ class InProcess:
         self._next.append((key, arguments))
 
     def wait(self, seconds: float) -> list[Ended]:
-        """See `Executor.wait`. Waits for as long as the task takes."""
+        """Run the next task and return it. Blocks until the task ends."""
         if not self._next:
             return []
         key, arguments = self._next.pop(0)
         try:
             return [Ended(key, self.function(*arguments))]
-        except Exception as error:  # one task's, whatever it is
+        except Exception as error:  # any failure affects one task only
             return [Ended(key, None, _reason(error))]
 
 
 @dataclass
 class _Begun:
-    """A task under way: its key, its arguments, how often it was begun."""
+    """A running task: its key, its arguments, and its number of starts."""
 
     key: Any
     arguments: tuple[Any, ...]
@@ -99,13 +99,13 @@ class _Begun:
 
 
 class OnWorkers:
-    """Tasks on a cluster's workers, each in a process of its own.
+    """Executor that runs tasks on a cluster's workers, each in its own process.
 
-    Where the process or its machine dies, the task is begun again, at most twice.
+    If the process or its machine dies, the task is restarted, at most twice.
 
     Args:
-        cluster: connected.
-        function: of a module that the workers can import; of arguments and a result that can be serialised.
+        cluster: connected cluster.
+        function: importable function with serialisable arguments and result.
     """
 
     def __init__(self, cluster: Cluster, function: Callable[..., Any]):
@@ -124,11 +124,11 @@ class OnWorkers:
         self._start(_Begun(key, arguments, 1))
 
     def wait(self, seconds: float) -> list[Ended]:
-        """See `Executor.wait`. Raises `InputError` where the cluster's head node is lost."""
+        """Return completed tasks. Raise `InputError` if the cluster's head node is lost."""
         self._head.check()
         try:
             ready = set(self._ray.wait(list(self._begun), num_returns=1, timeout=seconds)[0])
-            if ready:  # all that have ended by now
+            if ready:  # all completed tasks
                 ready |= set(self._ray.wait(list(self._begun), num_returns=len(self._begun), timeout=0)[0])
             ended = [self._end(reference) for reference in list(self._begun) if reference in ready]
             return [one for one in ended if one is not None]
@@ -137,20 +137,20 @@ class OnWorkers:
             raise
 
     def saved(self) -> list[Ended]:
-        """After an interrupt: the tasks that ended in good order, before it or because of it."""
+        """Return, after an interrupt, the tasks that ended regularly, before it or because of it."""
         ready = self._ray.wait(list(self._begun), num_returns=len(self._begun), timeout=0)[0] if self._begun else []
-        found = []
+        ended = []
         for reference in ready:
             task = self._begun.pop(reference)
             with contextlib.suppress(self._ray.exceptions.RayError):
-                found.append(Ended(task.key, self._ray.get(reference), "", task.attempts))
-        return found
+                ended.append(Ended(task.key, self._ray.get(reference), "", task.attempts))
+        return ended
 
     def _start(self, task: _Begun) -> None:
         self._begun[self._remote.remote(*task.arguments)] = task
 
     def _end(self, reference: Any) -> Ended | None:
-        """What became of a task; None for one that is begun again."""
+        """Return a completed task; None for one that is restarted."""
         errors = self._ray.exceptions
         task = self._begun.pop(reference)
         try:
@@ -169,7 +169,7 @@ class OnWorkers:
             return Ended(task.key, None, f"its worker died {task.attempts} times: {_death(error)}", task.attempts)
 
     def _cancel(self) -> None:
-        """Tell all tasks to stop, and wait for a few seconds until they have."""
+        """Cancel all tasks, and wait a few seconds for them to stop."""
         with contextlib.suppress(Exception):
             for reference in self._begun:
                 self._ray.cancel(reference)
@@ -186,6 +186,6 @@ def _reason(error: BaseException) -> str:
 
 
 def _death(error: BaseException) -> str:
-    """Ray's words, without what they say of its logs."""
+    """Return Ray's description of the death, without its references to logs."""
     first = " ".join(str(error).split()).split(". ")[0]
     return one_line(first[:200])

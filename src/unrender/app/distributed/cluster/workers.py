@@ -1,4 +1,4 @@
-"""How many workers there are to be, where, and what each may use. Nothing here needs Ray."""
+"""Number of workers, their location and resources. This module does not need Ray."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ _prepared: list[tuple[str, int]] = []
 
 
 def prepare_worker(name: str, threads: int) -> str:
-    """Choose the variant and the number of threads, once a process: later calls with the same arguments do nothing.
+    """Choose the variant and the number of threads, once per process. Later calls with the same arguments do nothing.
 
     Args:
-        name: of the variant, or "auto".
-        threads: of the processor, >= 1.
+        name: name of the variant, or "auto".
+        threads: processor threads, >= 1.
 
     Returns:
-        The variant in use.
+        The active variant.
 
     Raises:
-        VariantError: this machine cannot run it.
+        VariantError: this machine does not support it.
     """
     chosen = variant.use(name)
     if (name, threads) not in _prepared:
@@ -40,12 +40,12 @@ _WORKER_BYTES = 512 << 20
 
 @dataclass(frozen=True)
 class Workers:
-    """What `--workers` says.
+    """Value of `--workers`.
 
     Attributes:
-        count: how many; None for one a GPU, or one a processor core where no GPU is to be used.
-        address: HOST:PORT of a Ray cluster to join; None for this machine (or for the cluster that RAY_ADDRESS names).
-        insecure: Whether to join a cluster that other users can enter.
+        count: number of workers; None for one per GPU, or one per processor core without GPUs.
+        address: HOST:PORT of a Ray cluster to join; None for this machine (or for the cluster of RAY_ADDRESS).
+        insecure: whether to join a cluster that other users can enter.
     """
 
     count: int | None = None
@@ -54,7 +54,7 @@ class Workers:
 
     @classmethod
     def parse(cls, text: str, option: str = "--workers") -> Workers:
-        """`auto`, a number, HOST:PORT, or NUMBER@HOST:PORT. Raises `InputError`."""
+        """Parse `auto`, a number, HOST:PORT, or NUMBER@HOST:PORT. Raise `InputError`."""
         number, at, address = text.strip().rpartition("@")
         if not at and not _ADDRESS.match(address):
             number, address = address, ""
@@ -75,12 +75,12 @@ class Workers:
 
 @dataclass(frozen=True)
 class Share:
-    """What the workers are, and what each may use.
+    """Number of workers, and resources of each.
 
     Attributes:
-        count: how many workers, >= 1.
-        cpus: of a machine's cores for each: a whole number, or 1/k where k workers share one.
-        gpus: of a machine's GPUs for each: 0, 1, or 1/k.
+        count: number of workers, >= 1.
+        cpus: cores per worker: an integer, or 1/k if k workers share one.
+        gpus: GPUs per worker: 0, 1, or 1/k.
     """
 
     count: int
@@ -94,13 +94,13 @@ class Share:
 
 
 def share(machines: Sequence[tuple[float, float]], count: int | None, gpu: bool, most: int | None = None) -> Share:
-    """How workers share the machines.
+    """Return how workers share the machines.
 
     Args:
-        machines: (cores, GPUs) of each.
-        count: how many workers; None for one a GPU, or one a core without `gpu`.
+        machines: (cores, GPUs) of each machine.
+        count: number of workers; None for one per GPU, or one per core without `gpu`.
         gpu: whether they compute on GPUs.
-        most: of how many there is work for, where `count` is None; None for any number.
+        most: maximum useful number of workers if `count` is None; None for no maximum.
 
     Raises:
         InputError: no machine has a core (a GPU).
@@ -134,7 +134,7 @@ def most_by_memory(most: int | None) -> int | None:
 
 
 def _most_each(devices: Sequence[int], count: int) -> float:
-    """The most that each of `count` workers can have, none of them on two machines: a whole number, or 1/k."""
+    """Return the maximum number of devices for each of `count` workers, without workers across machines: an integer, or 1/k."""
     for each in range(max(devices), 0, -1):
         if sum(n // each for n in devices) >= count:
             return float(each)
