@@ -28,7 +28,7 @@ MISTAKES = [
     (["run", "problem.toml", "--method", "rvc"], "unknown method rvc; did you mean rcv?"),
     (["run", "problem.toml", "--set", "spp"], "--set spp: expected NAME=VALUE"),
     (["run", "problem.toml", "--set", "=3"], "--set =3: expected NAME=VALUE"),
-    (["run", "problem.toml", "--set", "spp=2", "--set", "spp=4"], "--set spp=4: spp is given twice"),
+    (["run", "problem.toml", "--set", "spp=2", "--set", "spp=4"], "--set spp=4: spp is set twice"),
     (["run", "problem.toml", "--set", "spp=-2"], "option spp: expected a whole number above 0 or none, got '-2'"),
     (
         ["run", "problem.toml", "--set", f"spp={2**31}"],
@@ -53,13 +53,13 @@ MISTAKES = [
     ),
     (["run", "problem.toml", "--set", "steps=x"], "--set steps=x: expected a whole number"),
     (["run", "problem.toml", "--set", "seconds=x"], "--set seconds=x: expected a number"),
-    (["run", "problem.toml", "--set", "steps=3", "--steps", "3"], "--set steps=3: --steps is given, too"),
+    (["run", "problem.toml", "--set", "steps=3", "--steps", "3"], "--set steps=3: --steps is given as well"),
     (["run", "problem.toml", "--variant", "cuda_ad_rbg"], "did you mean cuda_ad_rgb?"),
     (["run", "problem.toml", "--problem-set", "resolution=8"], "--problem-set resolution: only gallery problems"),
     (["run", "missing.toml"], "missing.toml: no such file"),
     (["run", "problems.toml"], "problems.toml: no such file; did you mean problem.toml?"),
     (["run", "problem"], "no problem problem: neither a TOML file nor in the gallery; did you mean problem.toml?"),
-    (["run", "wall.xml"], "wall.xml: a scene alone does not say what is unknown"),
+    (["run", "wall.xml"], "wall.xml: a scene does not define the unknowns"),
     (["run", "indirect-rom"], "neither a TOML file nor in the gallery; did you mean indirect-room?"),
     (["run", "indirect-room", "-p", "resolutoin=8"], "no option resolutoin; did you mean resolution?"),
     (["run", "indirect-room", "-p", "resolution=-8"], "resolution"),
@@ -78,7 +78,7 @@ MISTAKES = [
     (["compare"], "Missing argument"),
     (["compare", "problem.toml", "--methods", "plain,rvc"], "unknown method rvc; did you mean rcv?"),
     (["compare", "problem.toml", "--methods", ","], "--methods: expected at least one name"),
-    (["compare", "problem.toml", "--methods", "rcv,rcv"], "--methods: rcv is given twice"),
+    (["compare", "problem.toml", "--methods", "rcv,rcv"], "--methods: rcv is listed twice"),
     (["compare", "problem.toml", "--seconds", "0"], "--seconds 0: expected a number above 0"),
     (["compare", "problem.toml", "--seeds", "0"], "Invalid value for '--seeds'"),
     (["compare", "problem.toml", "--set", "rvc.spp=2"], "rvc is not one of the methods stock, auto"),
@@ -86,7 +86,7 @@ MISTAKES = [
     (["compare", "problem.toml", "--set", "auto.spp=0"], "method auto: option spp: expected a whole number above 0"),
     (["compare", ".", "nowhere"], "nowhere: no such run folder"),
     (["compare", "."], "run.json"),
-    (["compare", ".", "--seconds", "3"], "run folders are compared as they are"),
+    (["compare", ".", "--seconds", "3"], "do not apply to run folders"),
 ]
 
 

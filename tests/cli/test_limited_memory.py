@@ -95,7 +95,7 @@ def test_too_few_addresses_are_one_line(tmp_path: Path, limit: int, words: list[
     """Dr.Jit waits for ever at 500000 kB, where it gets no thread."""
     status, said = ended(start(tmp_path, words, limit), 30)
     assert status == 3
-    assert said.startswith(f"unrender: memory: ulimit -v allows {limit} kB of addresses, expected at least ")
+    assert said.startswith(f"unrender: memory: ulimit -v allows {limit} kB of address space, expected at least ")
     assert said.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
@@ -203,7 +203,7 @@ def test_a_run_without_memory(
         patches.setattr(PathGradient, "estimate", estimate)
         answer = unrender(*TOY, "--steps", 10, "--checkpoint-every", 2, "--variant", mitsuba_variant)
     assert answer.status == 3
-    assert answer.error.startswith("unrender: out of memory; what a run had written remains.")
+    assert answer.error.startswith("unrender: out of memory; files of a run remain.")
     assert answer.error.count("\n") == 1
     assert json.loads(Path("run/run.json").read_text())["status"] == "failed"
     assert unrender("resume", "run").status == 0

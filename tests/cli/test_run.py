@@ -134,7 +134,7 @@ def test_run_replaces_earlier_results_only_when_told(unrender, problem: Path, mi
     (problem.parent / "result" / "notes.txt").write_text("mine")
     refused = unrender(*words)
     assert refused.status == 2
-    assert refused.error == "unrender: --out result: holds earlier results; give --overwrite to replace them\n"
+    assert refused.error == "unrender: --out result: contains earlier results; give --overwrite to replace them\n"
     problem.write_text(problem.read_text().replace("truth", "# truth"))
     assert unrender(*words, "--overwrite").status == 0
     assert names(problem.parent / "result") == [name for name in sorted([*FILES, "notes.txt"]) if name != "truth.npz"]
@@ -192,7 +192,7 @@ def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mi
     assert unrender("report", Path("both", "plain-seed0")).out.strip() == str(
         Path("both", "plain-seed0", "report.html")
     )
-    assert unrender(*words).error.startswith("unrender: --out both: holds earlier results")
+    assert unrender(*words).error.startswith("unrender: --out both: contains earlier results")
 
 
 def test_ctrl_c_keeps_what_was_reached(problem: Path, mitsuba_variant: str):
@@ -227,8 +227,8 @@ def test_ctrl_c_keeps_what_was_reached(problem: Path, mitsuba_variant: str):
         process.kill()
     assert process.returncode == 130, error
     assert error.removeprefix(f"unrender: {WAITING}\n") == "unrender: interrupted\n"
-    assert "interrupted: what was reached is saved" in out
-    assert "to go on: unrender resume result" in out
+    assert "interrupted: the current state is saved" in out
+    assert "to continue: unrender resume result" in out
     folder = problem.parent / "result"
     assert names(folder) == FILES
     record = json.loads((folder / "run.json").read_text())

@@ -50,8 +50,8 @@ def test_sigterm_ends_a_run_with_143(unrender, monkeypatch: pytest.MonkeyPatch, 
         at_step(patches, 5, lambda: send(signal.SIGTERM))
         answer = unrender("run", *TOY, "--out", "run", "--variant", mitsuba_variant)
     assert (answer.status, answer.error) == (143, "unrender: terminated\n")
-    assert "terminated: what was reached is saved" in answer.out
-    assert "to go on: unrender resume run" in answer.out
+    assert "terminated: the current state is saved" in answer.out
+    assert "to continue: unrender resume run" in answer.out
     record = json.loads(Path("run/run.json").read_text())
     assert (record["status"], record["stopped"], record["steps"]) == ("interrupted", "terminated", 5)
     assert Path("run/checkpoints/00000005/manifest.json").exists()
@@ -148,12 +148,12 @@ def test_a_run_that_is_given_up_is_no_success(unrender, monkeypatch: pytest.Monk
     answer = unrender("run", *TOY, "--out", "run", "--variant", mitsuba_variant)
     assert (answer.status, answer.error) == (
         4,
-        "unrender: the run failed: it was given up, and what was finite is kept\n",
+        "unrender: the run failed: it was stopped, and the last finite values are saved\n",
     )
-    assert "failed: given up after 23 steps; kept are the values of the 3 that were applied" in answer.out
+    assert "failed: stopped after 23 steps; the result has the values of the 3 applied steps" in answer.out
     assert "to try once more from its last step: unrender resume run" in answer.out
     assert json.loads(Path("run/run.json").read_text())["status"] == "failed"
-    assert "failed, given up: gradients were not finite" in Path("run/report.html").read_text()
+    assert "failed: gradients were not finite" in Path("run/report.html").read_text()
     methods = ["--methods", "plain,rcv", "--seconds", 0.5, "--final-spp", 1]
     answer = unrender("compare", "exponential", *methods, "--out", "both", "--variant", mitsuba_variant)
     assert answer.status == 4

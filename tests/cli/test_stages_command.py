@@ -186,8 +186,8 @@ def test_a_file_that_is_wrong_is_one_line(unrender: Unrender, staged: Path, old:
 
 
 def test_options_that_stand_in_the_file_are_refused(unrender: Unrender, staged: Path) -> None:
-    assert "--set spp: not with stages" in unrender(*RUN, "--set", "spp=2").error
-    assert "--method: not with stages" in unrender(*RUN, "--method", "rcv").error
+    assert "--set spp: not supported with stages" in unrender(*RUN, "--set", "spp=2").error
+    assert "--method: not supported with stages" in unrender(*RUN, "--method", "rcv").error
     assert not (staged / "result").exists()
 
 
@@ -268,7 +268,7 @@ def test_a_run_that_was_killed_before_its_first_record_goes_on_with_its_options(
 def test_other_commands_say_that_it_is_a_file_of_stages(unrender: Unrender, staged: Path, command: str) -> None:
     answer = unrender(*command.split())
     assert (answer.status, answer.error.count("\n")) == (2, 1)
-    assert "stages.toml: a file of stages, which `unrender run` alone takes; expected a problem file" in answer.error
+    assert "stages.toml: a file of stages, which only `unrender run` accepts; expected a problem file" in answer.error
     assert not (staged / "out").exists()
 
 

@@ -50,7 +50,7 @@ def test_a_grid_in_this_process(unrender, mitsuba_variant: str) -> None:
     alone, within = (json.loads(Path(p, "run.json").read_text()) for p in ("r", "s/trial-001-seed0"))
     assert alone["settings"]["options"] == within["settings"]["options"]
     again = unrender("sweep", *GRID, "--out", "s")
-    assert (again.status, "holds earlier results" in again.error) == (2, True)
+    assert (again.status, "contains earlier results" in again.error) == (2, True)
 
 
 @pytest.mark.slow
@@ -71,7 +71,7 @@ def test_an_interrupted_sweep_goes_on_where_it_was(
         patches.setattr(tasks, "carry_out", interrupted)
         answer = unrender(*command, "--out", "s")
     assert (answer.status, answer.error) == (130, "unrender: interrupted\n")
-    assert "to go on: unrender sweep s" in answer.out
+    assert "to continue: unrender sweep s" in answer.out
     assert (sweep_json()["status"], len(sweep_json()["trials"])) == ("interrupted", 2)
     stamps = [os.stat(f"s/trial-00{i}-seed0/run.json").st_mtime_ns for i in range(2)]
     assert unrender("sweep", "s").status == 0
@@ -82,7 +82,7 @@ def test_an_interrupted_sweep_goes_on_where_it_was(
     more = unrender("sweep", "s", "--trials", 5)
     assert (more.status, len(trials("s"))) == (0, 5)
     refused = unrender("sweep", "s", "--steps", 3)
-    assert (refused.status, "goes on as it was begun, without --steps" in refused.error) == (2, True)
+    assert (refused.status, "continues with its original options; leave out --steps" in refused.error) == (2, True)
 
 
 def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(
@@ -122,7 +122,7 @@ def test_a_sweep_from_python_is_the_commands(unrender, monkeypatch: pytest.Monke
     assert found.plan == plans[0][0]
     with pytest.raises(ur.InputError, match="nothing to vary"):
         ur.app.sweep("quad", "plain")
-    with pytest.raises(ur.InputError, match="holds earlier results"):
+    with pytest.raises(ur.InputError, match="contains earlier results"):
         ur.app.sweep("quad", "plain", over, out="python")
 
 
@@ -219,6 +219,6 @@ def test_an_interrupt_ends_workers_and_what_was_reached_is_kept(started: Any, tm
     out, error = process.communicate(timeout=60)
     assert time.monotonic() - began < 30
     assert (process.returncode, error.removeprefix(f"unrender: {WAITING}\n")) == (130, "unrender: interrupted\n")
-    assert "to go on: unrender sweep s" in out
+    assert "to continue: unrender sweep s" in out
     assert json.loads((tmp_path / "s/sweep.json").read_text())["status"] == "interrupted"
     assert json.loads((tmp_path / "s/trial-000-seed0/run.json").read_text())["steps"] > 0

@@ -24,9 +24,9 @@ compare = import_module("unrender.app.cli.compare")
         (["--workers", "0"], "--workers 0: expected"),
         (
             ["--workers", "1", "--compress"],
-            "--compress: is of what is sent to workers; --workers 1 is this process alone",
+            "--compress: requires other processes, but --workers 1 is this process; use more workers",
         ),
-        (["--compress"], "--compress: is of what is sent to workers; give --workers, too"),
+        (["--compress"], "--compress: requires --workers"),
     ],
 )
 def test_bad_words_are_one_line(words: list[str], line: str, capfd: Any, tmp_path: Any) -> None:

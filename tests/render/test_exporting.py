@@ -40,7 +40,7 @@ def test_a_material_that_tells_no_description_is_one_line(tmp_path: Path) -> Non
     MADE_BEFORE.append(mi.load_dict({"type": "roughconductor"}))
     for description in (scene(MADE_BEFORE[0]), lambda: scene(MADE_BEFORE[0])):
         asked = problem(description)
-        with pytest.raises(ur.InputError, match=r"^ball\.bsdf: a ready-made .*, which tells no description of itself"):
+        with pytest.raises(ur.InputError, match=r"^ball\.bsdf: a ready-made .*, which has no description"):
             ur.app.export((asked, start(asked)), tmp_path / "out")
         assert not list(tmp_path.iterdir())
     MADE_BEFORE.clear()

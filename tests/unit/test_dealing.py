@@ -342,7 +342,7 @@ def test_what_does_not_fit_a_worker_is_refused_with_what_would() -> None:
     parameters, images = assignment.needed(problem, (0, 1), remembers=True)
     room = sum(parameters.values()) + images
     assignment.check(problem, shares, [("a", room), ("b", 0)], remembers=True)
-    with pytest.raises(ur.InputError, match=r"on b, .* 1 would fit; take 4 workers"):
+    with pytest.raises(ur.InputError, match=r"but b has .* 1 would fit: use at least 4 workers"):
         assignment.check(problem, shares, [("a", room), ("b", room - 1)], remembers=True)
     with pytest.raises(ur.InputError, match=r"parameter map \(2 × 2 × 1\) is .*, but a has .*would fit"):
         assignment.check(problem, shares, [("a", 100), ("b", 100)], remembers=False)

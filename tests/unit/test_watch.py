@@ -145,9 +145,9 @@ def test_the_page_shows_a_finished_run(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"status": "failed", "stopped": "non-finite"}, "failed, given up: gradients were not finite"),
+        ({"status": "failed", "stopped": "non-finite"}, "failed: gradients were not finite"),
         ({"status": "failed", "stopped": "", "error": "a defect"}, ">failed<"),
-        ({"status": "interrupted", "stopped": "terminated"}, "terminated: this is what was reached"),
+        ({"status": "interrupted", "stopped": "terminated"}, "terminated: this is the state at the termination"),
     ],
 )
 def test_the_page_tells_a_run_that_failed_from_one_that_finished(tmp_path, fields, words):

@@ -1,4 +1,4 @@
-"""The parts of the `unrender` command. Importing this is quick: each command imports what it needs when it is called."""
+"""Subcommands of the `unrender` command. This module imports quickly: each command imports what it needs when it is called."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from unrender.app.cli.turntable import turntable
 from unrender.app.cli.watch import watch
 
 app = typer.Typer(
-    help="Recover what a scene is made of (textures, materials, light) from images of it.",
+    help="Recover the parameters of a scene (textures, materials, lights) from images.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # rich's help takes half a second to import
@@ -43,7 +43,7 @@ app.command()(methods)
 
 @app.command("doctor")
 def _doctor() -> None:
-    """Tell what this machine has, try a gradient, say what to install."""
+    """Show the properties of this machine, test a gradient, and list missing packages."""
     from unrender.app.cli.doctor import doctor
 
     raise typer.Exit(doctor())

@@ -1,4 +1,4 @@
-"""From what was typed to what it means: problems, settings, folders."""
+"""Parsing of command-line arguments: problems, settings, folders."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ ProblemSettings = Annotated[
     ),
 ]
 Variant = Annotated[str, typer.Option(help="Mitsuba's variant: auto, cuda_ad_rgb or llvm_ad_rgb.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what an earlier run left in the folder.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run in the folder.")]
 Threads = Annotated[
     int | None,
     typer.Option(min=1, help="Threads of the processor. With 1, runs repeat bit for bit.", show_default=False),
@@ -68,16 +68,16 @@ AllowOutside = Annotated[
     typer.Option(
         "--allow-outside",
         callback=confinement.allow,
-        help="Read files that a capture or a scene names outside of its own folder.",
+        help="Allow a capture or a scene to read files outside its own folder.",
         show_default=False,
     ),
 ]
-"""The option has its effect when it is parsed: see `io.confinement`."""
+"""Option that takes effect when it is parsed, see `io.confinement`."""
 
 
 NoCache = Annotated[
     bool,
-    typer.Option("--no-cache", help="Render a gallery problem's references anew, and keep none.", show_default=False),
+    typer.Option("--no-cache", help="Render a gallery problem's references without the cache.", show_default=False),
 ]
 
 
@@ -102,41 +102,41 @@ Insecure = Annotated[
 
 
 def workers(text: str | None, insecure: bool = False) -> Workers | None:
-    """Return what --workers and --insecure say; None for this process alone, which one worker without an address is, too.
+    """Return the value of --workers and --insecure; None for this process alone, which includes one worker without an address.
 
     Raises:
-        InputError: --workers cannot be understood, or --insecure is given without it.
+        InputError: --workers is invalid, or --insecure is given without it.
     """
     if text is None:
         if insecure:
-            raise InputError("--insecure: applies to the cluster of --workers HOST:PORT; give that, too")
+            raise InputError("--insecure: requires --workers HOST:PORT")
         return None
     from dataclasses import replace
 
     from unrender.app.distributed.cluster import Workers, load_ray
 
-    found = Workers.parse(text)
-    if found == Workers(1):
+    parsed = Workers.parse(text)
+    if parsed == Workers(1):
         return None
-    load_ray()  # what is missing is known before anything that takes time
-    return replace(found, insecure=insecure)
+    load_ray()  # report missing packages before slow operations
+    return replace(parsed, insecure=insecure)
 
 
 def settings(pairs: Iterable[str] | None, option: str) -> dict[str, str]:
-    """["spp=4"] as {"spp": "4"}. Raises `InputError` for what is no NAME=VALUE, or a name given twice."""
-    found: dict[str, str] = {}
+    """Return ["spp=4"] as {"spp": "4"}. Raise `InputError` for an invalid NAME=VALUE, or a repeated name."""
+    result: dict[str, str] = {}
     for pair in pairs or ():
         name, equals, value = (part.strip() for part in pair.partition("="))
         if not equals or not name:
             raise InputError(f"{option} {pair}: expected NAME=VALUE")
-        if name in found:
-            raise InputError(f"{option} {pair}: {name} is given twice")
-        found[name] = value
-    return found
+        if name in result:
+            raise InputError(f"{option} {pair}: {name} is set twice")
+        result[name] = value
+    return result
 
 
 def literal(text: str) -> Any:
-    """A whole number, a number, true or false where `text` is one, else the text."""
+    """Return an integer, a number, or a boolean if `text` is one, else the text."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -153,9 +153,9 @@ def check_variant(name: str) -> None:
 
 
 def use_variant(name: str, threads: int | None = None) -> str:
-    """Choose the variant and, on the processor, the number of threads (None for one per core). Before anything is rendered.
+    """Choose the variant and, on the processor, the number of threads (None for one per core), before anything is rendered.
 
-    A name that does not exist is wrong input; one that cannot run here is not.
+    An unknown name raises `InputError`; one that this machine does not support raises `VariantError`.
     """
     check_variant(name)
     with phases.phase("loading"):
@@ -166,13 +166,13 @@ def use_variant(name: str, threads: int | None = None) -> str:
 
 
 def check_problem(name: str, options: Mapping[str, str]) -> None:
-    """Raise `InputError` where `open_problem` would fail for reasons that can be told without Mitsuba."""
+    """Raise `InputError` if `open_problem` would fail for reasons that can be checked without Mitsuba."""
     from unrender import gallery
 
     if _is_file(name):
         if Path(name).suffix.lower() == ".xml":
             raise InputError(
-                f"{name}: a scene alone does not say what is unknown; write a problem file with: "
+                f"{name}: a scene does not define the unknowns; write a problem file with: "
                 f'scene = "{Path(name).name}", [[parameters]] and [[views]]'
             )
         if options:
@@ -189,20 +189,20 @@ def check_problem(name: str, options: Mapping[str, str]) -> None:
 
 
 def refuse_stages(file: str) -> None:
-    """Raise `InputError` for a file of stages where a problem file is expected."""
+    """Raise `InputError` for a file of stages if a problem file is expected."""
     from unrender.app.stages import stages_file
 
     if Path(file).is_file() and stages_file.is_stages(Path(file)):
-        raise InputError(f"{file}: a file of stages, which `unrender run` alone takes; expected a problem file")
+        raise InputError(f"{file}: a file of stages, which only `unrender run` accepts; expected a problem file")
 
 
 def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> Problem:
-    """The problem of a TOML file or of the gallery. A variant must be in use. Raises `InputError`.
+    """Open the problem of a TOML file or of the gallery. A variant must be active. Raise `InputError`.
 
     Args:
-        name: as typed.
-        options: of a gallery problem.
-        cached: whether its references may come from the cache folder, and go there.
+        name: typed name.
+        options: options of a gallery problem.
+        cached: whether its references are read from and written to the cache.
     """
     with phases.phase("loading"), contextlib.nullcontext() if cached else cache.bypassed():
         from unrender import gallery
@@ -215,12 +215,12 @@ def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> 
 
 
 def short_name(problem: str) -> str:
-    """What folders are called after: the problem's name, or its file's without the ending."""
+    """Return the base name of folders: the problem's name, or its file's without the extension."""
     return Path(problem).stem if problem.endswith(".toml") else problem
 
 
 def absolute(problem: str) -> str:
-    """As typed, with the absolute path of a file: the same wherever it is opened from."""
+    """Return the problem as typed, with the absolute path of a file."""
     return str(Path(problem).absolute()) if _is_file(problem) else problem
 
 
@@ -229,7 +229,7 @@ def _is_file(name: str) -> bool:
 
 
 def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float | None]:
-    """Steps and seconds; `DEFAULT_STEPS` where neither is given. Raises `InputError` where one makes no sense."""
+    """Return steps and seconds; `DEFAULT_STEPS` if neither is given. Raise `InputError` for an invalid value."""
     if steps is not None and not 1 <= steps < 1 << 63:
         raise InputError(f"--steps {steps!s:.60}: expected at least 1 and less than 2**63")
     if seconds is not None and not 0 < seconds < math.inf:
@@ -238,16 +238,16 @@ def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float 
 
 
 def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Path:
-    """Where results go: a folder without files, made here so that a wrong place is known before hours of work.
+    """Return the output folder, created now so that an invalid location is reported before hours of work.
 
     Args:
-        given: what the user asked for, or None for a new folder in out/.
-        default: its name there; a number is added to one that exists.
-        overwrite: whether a folder that holds earlier results may be written to.
-        marks: patterns of the files by which earlier results are known.
+        given: folder that the user chose, or None for a new folder in out/.
+        default: its name there; a number is appended if it exists.
+        overwrite: whether a folder with earlier results may be written to.
+        marks: patterns of files that identify earlier results.
 
     Raises:
-        InputError: a file, a folder with other things in it, earlier results without `overwrite`, or not writable.
+        InputError: a file, a folder with other contents, earlier results without `overwrite`, or not writable.
     """
     if given is None:
         name = re.sub(r"[^\w.-]+", "-", default).strip(".-") or "run"
@@ -263,7 +263,7 @@ def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Pa
             if not any(True for mark in marks for _ in given.glob(mark)):
                 raise InputError(f"--out {given}: the folder is not empty and holds no earlier results ({marks[0]})")
             if not overwrite:
-                raise InputError(f"--out {given}: holds earlier results; give --overwrite to replace them")
+                raise InputError(f"--out {given}: contains earlier results; give --overwrite to replace them")
         from unrender.io import files  # NumPy with it
 
         files.make_folder(given)
@@ -280,14 +280,14 @@ def command_line(context: typer.Context) -> str:
 
 
 def finished_run(directory: Path) -> Path:
-    """The run folder whose result is meant by DIR: of a run in stages, the last that has begun. Raises `InputError`."""
+    """Return the run folder of the result in DIR: for a run in stages, the last that has started. Raise `InputError`."""
     from unrender.app.stages import run_folders
 
     return run_folders.last_result(directory)
 
 
 def remove_if_empty(directory: Path) -> None:
-    """Take back a folder that `folder` made and nothing was written to."""
+    """Remove a folder that `folder` created if nothing was written to it."""
     with contextlib.suppress(OSError):
         directory.rmdir()
         if directory.parent == Path("out"):

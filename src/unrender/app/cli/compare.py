@@ -1,4 +1,4 @@
-"""`unrender compare`: several methods, or runs made earlier, at equal time."""
+"""`unrender compare`: methods, or earlier runs, at equal time."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SECONDS = 20.0
 _DEFAULT = ("stock", "auto")
-"""What people have, and what they get here without an option."""
+"""Default methods: the standard Mitsuba loop, and the automatic choice."""
 _POLL_SECONDS = 0.5
 _MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
@@ -56,19 +56,19 @@ def compare(
     context: typer.Context,
     what: Annotated[
         list[str],
-        typer.Argument(metavar="PROBLEM | DIR...", help="A problem to run here, or run folders made earlier."),
+        typer.Argument(metavar="PROBLEM | DIR...", help="A problem to run, or earlier run folders."),
     ],
     methods: _Methods = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", "-s", metavar="[METHOD.]NAME=VALUE", help="An option of one method or of all, such as rcv.spp=4."
+            "--set", "-s", metavar="[METHOD.]NAME=VALUE", help="An option of one or all methods, such as rcv.spp=4."
         ),
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="Time for each run, without compilation. [default: 20]")] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="How many runs of each method.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each method.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="The first run's seed.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="Where the results go. Default: a new folder in out/.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder. Default: a new folder in out/.")] = None,
     problem_settings: ProblemSettings = None,
     workers: WorkersOption = None,
     insecure: Insecure = False,
@@ -78,10 +78,10 @@ def compare(
     no_cache: NoCache = False,
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Compare methods at equal time on one problem, or runs made earlier.
+    """Compare methods at equal time on one problem, or compare earlier runs.
 
-    Every run gets the same seconds of optimization. Compiling kernels before the first step is left out for all alike. With workers,
-    several runs go at a time, each with its share of the machine.
+    Every run has the same time of optimization, without the compilation of kernels before the first step. With workers, several runs
+    are concurrent, each with its share of the machine.
     """
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
@@ -102,7 +102,9 @@ def compare(
         try:
             command = arguments.command_line(context)
             job = _job(what[0], options, not no_cache, command, folder)
-            turns = itertools.product(range(seed, seed + seeds), chosen)  # a machine that slows down slows all methods
+            turns = itertools.product(
+                range(seed, seed + seeds), chosen
+            )  # interleaved, so that a slower machine affects all methods
             runs = [_run_task(method.name, given[method.name], seconds, n, final_spp) for n, method in turns]
             with _prepared(console, job, runs, variant, where) as comparison:
                 directories, status = _run_all(console, comparison, progress)
@@ -132,7 +134,7 @@ def _run_task(
 def _prepared(
     console: Console, job: Job, runs: Sequence[RunTask], variant: str, workers: Workers | None
 ) -> Iterator[_Comparison]:
-    """The problem opened, and the workers there, where there are to be some."""
+    """Yield the open problem, with a connection to the workers if they are requested."""
     from unrender.app.cli.execute import introduce
 
     with contextlib.ExitStack() as stack:
@@ -157,12 +159,12 @@ def _report(console: Console, directories: Sequence[Path], folder: Path) -> None
         comparison, notices = report.load_comparison(directories)
         page = report.write_comparison(comparison, notices, folder)
     show(console, comparison)
-    console.print("Time of compilation is left out for every method alike.")
+    console.print("Compilation time is excluded for every method.")
     console.print(f"page: {plain(str(page))}", soft_wrap=True)
 
 
 def _check_single(what: Sequence[str]) -> None:
-    """Raise `InputError` unless one problem is given."""
+    """Raise `InputError` unless there is exactly one problem."""
     if len(what) > 1:
         missing = next(name for name in what if not Path(name).is_dir())
         raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
@@ -171,10 +173,10 @@ def _check_single(what: Sequence[str]) -> None:
 def _compare_folders(
     console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool, run_options: bool
 ) -> None:
-    """Compare runs made earlier. `run_options`: whether options were given that only runs made here have."""
+    """Compare earlier runs. `run_options` is whether options were given that only apply to new runs."""
     if run_options:
         raise InputError(
-            "compare: run folders are compared as they are, without --methods, --set, --seconds, --workers"
+            "compare: --methods, --set, --seconds and --workers do not apply to run folders; leave them out"
         )
     from unrender.app import report
     from unrender.app.cli.comparison_table import plain, show
@@ -193,13 +195,13 @@ def _compare_folders(
 
 @dataclass(frozen=True)
 class _Comparison:
-    """What is to be run, and by whom.
+    """Runs of a comparison, and their executor.
 
     Attributes:
-        job: what the runs have in common.
-        runs: in the order in which they begin.
-        problem: opened here.
-        cluster: whose workers carry them out; None for this process.
+        job: common data of the runs.
+        runs: runs in the order of their start.
+        problem: the open problem.
+        cluster: cluster whose workers run them; None for this process.
     """
 
     job: Job
@@ -238,8 +240,8 @@ def _here(console: Console, comparison: _Comparison, progress: Progress) -> list
 
 
 def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
-    """As many runs at a time as there are workers; a run that cannot be carried out is one line, and the others go on. After an
-    interrupt: those that were carried out by then, and what the others had reached, where they saved it within seconds."""
+    """Run as many runs concurrently as there are workers. A failed run is reported in one line, and the others continue. After an
+    interrupt, return the completed runs, and the state of the others if they saved it within seconds."""
     from unrender.app.cli import tasks
     from unrender.app.cli.task_display import TaskDisplay
     from unrender.app.distributed.cluster import OnWorkers
@@ -270,7 +272,7 @@ def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
                     executor.start((run.name, run.seed), job, [run])
                 for ended in executor.wait(_POLL_SECONDS):
                     take(ended)
-        except KeyboardInterrupt:  # what has been done is compared; `main` knows the status
+        except KeyboardInterrupt:  # compare the completed runs; `main` knows the status
             for ended in executor.saved():
                 take(ended)
     for outcome in outcomes:
@@ -282,13 +284,13 @@ def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
 def _methods_and_settings(
     names: str | None, typed: Mapping[str, str]
 ) -> tuple[list[Method], dict[str, dict[str, str]]]:
-    """The methods, and the settings of each, all of which it takes. Raises `InputError`."""
+    """Return the methods, and the validated settings of each. Raise `InputError`."""
     with phases.phase("loading"):
         chosen = _parse_methods(names)
-        given = _settings_by_method(chosen, typed)
+        by_method = _settings_by_method(chosen, typed)
         for one in chosen:
-            one.start(given[one.name])
-    return chosen, given
+            one.start(by_method[one.name])
+    return chosen, by_method
 
 
 def _parse_methods(names: str | None) -> list[Method]:
@@ -301,21 +303,21 @@ def _parse_methods(names: str | None) -> list[Method]:
         raise InputError("--methods: expected at least one name")
     for one in chosen:
         if chosen.count(one) > 1:
-            raise InputError(f"--methods: {one.name} is given twice")
+            raise InputError(f"--methods: {one.name} is listed twice")
     return chosen
 
 
-def _settings_by_method(chosen: Sequence[Method], given: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """The settings of each method: those without a method's name go to all, those with one to it, and win."""
-    found: dict[str, dict[str, str]] = {one.name: {} for one in chosen}
-    for name, value in given.items():
+def _settings_by_method(chosen: Sequence[Method], typed: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """Return the settings of each method. Those without a method's name apply to all; those with one take precedence."""
+    by_method: dict[str, dict[str, str]] = {one.name: {} for one in chosen}
+    for name, value in typed.items():
         if "." not in name:
-            for settings in found.values():
+            for settings in by_method.values():
                 settings[name] = value
-    for name, value in given.items():
+    for name, value in typed.items():
         owner, dot, option = name.partition(".")
         if dot:
-            if owner not in found:
-                raise InputError(f"--set {name}={value}: {owner} is not one of the methods {', '.join(found)}")
-            found[owner][option] = value
-    return found
+            if owner not in by_method:
+                raise InputError(f"--set {name}={value}: {owner} is not one of the methods {', '.join(by_method)}")
+            by_method[owner][option] = value
+    return by_method

@@ -1,4 +1,4 @@
-"""Tables that `unrender compare` prints, one for each metric. A module of its own: its imports would make `unrender --help` slow."""
+"""Tables of `unrender compare`, one per metric. A separate module, since its imports would slow down `unrender --help`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from unrender.losses.metrics import has_flip
 
 
 def show(console: Console, comparison: Comparison) -> None:
-    """The median over each method's runs, and the range: of every metric, and of the last pictures."""
+    """Print the median and range over each method's runs, for every metric and for the final pictures."""
     parameters = [metric for metric in comparison.metrics if metric.name != "loss"]
     for metric in parameters or comparison.metrics:
         console.print(f"[bold]{plain(metric.title)}[/]", soft_wrap=True)
@@ -36,7 +36,7 @@ def show(console: Console, comparison: Comparison) -> None:
 
 
 def plain(text: str) -> str:
-    """Text of a run folder, without marks for rich; in a column as wide as what is printed."""
+    """Return text of a run folder without rich markup, with its printed width."""
     return escape(visible(text))
 
 

@@ -1,4 +1,4 @@
-"""--workers of one run: its views, dealt to processes by Ray."""
+"""The option --workers of a single run: distribution of its views to Ray processes."""
 
 from __future__ import annotations
 
@@ -22,26 +22,24 @@ Compress = Annotated[
     bool,
     typer.Option(
         "--compress",
-        help="With --workers: parameters go as 16-bit differences, gradients in single precision: half the bytes.",
+        help="With --workers: send parameters as 16-bit differences and gradients in single precision, half the bytes.",
         show_default=False,
     ),
 ]
 
 
 def check(workers: str | None, compress: bool, insecure: bool = False) -> Workers | None:
-    """See `arguments.workers`; raises `InputError` for --compress without workers, too."""
+    """Return `arguments.workers`; raise `InputError` for --compress without workers as well."""
     if compress and workers is None:
-        raise InputError("--compress: is of what is sent to workers; give --workers, too")
-    found = arguments.workers(workers, insecure)
-    if compress and found is None:
-        raise InputError(
-            "--compress: is of what is sent to workers; --workers 1 is this process alone, which is sent nothing"
-        )
-    return found
+        raise InputError("--compress: requires --workers")
+    parsed = arguments.workers(workers, insecure)
+    if compress and parsed is None:
+        raise InputError("--compress: requires other processes, but --workers 1 is this process; use more workers")
+    return parsed
 
 
 def variant_again(typed: str | None, record: RunRecord) -> str:
-    """Mitsuba's variant for the workers of a run that goes on: what was typed, else theirs so far, else `auto` as for a new run."""
+    """Return the Mitsuba variant of the workers of a resumed run: the typed one, else the run's, else `auto`."""
     from unrender.backend.variant import CUDA, LLVM
 
     before = record.problem.description.get("workers")
@@ -52,7 +50,7 @@ def variant_again(typed: str | None, record: RunRecord) -> str:
 def dealt(
     problem: Problem, workers: Workers | None, compress: bool, variant: str, threads: int | None, console: Console
 ) -> Iterator[Problem]:
-    """The problem, its views dealt to workers; itself for None. See `unrender.deal`."""
+    """Yield the problem with its views distributed to workers; the problem itself for None. See `unrender.app.distribute`."""
     if workers is None:
         yield problem
         return
@@ -65,5 +63,5 @@ def dealt(
 
     with contextlib.ExitStack() as stack:
         with phases.phase("workers"):
-            found = stack.enter_context(distribute(problem, workers, compress, variant, threads, tell))
-        yield found
+            distributed = stack.enter_context(distribute(problem, workers, compress, variant, threads, tell))
+        yield distributed

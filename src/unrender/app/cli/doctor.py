@@ -1,4 +1,4 @@
-"""`unrender doctor`: what this machine has, whether a gradient comes out right, and what to install."""
+"""`unrender doctor`: properties of this machine, a gradient test, and missing packages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from unrender.core.errors import VariantError
 from unrender.display.terminal import Console
 
 TOLERANCE = 1e-3
-"""The largest relative error of the trial gradient: both sides use the same paths, so what is left is rounding."""
+"""Maximum relative error of the test gradient. Both sides use the same paths, so only rounding errors remain."""
 
 _FEATURES = {
     "denoise": "denoised images on the CPU",
@@ -29,7 +29,7 @@ _FEATURES = {
     "dev": "tests of this package",
     "docs": "its documentation",
 }
-"""What the extras are for."""
+"""{extra: its purpose}."""
 
 _STEP = 0.05
 _RESOLUTION = 16
@@ -38,7 +38,7 @@ _SEED = 1
 
 
 def doctor(console: Console | None = None) -> int:
-    """Print versions, hardware, the backend chosen, a gradient checked against finite differences, and what is missing.
+    """Print versions, hardware, the selected backend, a gradient test against finite differences, and missing packages.
 
     Returns:
         The exit status: 0 if everything that is needed works, else 3.
@@ -74,18 +74,18 @@ def doctor(console: Console | None = None) -> int:
 
 
 def gradient_error() -> float:
-    """The relative error of path replay backpropagation's derivative of a Cornell box's mean brightness by the red
-    wall's albedo, summed over its channels, against central differences on the same paths.
+    """Return the relative error of path replay backpropagation for the derivative of a Cornell box's mean brightness by the red wall's
+    albedo, summed over channels, against central differences on the same paths.
 
-    A variant must be set. The brightness is a cubic polynomial of the albedo at this depth, so the differences' own
-    error is some 1e-4.
+    A variant must be active. The brightness is a cubic polynomial of the albedo at this depth, so the error of the differences is about
+    1e-4.
     """
     import drjit as dr
     import mitsuba as mi
 
     description = mi.cornell_box()
     description["sensor"]["film"].update(width=_RESOLUTION, height=_RESOLUTION)
-    # Four segments are fewer than Russian roulette's five, which would choose other paths for another albedo.
+    # Four segments avoid Russian roulette, which begins at five and would select other paths for another albedo.
     description["integrator"] = {"type": "prb", "max_depth": 4}
     scene = mi.load_dict(description)
     parameters = mi.traverse(scene)
@@ -104,8 +104,8 @@ def gradient_error() -> float:
     shape = (_RESOLUTION, _RESOLUTION, 3)
     weights = dr.full(mi.TensorXf, 1 / (_RESOLUTION * _RESOLUTION * 3), shape)
     integrator.render_backward(scene, parameters, weights, seed=_SEED, spp=_SPP)
-    found = float(dr.sum(mi.Color3f(dr.grad(parameters[key])))[0])
-    return abs(found - expected) / abs(expected)
+    replayed = float(dr.sum(mi.Color3f(dr.grad(parameters[key])))[0])
+    return abs(replayed - expected) / abs(expected)
 
 
 def _versions() -> list[tuple[str, str]]:
@@ -154,12 +154,17 @@ def _hardware() -> list[tuple[str, str]]:
 
 
 def _cache() -> list[tuple[str, str]]:
-    """Where references and kernels are kept, and how much of them there is."""
+    """Return the location and size of the caches of references and kernels."""
     place = cache.root()
     if place is None:
         return [("cache", f"switched off ({cache.ENVIRONMENT_VARIABLE} is empty)")]
     if cache.folder(cache.REFERENCES) is None:
-        return [("cache", f"{place} cannot be written: nothing is kept; {cache.ENVIRONMENT_VARIABLE} names another")]
+        return [
+            (
+                "cache",
+                f"{place} cannot be written, so nothing is cached; set {cache.ENVIRONMENT_VARIABLE} to another folder",
+            )
+        ]
     sizes = ", ".join(f"{part} {cache.size(part) / 1e6:.0f} MB" for part in (cache.REFERENCES, cache.KERNELS))
     return [("cache", f"{place} ({sizes})")]
 
@@ -174,7 +179,7 @@ def _processor() -> str:
 
 
 def _first_line(program: str, *arguments: str) -> str | None:
-    """The first line that a program prints; None where there is no such program, or it fails."""
+    """Return the first line that a program prints; None if there is no such program, or it fails."""
     if not shutil.which(program):
         return None
     try:
@@ -185,9 +190,9 @@ def _first_line(program: str, *arguments: str) -> str | None:
 
 
 def _missing() -> list[str]:
-    """One line per optional feature whose packages are not installed and can be on this Python: with the command that installs them.
+    """Return one line per optional feature with missing packages that support this Python, with the installation command.
 
-    The command names the packages themselves: this one may not be on an index to take its extras from.
+    The command names the packages themselves, since this package may not be on an index that provides its extras.
     """
     from packaging.requirements import InvalidRequirement, Requirement
 

@@ -1,4 +1,4 @@
-"""One run of the command line, from a plan to a run folder, and its summary."""
+"""One run of the command line, from its options to a run folder, and its summary."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ __all__ = ["RunOrder", "execution", "image_error", "introduce", "summarise", "ve
 
 @dataclass(frozen=True)
 class RunOrder:
-    """How a problem is to be run.
+    """Specification of a run.
 
     Attributes:
-        method: by what.
-        settings: of the method, where they are not the defaults.
+        method: the method.
+        settings: settings of the method that differ from the defaults.
         steps, seconds, seed: see `optimize`.
-        final_spp: of the final pictures; None chooses.
-        command: what was typed, to be saved with the results.
-        problem_settings: of a gallery problem, to be saved with the results.
+        final_spp: samples per pixel of the final pictures; None for an automatic choice.
+        command: typed command, which is saved with the results.
+        problem_settings: options of a gallery problem, which are saved with the results.
         checkpoint_every: see `optimize`.
-        within_seconds: whether `seconds` covers compilation and final pictures too; where methods are compared it is for steps alone.
-        began: when the budget began, on the clock of `time.perf_counter`; None for when the run begins.
+        within_seconds: whether `seconds` includes compilation and final pictures; in comparisons it only limits steps.
+        began: start of the budget, on the clock of `time.perf_counter`; None for the start of the run.
     """
 
     method: Method | PlanFile
@@ -83,7 +83,9 @@ def execution(
     settings = {name: value for name, value in settings.items() if value}
     for line in advice.remarks(problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
-    earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # of runs before
+    earlier = {
+        name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES
+    }  # time of earlier runs
     spent = 0.0 if order.began is None else time.perf_counter() - order.began
     annotations = RunAnnotations(
         order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, order.within_seconds, spent
@@ -104,10 +106,9 @@ def execution(
 
 
 def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarray | None] | None = None) -> str:
-    """The mean over views with pictures of the root mean square error against the reference, in words: its noise taken out where it is
-    known.
+    """Return the mean over views of the root mean square error against the reference as text, with noise removed if it is known.
 
-    `masks`: of the views, (H, W), by how much each pixel counts where the noise is not known; None for all pixels of all views.
+    `masks` are the views' pixel weights (H, W) if the noise is unknown; None for all pixels of all views.
     """
     views = [view for view in range(int(result.problem["views"])) if image_name(view, which) in result.pictures]
     known = [result.image_errors[name] for view in views if (name := image_name(view, which)) in result.image_errors]
@@ -122,12 +123,12 @@ def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarra
 
 
 def _error_line(problem: Problem, result: Result, key: str, before: float, after: float) -> str:
-    """The error of a parameter at the start and at the end; and where the pictures tell of it."""
-    measure, told = problem.unknowns[key].measure, result.sensitivity.get(key)
+    """Return the error of a parameter at the start and at the end, and over the elements that images depend on."""
+    measure, sensitivity = problem.unknowns[key].measure, result.sensitivity.get(key)
     line = f"error {measure.text(before)} before, {measure.text(after)} after"
     if measure.unit and key in problem.truth:
         line += f" ({measure.name_with_median(result.parameters[key], problem.truth[key])})"
-    where = None if told is None else seen_cells(told)
+    where = None if sensitivity is None else seen_cells(sensitivity)
     if where is None or key not in problem.truth or where.all():
         return line
     seen = measure.error(result.parameters[key], problem.truth[key], where)
@@ -135,17 +136,18 @@ def _error_line(problem: Problem, result: Result, key: str, before: float, after
 
 
 def verified(result: Result) -> str:
-    """Return what fresh pictures say about the run, in words: status, losses, and which parameters are kept."""
-    found = result.verification
+    """Return the verification by fresh pictures as text: status, losses, and the selected parameters."""
+    verification = result.verification
     first, last = (
-        formatting.with_error(*found[name]) if None not in found[name] else "not finite" for name in ("start", "end")
+        formatting.with_error(*verification[name]) if None not in verification[name] else "not finite"
+        for name in ("start", "end")
     )
-    kept = "" if found["best"] == "end" else f"; kept: the parameters of {found['best']}"
-    return f"{found['status']}: loss {first} before, {last} after (fresh pictures, noise removed){kept}"
+    selected = "" if verification["best"] == "end" else f"; kept: the parameters of {verification['best']}"
+    return f"{verification['status']}: loss {first} before, {last} after (fresh pictures, noise removed){selected}"
 
 
 def introduce(console: Console, problem: Problem, variant: str) -> None:
-    """What is about to be recovered, and what was done to the input."""
+    """Print the problem's unknowns and views, and its notices."""
     views = describe_views(problem)
     keys = ", ".join(parameter.key for parameter in problem.parameters)
     console.print(f"[bold]{escape(problem.name)}[/]: {escape(keys)} from {views}, on {variant}", soft_wrap=True)
@@ -154,7 +156,7 @@ def introduce(console: Console, problem: Problem, variant: str) -> None:
 
 
 def summarise(console: Console, problem: Problem, result: Result, progress: Progress) -> None:
-    """What came out."""
+    """Print a summary of the result."""
     table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
@@ -188,9 +190,9 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     for warning in result.warnings:
         console.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
     if result.status == "interrupted":
-        console.print(f"{result.stopped}: what was reached is saved")
+        console.print(f"{result.stopped}: the current state is saved")
     if result.status == "failed":
         applied = result.steps - result.skipped
         console.print(
-            f"[red]failed[/]: given up after {result.steps} steps; kept are the values of the {applied} that were applied"
+            f"[red]failed[/]: stopped after {result.steps} steps; the result has the values of the {applied} applied steps"
         )

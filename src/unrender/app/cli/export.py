@@ -1,4 +1,4 @@
-"""`unrender export`: a run's result as a scene that plain Mitsuba renders, or for other programs."""
+"""`unrender export`: a run's result as a scene for plain Mitsuba, or for other programs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def export(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Where it goes. Default: the folder scene in DIR, or NAME-scene in out/.")
+        Path | None, typer.Option(help="Output folder. Default: the folder scene in DIR, or NAME-scene in out/.")
     ] = None,
     formats: Annotated[
         str,

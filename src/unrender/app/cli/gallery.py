@@ -1,4 +1,4 @@
-"""`unrender gallery`: problems made by code, ready to run."""
+"""`unrender gallery`: built-in problems."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ _SPP = 64
 
 
 def gallery(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Tell more of this one.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Describe this problem.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="With NAME: render its references, its start and its truth to PNG files here.")
+        Path | None,
+        typer.Option(help="With NAME: render its references, start and ground truth to PNG files in this folder."),
     ] = None,
     problem_settings: ProblemSettings = None,
     variant: Variant = "auto",
@@ -31,7 +32,7 @@ def gallery(
     overwrite: Overwrite = False,
     no_cache: NoCache = False,
 ) -> None:
-    """List the gallery's problems, or tell more of one."""
+    """List the gallery's problems, or describe one."""
     from rich.markup import escape
 
     from unrender import gallery as problems
@@ -92,7 +93,7 @@ def _parameters(problem: Problem) -> Table:
 
 
 def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
-    """PNG files of each view's reference, start and truth, all as bright as the reference."""
+    """Write PNG files of each view's reference, start and ground truth, with the exposure of the reference."""
     import numpy as np
 
     from unrender.io.files import write

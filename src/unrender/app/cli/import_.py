@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 
 _Folder = Annotated[
-    Path, typer.Argument(metavar="FOLDER", help="With transforms.json, a COLMAP model, poses_bounds.npy or lights.txt.")
+    Path,
+    typer.Argument(
+        metavar="FOLDER", help="Folder with transforms.json, a COLMAP model, poses_bounds.npy or lights.txt."
+    ),
 ]
 _Mesh = Annotated[
     Path | None, typer.Option(metavar="FILE", help="PLY or OBJ in the cameras' world. Default: carved from masks.")
@@ -27,24 +30,24 @@ _Masks = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Masks named like the photographs, white on the object.")
 ]
 _Check = Annotated[
-    bool, typer.Option("--check", help="Only draw mesh, edges and masks over the photographs, and judge them.")
+    bool, typer.Option("--check", help="Only draw mesh, edges and masks over the photographs, and check their overlap.")
 ]
 _Resolution = Annotated[int, typer.Option(min=8, help="Pixels along the longer side, at most.")]
-_Scale = Annotated[float | None, typer.Option(help="In place of --resolution: 0.5 for half as many pixels a side.")]
+_Scale = Annotated[float | None, typer.Option(help="Alternative to --resolution: 0.5 halves the width and the height.")]
 _HoldOut = Annotated[
     int | None,
     typer.Option(metavar="N", min=0, help="Hold out one photograph of N, 0 for none. Default: the own split, or 8."),
 ]
 _Kind = Annotated[
-    str | None, typer.Option("--format", help="transforms, colmap, llff or lights, where several are there.")
+    str | None, typer.Option("--format", help="transforms, colmap, llff or lights, if the folder has several.")
 ]
-_Axes = Annotated[str | None, typer.Option(help="The cameras' axes, where not the format's: opengl, opencv or llff.")]
+_Axes = Annotated[str | None, typer.Option(help="Camera axes: opengl, opencv or llff. Default: those of the format.")]
 _Direction = Annotated[
     bool | None,
-    typer.Option("--world-to-camera/--camera-to-world", help="What matrices do, where not as the format says."),
+    typer.Option("--world-to-camera/--camera-to-world", help="Direction of the matrices. Default: that of the format."),
 ]
-_Voxels = Annotated[int, typer.Option(min=16, max=256, help="Of the carved shape, along its longest side.")]
-_Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Of the carved shape, at most.")]
+_Voxels = Annotated[int, typer.Option(min=16, max=256, help="Voxels of the carved shape along its longest side.")]
+_Faces = Annotated[int, typer.Option(min=100, max=1_000_000, help="Maximum number of faces of the carved shape.")]
 _Texture = Annotated[int, typer.Option(min=4, max=8192, help="Texels along the sides of the textures.")]
 _Unknowns = Annotated[
     str | None,
@@ -62,7 +65,7 @@ _Response = Annotated[
     str,
     typer.Option(
         metavar="CURVE",
-        help="Of files of 8 or 16 bits: srgb, linear, an exponent such as 2.2, or fit to find what differs from sRGB.",
+        help="Response of 8- and 16-bit files: srgb, linear, an exponent such as 2.2, or fit to recover it.",
     ),
 ]
 _Turntable = Annotated[
@@ -126,28 +129,28 @@ def import_(
         with Progress(console):
             arguments.use_variant(variant)
             if check:
-                found, refusal = importing.check(folder, place, options)
+                imported, refusal = importing.check(folder, place, options)
             else:
-                found = importing.import_capture(folder, place, options, overwrite=True)
+                imported = importing.import_capture(folder, place, options, overwrite=True)
     finally:
         arguments.remove_if_empty(place)
-    _tell(console, found)
+    _print_summary(console, imported)
     written = place / (importing.SHEET if check else importing.PROBLEM)
     console.print(f"{'pictures' if check else 'problem'}: {written}", soft_wrap=True, markup=False)
     if refusal:
         raise InputError(f"{folder}: {refusal}")
     if not check:
-        _tell_next(console, place)
+        _print_next_steps(console, place)
 
 
-def _tell_next(console: Console, place: Path) -> None:
+def _print_next_steps(console: Console, place: Path) -> None:
     from unrender.app.capture import importing
 
     staged = (place / importing.STAGES).is_file()
     names = (
-        (importing.SHEET, "to look at", ""),
+        (importing.SHEET, "overview", ""),
         (importing.STAGES, "next", "60"),
-        (importing.PROBLEM, "all at once" if staged else "next", "60"),
+        (importing.PROBLEM, "all parameters at once" if staged else "next", "60"),
     )
     for file, what, seconds in names:
         if (path := place / file).is_file():
@@ -155,16 +158,16 @@ def _tell_next(console: Console, place: Path) -> None:
             console.print(f"{what}: {command}", soft_wrap=True, markup=False)
 
 
-def _tell(console: Console, found: Imported) -> None:
+def _print_summary(console: Console, imported: Imported) -> None:
     from statistics import mean
 
-    for notice in found.notices:
+    for notice in imported.notices:
         console.print(f"note: {notice}", soft_wrap=True, markup=False)
-    counts = f"{found.views} photographs and {found.held_out} held out"
-    shape = f"; a mesh of {found.faces} faces" if found.faces else ""
-    console.print(f"{found.kind}: {counts}, {found.size[0]} x {found.size[1]}{shape}", markup=False)
-    if found.overlaps:
-        worst = min(found.overlaps)
+    counts = f"{imported.views} photographs and {imported.held_out} held out"
+    shape = f"; a mesh of {imported.faces} faces" if imported.faces else ""
+    console.print(f"{imported.kind}: {counts}, {imported.size[0]} x {imported.size[1]}{shape}", markup=False)
+    if imported.overlaps:
+        worst = min(imported.overlaps)
         console.print(
-            f"the mesh covers the masks with IoU {mean(found.overlaps):.3f}, {worst:.3f} at worst", markup=False
+            f"the mesh covers the masks with IoU {mean(imported.overlaps):.3f}, {worst:.3f} at worst", markup=False
         )

@@ -1,4 +1,4 @@
-"""`unrender judge`: a run's result against photographs that were held out, or under another light."""
+"""`unrender judge`: evaluation of a run's result on held-out photographs, or under another light."""
 
 from __future__ import annotations
 
@@ -21,13 +21,15 @@ def judge(
     ],
     held_out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="A problem file with other views. Default: held-out.toml beside the run's."),
+        typer.Option(
+            metavar="FILE", help="A problem file with other views. Default: held-out.toml next to the run's problem."
+        ),
     ] = None,
     environment: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Another light: a picture of all directions (.exr, .hdr).")
     ] = None,
     spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel.")] = 64,
-    out: Annotated[Path | None, typer.Option(help="The folder. Default: judge in DIR.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Output folder. Default: judge in DIR.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier judgement.")] = False,
     variant: Variant = "auto",
     allow_outside: AllowOutside = False,
@@ -70,7 +72,7 @@ def _tell(console: object, found: Judgement) -> None:
         )
     for notice in found.notices:
         console.print(f"note: {notice}", soft_wrap=True, markup=False)
-    console.print(f"to look at: {found.folder / 'sheet.png'}", soft_wrap=True, markup=False)
+    console.print(f"overview: {found.folder / 'sheet.png'}", soft_wrap=True, markup=False)
 
 
 def _number(value: float | None, name: str) -> str:

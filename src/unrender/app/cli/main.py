@@ -1,8 +1,7 @@
-"""The `unrender` command: how it starts and how it ends.
+"""Entry point and exit of the `unrender` command.
 
-Exit status: 0; 2 where what the user gave is wrong; 3 where this machine cannot; 4 where a run failed; 5 where fresh pictures contradict
-it; 130 where it was interrupted, 143 where it was told to terminate, and what a run had reached is saved.
-Whatever is wrong is one line on standard error.
+Exit status: 0 for success; 2 for invalid input; 3 if this machine lacks something; 4 if a run failed; 5 if fresh pictures contradict
+it; 130 after an interrupt and 143 after SIGTERM, with the state of a run saved. Every error is one line on standard error.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from unrender.core.text import one_line
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line. Returns the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if given == ["--version"]:  # at once: nothing else is imported
+    if given == ["--version"]:  # without further imports
         print(metadata.version("unrender"))
         return 0
     try:
@@ -42,9 +41,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             with signals:
                 command = _command(given)
-                found = command()
+                value = command()
                 sys.stdout.flush()
-            status = found if isinstance(found, int) else 0
+            status = value if isinstance(value, int) else 0
         except BaseException as error:
             if (ended := _status_of(error, signals)) is None:
                 raise
@@ -63,29 +62,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         status = _out_of_memory()
         if is_process:
-            os._exit(status)  # what ends an interpreter needs memory, too
+            os._exit(status)  # a regular interpreter exit needs memory
         return status
 
 
 def _command(given: list[str]) -> Callable[[], Any]:
-    """Return what carries out a command line."""
-    if given == ["doctor"]:  # which has something to say where the rest cannot even be imported
+    """Return the function that executes a command line."""
+    if given == ["doctor"]:  # works even if other modules cannot be imported
         from unrender.app.cli.doctor import doctor
 
         return doctor
     for argument in given:
         encode_text(argument, "command line")
-    variant.prepare()  # before Dr.Jit is imported, which the rest of the command line does
+    variant.prepare()  # must run before Dr.Jit is imported
     from unrender.app.cli.app import app
 
     return partial(app, given, prog_name="unrender", standalone_mode=False, obj=["unrender", *given])
 
 
 def _status_of(error: BaseException, signals: Signals) -> int | None:
-    """Say in one line why a command failed. Returns its exit status; None for an error of the program itself."""
+    """Print in one line why a command failed and return its exit status; None for an error of the program itself."""
     import typer
 
-    # Typer may bring its own copy of click, so its errors are found from the one that typer exports.
+    # Typer may vendor its own copy of click, so take the error classes from the one that it exports.
     usage_error: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
     match error:
         case VariantError():
@@ -96,10 +95,10 @@ def _status_of(error: BaseException, signals: Signals) -> int | None:
             return _complain(str(error), INPUT)
         case typer.Exit():
             return error.exit_code
-        case typer.Abort() | KeyboardInterrupt():  # the former is what Typer makes of the latter
+        case typer.Abort() | KeyboardInterrupt():  # Typer converts the latter to the former
             return signals.status or INTERRUPTED
         case BrokenPipeError():
-            # Whoever read our output has gone; Python would complain once more when it flushes at exit.
+            # The reader of the output has closed it. Python would report this again when it flushes at exit.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 1
         case OSError():  # a name that is too long, a folder that may not be entered, a full disk
@@ -109,7 +108,7 @@ def _status_of(error: BaseException, signals: Signals) -> int | None:
             return _complain(f"{where}{error.strerror or error}", INPUT)
     if isinstance(error, usage_error):
         return _complain(error.format_message(), INPUT)  # pyright: ignore[reportAttributeAccessIssue]
-    return signals.status or None  # what the interrupt became on its way out of compiled code
+    return signals.status or None  # compiled code may have converted the interrupt
 
 
 def _out_of_memory(what: str = "") -> int:

@@ -1,7 +1,7 @@
-"""The command where memory is limited, by `ulimit -v` or by a container: one line, whatever native code makes of it.
+"""Commands under memory limits, by `ulimit -v` or a container: failures are one line, whatever native code does.
 
-A library that gets no memory may raise anything, abort, or wait for ever. So a command that has too few addresses does not begin. Where a
-limit is set, the command runs in a process of its own. Its parent reports an end by a signal as one line.
+A library without memory may raise anything, abort, or hang. A command with too little address space therefore does not start. Under a
+limit, the command runs in a child process, and the parent reports its death by a signal as one line.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from unrender.core.errors import VariantError
 from unrender.core.text import one_line
 
 _BASE, _PER_CORE = 800 << 20, 64 << 20
-"""Bytes of addresses that the smallest problem with a renderer takes: libraries, then a thread's stack and heap for each core."""
+"""Address space in bytes of the smallest problem with a renderer: of libraries, and of a thread's stack and heap per core."""
 _MARGIN = 64 << 20
 _SIGNS = re.compile(
     r"bad_alloc|out of memory|cannot allocate memory|unable to allocate|failed to map segment|resource temporarily unavailable"
@@ -36,11 +36,11 @@ _is_child = False
 
 
 def check() -> None:
-    """Raise `VariantError` where `ulimit -v` leaves too few addresses for the libraries to be loaded."""
-    if not (given := limits.address_space()):
+    """Raise `VariantError` if `ulimit -v` leaves too little address space to load the libraries."""
+    if not (limit := limits.address_space()):
         return
     needed = _BASE + _PER_CORE * limits.cores()
-    if given < needed:
+    if limit < needed:
         raise VariantError(
             f"memory: {_described()}, expected at least {needed >> 10} kB on {limits.cores()} cores; raise it: ulimit -v unlimited"
         )
@@ -52,13 +52,13 @@ def is_limited() -> bool:
 
 
 def exhausted(error: BaseException) -> bool:
-    """Return whether an error of an unknown reason came from a lack of memory: it says so, or nearly all allowed addresses were in use."""
-    given = limits.address_space()
-    return says_so(error) or 0 < given < limits.most_address_space() + _MARGIN
+    """Return whether an unknown error is due to a lack of memory: it says so, or nearly all of the allowed address space was in use."""
+    limit = limits.address_space()
+    return says_so(error) or 0 < limit < limits.most_address_space() + _MARGIN
 
 
 def says_so(error: BaseException) -> bool:
-    """Return whether an error, or one that it arose from, says that there was no memory."""
+    """Return whether an error, or one of its causes, reports a lack of memory."""
     return any(isinstance(each, MemoryError) or _SIGNS.search(str(each)) for each in _chain(error))
 
 
@@ -66,19 +66,20 @@ def exhaustion(how: str = "") -> str:
     """Return the line for a command that ran out of memory."""
     try:
         limit = f" ({described})" if (described := _described()) else ""
-    except MemoryError:  # there is not enough to read the limits
+    except MemoryError:  # not enough memory to read the limits
         limit = ""
     return (
-        f"out of memory{limit}{how}; what a run had written remains. Allow more memory, or use fewer samples (--set spp=N), "
+        f"out of memory{limit}{how}; files of a run remain. Allow more memory, or use fewer samples (--set spp=N), "
         "smaller pictures or fewer --threads"
     )
 
 
 def supervised() -> int | None:
-    """Run the rest of the command in a child. Returns None there, and the exit status in the parent once the child has ended.
+    """Run the rest of the command in a child process. Return None in the child, and the exit status in the parent once the child has
+    ended.
 
-    What the child writes on standard error is shown when it ends, and is dropped where native code ended it. The child has a process
-    group of its own, so that a signal reaches it once: by its parent. Signals wait until both are ready for them.
+    The child's standard error is shown when it ends, and is dropped if native code aborted it. The child has its own process group, so
+    that a signal reaches it only once, through its parent. Signals are blocked until both can handle them.
     """
     global _is_child
     errors = os.memfd_create("unrender-errors")
@@ -91,7 +92,7 @@ def supervised() -> int | None:
         os.setpgid(0, 0)
         os.dup2(errors, 2)
         os.close(errors)
-        import ctypes  # takes time, which commands without a limit need not spend
+        import ctypes  # slow to import, and only needed under a limit
 
         ctypes.CDLL(None).prctl(_DEATH_OF_PARENT, signal.SIGKILL)
         if os.getppid() != parent:
@@ -118,7 +119,7 @@ def supervised() -> int | None:
 
 
 def drop_errors() -> None:
-    """Forget what libraries wrote on standard error before the line that tells the reason, in a supervised child."""
+    """Discard the libraries' output on standard error before the line with the reason, in a supervised child."""
     if _is_child:
         sys.stderr.flush()
         os.ftruncate(2, 0)
@@ -127,7 +128,7 @@ def drop_errors() -> None:
 
 @contextlib.contextmanager
 def _passing_on(child: int) -> Iterator[None]:
-    """Let signals to this process reach the child, and stop and go on with it."""
+    """Forward signals to the child, and stop and continue together with it."""
 
     def pass_on(number: int, frame: FrameType | None) -> None:
         del frame
@@ -154,14 +155,14 @@ def _passing_on(child: int) -> Iterator[None]:
 def _described() -> str:
     parts = []
     if given := limits.address_space():
-        parts.append(f"ulimit -v allows {given >> 10} kB of addresses")
+        parts.append(f"ulimit -v allows {given >> 10} kB of address space")
     if given := limits.group_memory():
         parts.append(f"the container allows {given >> 20} MB")
     return ", ".join(parts)
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
-    """The error and those that it arose from."""
+    """Yield the error and its causes."""
     seen: set[int] = set()
     following: BaseException | None = error
     while following is not None and id(following) not in seen:

@@ -1,4 +1,4 @@
-"""`unrender methods`: what there is, and which options they have."""
+"""`unrender methods`: the available methods and their options."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def methods(
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None,
     plan: Annotated[
         str | None,
-        typer.Option(metavar="PROBLEM", help="Print what the method (auto) would do for this problem, as a plan file."),
+        typer.Option(metavar="PROBLEM", help="Print the plan of the method (auto) for this problem, as a plan file."),
     ] = None,
     settings: Annotated[
         list[str] | None,

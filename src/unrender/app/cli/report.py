@@ -1,4 +1,4 @@
-"""`unrender report`: the page of a run, or of a sweep, made earlier."""
+"""`unrender report`: the page of an earlier run or sweep."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MOST = 6
 
 
 def write_page(folder: Path, record: SweepRecord) -> Path:
-    """Write compare.html of the six best finished trials; return its path. Raise `InputError` where none has finished."""
+    """Write compare.html of the six best finished trials; return its path. Raise `InputError` if none has finished."""
     from unrender.app import report
     from unrender.app.sweeps import folders
 
@@ -32,7 +32,7 @@ def report(
         Path, typer.Argument(metavar="DIR", help="A run folder, that of a run in stages, or a sweep's.")
     ],
 ) -> None:
-    """Write the page of a run folder anew, or that of a sweep's best trials, and print where it is."""
+    """Rewrite the page of a run folder, or of a sweep's best trials, and print its path."""
     from unrender.app.sweeps.record import SWEEP, read_sweep
     from unrender.display.terminal import echo
 

@@ -19,11 +19,11 @@ def resume(
     context: typer.Context,
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="A run folder, or the folder of a run in stages.")],
     steps: Annotated[
-        int | None, typer.Option(help="Stop after that many steps, counted from the run's start. [default: as the run]")
+        int | None, typer.Option(help="Stop after this number of steps from the run's start. [default: the run's]")
     ] = None,
-    seconds: Annotated[float | None, typer.Option(help="Stop after that much time, likewise.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after this many seconds from the run's start.")] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Go on though the problem, its files or versions changed since.")
+        bool, typer.Option("--force", help="Continue even if the problem, its files or versions have changed.")
     ] = False,
     variant: Annotated[str | None, typer.Option(help="Mitsuba's variant. [default: the run's]")] = None,
     threads: Threads = None,
@@ -32,10 +32,10 @@ def resume(
     allow_outside: AllowOutside = False,
     insecure: Insecure = False,
 ) -> None:
-    """Go on with a run that was interrupted or killed, or give a finished one more.
+    """Continue an interrupted or killed run, or extend a finished one.
 
-    It goes on from its last checkpoint and becomes the run that it would have been without the interruption: to the bit with as many
-    workers as it had, else up to rounding. Of a run in stages, the steps or seconds are those of all, for the stages that are left.
+    It continues from its last checkpoint and gives the result of an uninterrupted run: to the bit with the same number of workers,
+    otherwise up to rounding. For a run in stages, steps or seconds are those of all stages, for the remaining ones.
     """
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
@@ -45,7 +45,7 @@ def resume(
         steps, seconds = arguments.budget(steps, seconds)
     if (directory / "stages.toml").is_file() and not (directory / "run.json").is_file():
         if force:
-            raise InputError(f"{directory}: --force goes with the run folder of a stage")
+            raise InputError(f"{directory}: --force applies to the run folder of a stage; give that instead")
         stages.refuse_workers(workers)
         command = arguments.command_line(context)
         with Progress(console) as progress:
@@ -60,14 +60,14 @@ def resume(
             from unrender.runs.resume import load_run, resume_run
 
             processes = dealing.check(workers, compress, insecure)
-            found = load_run(directory, steps, seconds)
-            alone = 1 if found.method.threads == 1 else None  # such a run repeats bit for bit
-            running = arguments.use_variant(variant or found.record.variant or "auto", threads or alone)
+            stored = load_run(directory, steps, seconds)
+            alone = 1 if stored.method.threads == 1 else None  # such a run is reproducible bit for bit
+            running = arguments.use_variant(variant or stored.record.variant or "auto", threads or alone)
             problem = reopen.problem_of(directory)
         introduce(console, problem, running)
-        live = Live(directory, problem.name, found.record.method, found.record.command)
-        theirs = dealing.variant_again(variant, found.record)
+        live = Live(directory, problem.name, stored.record.method, stored.record.command)
+        theirs = dealing.variant_again(variant, stored.record)
         with dealing.dealt(problem, processes, compress, theirs, threads or alone, console) as dealt:
-            result = resume_run(found, dealt, force, [progress, live], earlier=progress.seconds, within_seconds=True)
+            result = resume_run(stored, dealt, force, [progress, live], earlier=progress.seconds, within_seconds=True)
         live.clear()
         conclude(console, problem, result, directory, progress)

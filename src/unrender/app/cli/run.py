@@ -75,8 +75,8 @@ def run(
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
 
-    PROBLEM may also be a file of stages: a run folder for each, which begins with what the one before it found.
-    Ctrl-C and SIGTERM stop after the present step and keep what was reached; `unrender resume` goes on from there.
+    PROBLEM may also be a file of stages: each stage has a run folder and starts from the result of the previous stage. Ctrl-C and
+    SIGTERM stop after the current step and save the state; `unrender resume` continues from there.
     """
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
@@ -131,12 +131,12 @@ def conclude(
     again: Path | None = None,
     page: bool = True,
 ) -> None:
-    """Write the page, say what came out, and leave with the status of an interrupted, failed or doubtful run where it is one.
+    """Write the page, print a summary, and exit with the status of an interrupted, failed or doubtful run.
 
     Args:
         console, problem, result, folder, progress: of the run.
-        again: what `unrender resume` is to be given then; None for the run folder.
-        page: whether it is written.
+        again: argument of `unrender resume` for the run; None for the run folder.
+        page: whether to write the page.
     """
     from rich.markup import escape
 
@@ -152,7 +152,7 @@ def conclude(
     if written is not None:
         console.print(f"page: {escape(str(written))}", soft_wrap=True)
     if status := exit_status(result.stopped):
-        why = "to go on" if result.status == "interrupted" else "to try once more from its last step"
+        why = "to continue" if result.status == "interrupted" else "to try once more from its last step"
         console.print(f"{why}: unrender resume {escape(shlex.quote(str(again or folder)))}", soft_wrap=True)
         raise typer.Exit(status)
     if result.status != "finished":
@@ -160,7 +160,7 @@ def conclude(
 
 
 def exit_status(stopped: str) -> int:
-    """Of a command whose run ended for that reason (`Result.stopped`)."""
+    """Return the exit status for the reason why a run ended (`Result.stopped`)."""
     from unrender.runs import result as results
 
     statuses = {results.INTERRUPTED: INTERRUPTED, results.TERMINATED: TERMINATED, results.NON_FINITE: FAILED}
@@ -168,16 +168,16 @@ def exit_status(stopped: str) -> int:
 
 
 def _budget_settings(
-    given: dict[str, str], steps: int | None, seconds: float | None
+    typed: dict[str, str], steps: int | None, seconds: float | None
 ) -> tuple[int | None, float | None]:
-    """The budget, which may also stand among the settings (--set steps=300): it is taken from there."""
+    """Return the budget. It may also be given among the settings (--set steps=300), from which it is removed."""
     budget: dict[str, Any] = {"steps": steps, "seconds": seconds}
     for name in budget:
-        if name in given and budget[name] is not None:
-            raise InputError(f"--set {name}={given[name]}: --{name} is given, too")
+        if name in typed and budget[name] is not None:
+            raise InputError(f"--set {name}={typed[name]}: --{name} is given as well; leave out one")
     for name, number, expected in (("steps", int, "a whole number"), ("seconds", float, "a number")):
-        if name in given:
-            text = given.pop(name)
+        if name in typed:
+            text = typed.pop(name)
             try:
                 budget[name] = number(text)
             except ValueError as error:

@@ -1,11 +1,11 @@
-"""Ctrl-C and SIGTERM: one line and an exit status of their own, at whatever instant and however often they come.
+"""Handling of Ctrl-C and SIGTERM: one line and a specific exit status, at any time and any number of signals.
 
-A run takes both over while it goes, and ends in good order after its step (`runs.run.interruptible`). Elsewhere, and when they come a
-second time, the command is interrupted where it is; while it is still busy with that, one more ends the process at once. What a run had
-written remains, as after a kill.
+A run handles both signals itself, and stops regularly after its step (`runs.run.interruptible`). Otherwise, and at a second signal, the
+command is interrupted immediately. A further signal during this ends the process at once. Data that a run has written remains, as after
+a kill.
 
-Python's handlers wait for the end of compiled code. A thread says so where that takes long, and lets a second signal end the process.
-Nothing waits for the rest of what was launched: all that is to remain is written before.
+Python's handlers wait for the end of compiled code. A thread reports long waits, and lets a second signal end the process. The exit does
+not wait for launched kernels: all data that must remain is written before.
 """
 
 from __future__ import annotations
@@ -23,24 +23,22 @@ from typing import Any
 from unrender.core.signals import GRACEFUL
 
 INPUT, ENVIRONMENT, FAILED, DOUBTFUL = 2, 3, 4, 5
-"""Invalid input; the machine lacks something; the run was given up; the check by fresh pictures failed."""
+"""Exit status for invalid input, a missing feature of the machine, a failed run, and failed verification by fresh pictures."""
 INTERRUPTED, TERMINATED = 130, 143
-"""Ctrl-C, and SIGTERM: 128 and the number of the signal, as shells and schedulers expect."""
+"""Exit status after Ctrl-C and SIGTERM: 128 plus the number of the signal, as shells and schedulers expect."""
 WORDS = {
-    FAILED: "the run failed: it was given up, and what was finite is kept",
+    FAILED: "the run failed: it was stopped, and the last finite values are saved",
     DOUBTFUL: "the result is doubtful: see the warnings",
     INTERRUPTED: "interrupted",
     TERMINATED: "terminated",
 }
-"""The line on standard error for those that no error comes with."""
+"""{exit status: line on standard error} for exits without an error message."""
 
 _LATER, _LONGEST = 0.02, 1.5
-"""Seconds until a signal comes again that came during an import, and until the command ends at once though the import goes on."""
+"""Seconds after which a signal during an import is repeated, and after which the command ends even during an import."""
 _SILENT, _STUCK = 1.5, 0.5
-"""Seconds for which compiled code may hold back a signal before that is said, and a second signal before the process ends."""
-WAITING = (
-    "the command ends when what is under way has ended (a kernel, a picture, a worker), and at once when told again"
-)
+"""Seconds for which compiled code can delay a signal before a line reports it, and a second signal before the process ends."""
+WAITING = "waiting for the end of the current work (a kernel, a picture, a worker); interrupt again to end at once"
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
@@ -65,7 +63,7 @@ class Signals:
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
             if self._process:
-                with contextlib.suppress(OSError, RuntimeError):  # no memory for a thread
+                with contextlib.suppress(OSError, RuntimeError):  # out of memory for a thread
                     self._watch = _Watch()
             for number in (signal.SIGINT, signal.SIGTERM):
                 if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:
@@ -81,9 +79,9 @@ class Signals:
             self._watch.close()
 
     def receive(self, number: int, frame: FrameType | None) -> None:
-        """End the command where it is; at once where it is busy with that already.
+        """Interrupt the command; end the process if it is already being interrupted.
 
-        In the midst of an import the signal comes again a little later: compiled code that imports modules may abort at an exception.
+        During an import, the signal is repeated later, since compiled code that imports modules may abort at an exception.
         """
         waited = time.monotonic() - self._first.setdefault(number, time.monotonic())
         if self.status or number in self._deferred or waited > _LONGEST:
@@ -92,7 +90,7 @@ class Signals:
             self._deferred.add(number)
             timer = threading.Timer(_LATER, self._send_again, (number,))
             timer.daemon = True
-            with contextlib.suppress(RuntimeError):  # no memory for a thread: the next signal ends the command
+            with contextlib.suppress(RuntimeError):  # out of memory for a thread: the next signal ends the command
                 timer.start()
             return
         self.status = 128 + number
@@ -106,10 +104,10 @@ class Signals:
 
 
 class _Watch:
-    """A thread that hears of signals at once, though compiled code keeps the main thread from handling them.
+    """Thread that receives signals immediately, even if compiled code keeps the main thread from handling them.
 
     Attributes:
-        own: number of signals to come that the process sent itself.
+        own: number of expected signals that the process sent to itself.
     """
 
     def __init__(self) -> None:
@@ -126,17 +124,17 @@ class _Watch:
         os.close(self._write)
 
     def _run(self) -> None:
-        signals, number, said, last = 0, 0, False, (0, 0)
+        signals, number, reported, last = 0, 0, False, (0, 0)
         while True:
             again = signals > 1
-            waits = signals and (again or not said)
+            waits = signals and (again or not reported)
             heard = select.select([self._read], [], [], (_STUCK if again else _SILENT) if waits else None)[0]
             place = self._place()
             if not heard:
                 if place == last and again:
                     _leave(128 + number)
-                if place == last and not said:
-                    said = True
+                if place == last and not reported:
+                    reported = True
                     os.write(2, f"unrender: {WAITING}\n".encode())
                 last = place
             elif not (data := os.read(self._read, 1)):

@@ -1,4 +1,4 @@
-"""`unrender run` and `resume` of a file of stages: a run folder for each, one after the other."""
+"""`unrender run` and `resume` of a file of stages: one run folder per stage, in sequence."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ _SCENES = "scenes"
 
 @dataclass(frozen=True)
 class StagesRun:
-    """A descent in stages under way.
+    """A run in stages in progress.
 
     Attributes:
-        stages: with their budget and the options of their run.
+        stages: stages with their budget and run options.
         whole: their problem.
-        out: the folder of the run folders.
-        variant: of Mitsuba.
-        command: what was typed, to be saved with the results.
-        lock: of `out`, held; `run_remaining` lets it go.
+        out: folder of the run folders.
+        variant: Mitsuba variant.
+        command: typed command, which is saved with the results.
+        lock: held lock of `out`; `run_remaining` releases it.
     """
 
     stages: Stages
@@ -59,7 +59,7 @@ class StagesRun:
 
 
 def is_stages(problem: str) -> bool:
-    """Whether what was given as PROBLEM is a file of stages."""
+    """Return whether the argument PROBLEM is a file of stages."""
     if not problem.endswith(".toml") or not Path(problem).is_file():
         return False
     from unrender.app.stages import stages_file
@@ -68,18 +68,18 @@ def is_stages(problem: str) -> bool:
 
 
 def refuse_workers(workers: str | None) -> None:
-    """Raise `InputError` where --workers is given."""
+    """Raise `InputError` if --workers is given."""
     if workers is not None:
-        raise InputError("--workers: not with stages, which run in this process")
+        raise InputError("--workers: not supported with stages; leave it out")
 
 
 def refuse_settings(method: str, settings: Mapping[str, str], options: Mapping[str, str], workers: str | None) -> None:
-    """Raise `InputError` for options of the command line that stand in a file of stages, or that stages do not have."""
+    """Raise `InputError` for command-line options that belong in a file of stages, or that stages do not support."""
     refuse_workers(workers)
     given = [f"--set {name}" for name in settings] + [f"--problem-set {name}" for name in options]
     given += ["--method"] * (method != "auto")
     if given:
-        raise InputError(f"{given[0]}: not with stages, whose file has method and settings")
+        raise InputError(f"{given[0]}: not supported with stages; set it in the file of stages")
 
 
 def begin(
@@ -94,15 +94,15 @@ def begin(
     checkpoint_every: int | None,
     final_spp: int | None,
 ) -> StagesRun:
-    """Check a file of stages, and write the folder that its run begins with. Raises `InputError`.
+    """Check a file of stages, and write the folder of its run. Raise `InputError`.
 
     Args:
-        file: exists.
-        budget: steps and seconds in place of the file's; both None for the file's.
-        seed: of the first stage, where it is not 0.
+        file: an existing file.
+        budget: steps and seconds instead of the file's; both None for the file's.
+        seed: seed of the first stage, if it is not 0.
         out: the folder; None for a new one.
-        overwrite: whether it may hold earlier results.
-        variant, threads, command, checkpoint_every, final_spp: of all stages.
+        overwrite: whether it may contain earlier results.
+        variant, threads, command, checkpoint_every, final_spp: options of all stages.
     """
     from unrender.app.stages import stages_file
     from unrender.methods import method
@@ -139,14 +139,14 @@ def begin(
 def reopen(
     folder: Path, budget: tuple[int | None, float | None], variant: str | None, threads: int | None, command: str
 ) -> StagesRun:
-    """A run in stages that was begun earlier: budget, variant, threads and checkpoints as it had, where they are not given."""
+    """Return an earlier run in stages, with its own budget, variant, threads and checkpoints unless they are given."""
     from unrender.app.stages import stages_file
 
     file = folder / stages_file.FILE
     stages = stages_file.read(file)
     if not stages_file.is_of_run(file):
         raise InputError(
-            f"{folder}: not a run in stages, whose {file.name} has the full path of its problem; begin one: unrender run {file}"
+            f"{folder}: not a run in stages, since {file.name} has no absolute path of its problem; start one: unrender run {file}"
         )
     if budget != (None, None):
         stages = replace(stages, steps=budget[0], seconds=budget[1])
@@ -173,7 +173,7 @@ def run_remaining(run: StagesRun, console: Console, progress: Progress) -> None:
 
 @contextlib.contextmanager
 def _held(folder: Path) -> Iterator[Lock]:
-    """The folder's lock, which stays held unless the block fails. Raises `InputError` where another process holds it."""
+    """Yield the folder's lock, which is only released if the block fails. Raise `InputError` if another process holds it."""
     from unrender.runs.folder.lock import Lock
 
     lock = Lock(folder)
@@ -209,7 +209,7 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
                 if left.exit_code != DOUBTFUL:
                     raise
                 doubtful = True
-        # Of the file, so that a stage begins with the same whether the one before it was run just now or earlier.
+        # Read the file, so that a stage has the same start whether the previous one ran just now or earlier.
         values |= reader.read(folder).parameters
     if doubtful:
         raise typer.Exit(DOUBTFUL)
@@ -218,7 +218,7 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
 def _run_stage(
     run: StagesRun, index: int, values: Mapping[str, Any], console: Console, progress: Progress
 ) -> tuple[Problem, Result]:
-    """Begin a stage, or go on with it."""
+    """Start a stage, or resume it."""
     from unrender.app.cli.execute import RunOrder, execution, introduce
     from unrender.app.stages import stages_file
     from unrender.methods import method
@@ -231,11 +231,11 @@ def _run_stage(
     stages, stage = run.stages, run.stages.stages[index]
     folder = stages_file.folder_of(stages, index, run.out)
     if (folder / schema.RECORD).is_file():
-        found = load_run(folder, *stages_file.split(stages)[index])
+        stored = load_run(folder, *stages_file.split(stages)[index])
         problem = runs.problem_of(folder)
         introduce(console, problem, run.variant)
-        live = Live(folder, problem.name, found.record.method, found.record.command)
-        result = resume_run(found, problem, False, [progress, live], earlier=progress.seconds, within_seconds=True)
+        live = Live(folder, problem.name, stored.record.method, stored.record.command)
+        result = resume_run(stored, problem, False, [progress, live], earlier=progress.seconds, within_seconds=True)
         live.clear()
         return problem, result
     with phases.phase("loading"):
@@ -245,7 +245,7 @@ def _run_stage(
     settings = stages.settings_of(stage)
     chosen = method(stage.method or stages.method)
     last = index == len(stages.stages) - 1
-    spp = run.options.final_spp or (None if last else 1)  # those of many views take minutes
+    spp = run.options.final_spp or (None if last else 1)  # final pictures of many views take minutes
     every = run.options.checkpoint_every
     order = RunOrder(chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every, True)
     with execution(problem, order, folder, console, progress) as arguments_of_run:
@@ -266,7 +266,7 @@ def _is_finished(folder: Path) -> bool:
 
 
 def _clear(out: Path) -> None:
-    """Remove what an earlier run in stages left: scenes and run folders of stages. Raises `InputError` where a process holds one."""
+    """Remove the scenes and run folders of an earlier run in stages. Raise `InputError` if a process holds one."""
     from unrender.runs.folder import schema
 
     old = [
@@ -275,7 +275,7 @@ def _clear(out: Path) -> None:
         if (path / schema.RECORD).is_file() or (path / schema.LOCK).is_file()
     ]
     with contextlib.ExitStack() as stack:
-        for path in old:  # all before any is removed
+        for path in old:  # lock all before any is removed
             stack.callback(stack.enter_context(_held(path)).release)
         for path in old:
             shutil.rmtree(path)

@@ -37,11 +37,9 @@ _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
 MARK = "sweep.json"
 _FREE = ("allow_outside", "what", "workers", "insecure", "trials", "threads")
-"""What may be given anew for a sweep that goes on."""
+"""Options that may change when a sweep continues."""
 
-_What = Annotated[
-    str, typer.Argument(metavar="PROBLEM | DIR", help="A problem; or the folder of a sweep, which then goes on.")
-]
+_What = Annotated[str, typer.Argument(metavar="PROBLEM | DIR", help="A problem; or the folder of a sweep to continue.")]
 _MethodName = Annotated[str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`.")]
 _Over = Annotated[
     list[str] | None,
@@ -56,24 +54,24 @@ _Settings = Annotated[
 ]
 _SearchName = Annotated[
     str | None,
-    typer.Option(metavar="grid|random|tpe", help="Which settings to try. [default: grid; random with open ranges]"),
+    typer.Option(metavar="grid|random|tpe", help="Search strategy. [default: grid; random with open ranges]"),
 ]
 _Trials = Annotated[
-    int | None, typer.Option(min=1, max=MOST_TRIALS, help="How many settings to try by random or tpe. [default: 16]")
+    int | None, typer.Option(min=1, max=MOST_TRIALS, help="Number of trials of random and tpe. [default: 16]")
 ]
 _Prune = Annotated[
     bool,
-    typer.Option("--prune", help="Give up runs whose error is, and would end, above the median of earlier trials'."),
+    typer.Option("--prune", help="Stop runs whose error is, and would end, above the median of earlier trials."),
 ]
 _Window = Annotated[
     int | None,
-    typer.Option(min=1, max=MOST_TRIALS, help="Trials under way at most. [default: 4, or two for each worker]"),
+    typer.Option(min=1, max=MOST_TRIALS, help="Maximum number of concurrent trials. [default: 4, or two per worker]"),
 ]
-_Steps = Annotated[int | None, typer.Option(help="Of each run. [default: 300, or --seconds]")]
+_Steps = Annotated[int | None, typer.Option(help="Steps of each run. [default: 300, or --seconds]")]
 _Seconds = Annotated[float | None, typer.Option(help="Time for each run, without compilation.")]
-_Seeds = Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="How many runs of each trial.")]
-_Seed = Annotated[int, typer.Option(min=0, help="Of the search, and of each trial's first run.")]
-_Out = Annotated[Path | None, typer.Option(help="Where the results go. Default: a new folder in out/.")]
+_Seeds = Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each trial.")]
+_Seed = Annotated[int, typer.Option(min=0, help="Seed of the search, and of the first run of each trial.")]
+_Out = Annotated[Path | None, typer.Option(help="Output folder. Default: a new folder in out/.")]
 
 
 def sweep_command(
@@ -101,10 +99,10 @@ def sweep_command(
     no_cache: NoCache = False,
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Search a method's options for those of the least error, on one problem.
+    """Search a method's options for the smallest error on one problem.
 
-    The error is the parameters' where the truth is known, else that of the final pictures. Each trial is an ordinary run folder, one for
-    each seed, in one folder with sweep.json. A sweep that was interrupted or killed goes on with `unrender sweep DIR`.
+    The error is that of the parameters if the ground truth is known, else that of the final pictures. Each trial is a normal run
+    folder, one per seed, in one folder with sweep.json. `unrender sweep DIR` continues an interrupted or killed sweep.
     """
     from unrender.app.cli.sweep_driver import Session, run_trials
     from unrender.app.sweeps.record import read_sweep
@@ -152,27 +150,27 @@ def sweep(
     overwrite: bool = False,
     insecure: bool = False,
 ) -> SweepRecord:
-    """Search a method's options for those of the least error, on one problem: `unrender sweep` as a function, silent.
+    """Search a method's options for the smallest error on one problem: `unrender sweep` as a function, without output.
 
-        found = unrender.app.sweep("room.toml", "rcv", {"learning_rate": "0.001:0.1:log", "spp": [2, 8]}, trials=40, workers="auto")
-        best = found.trials[found.best].settings
+        record = unrender.app.sweep("room.toml", "rcv", {"learning_rate": "0.001:0.1:log", "spp": [2, 8]}, trials=40, workers="auto")
+        best = record.trials[record.best].settings
 
     Args:
-        problem: a problem file, or the name of a gallery problem: workers open it themselves.
-        method: its name.
+        problem: a problem file, or the name of a gallery problem; workers open it themselves.
+        method: name of the method.
         over: options to vary: a list of values, or a range as text, LOW:HIGH[:log][:POINTS].
-        settings, problem_settings: options of the method and of a gallery problem that stay the same.
-        search, trials, prune, window: which settings to try (None for a grid, or random ones where a range has no points), and how many.
-        steps, seconds, seeds, seed, final_spp, variant: of each run, as for `unrender sweep`.
-        workers, threads, insecure: how many processes, "auto", or where; threads of each; whether others may enter the cluster.
-        out, overwrite: folder of the results, None for a new one in out/; whether an earlier sweep there is lost.
+        settings, problem_settings: fixed options of the method and of a gallery problem.
+        search, trials, prune, window: search (None for a grid, or random if a range has no points), and number of trials.
+        steps, seconds, seeds, seed, final_spp, variant: options of each run, as in `unrender sweep`.
+        workers, threads, insecure: number of processes, "auto", or an address; threads of each; whether others may enter the cluster.
+        out, overwrite: output folder, None for a new one in out/; whether to replace an earlier sweep there.
 
     Returns:
-        What sweep.json holds; `best` is None where every trial failed.
+        Contents of sweep.json; `best` is None if every trial failed.
 
     Raises:
-        InputError: an argument makes no sense (the line names the command's option), or Ray or Optuna is needed and missing.
-        KeyboardInterrupt: what was reached is in `out`; `unrender sweep DIR` goes on.
+        InputError: an invalid argument (the message names the command's option), or Ray or Optuna is required and missing.
+        KeyboardInterrupt: completed trials are in `out`; `unrender sweep DIR` continues.
     """
     given: dict[str, Any] = {
         "problem": str(problem), "method": method, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
@@ -209,7 +207,7 @@ def _texts(given: Mapping[str, Any] | None) -> dict[str, str]:
 
 
 def _is_sweep(what: str) -> bool:
-    """Whether a folder is meant, and no problem of the gallery that has its name."""
+    """Return whether the argument is a folder, and not a gallery problem of the same name."""
     from unrender import gallery
 
     return Path(what).is_dir() and (Path(what, MARK).exists() or what not in gallery.names())
@@ -274,7 +272,7 @@ def _search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
     if plan.search == "grid":
         found = Grid(axes)
         if plan.trials not in (None, found.trials):
-            raise InputError(f"--trials {plan.trials}: a grid has all of its {found.trials} points; leave it out")
+            raise InputError(f"--trials {plan.trials}: a grid always has its {found.trials} points; leave it out")
         return plan.model_copy(update={"trials": found.trials}), found
     count = plan.trials or _TRIALS
     kind = Random if plan.search == "random" else TPE
@@ -282,20 +280,20 @@ def _search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
 
 
 def _check_alone(context: typer.Context, folder: str) -> None:
-    """Raise `InputError` where options are given that a sweep which goes on has from its beginning."""
+    """Raise `InputError` for options that a continued sweep takes from its start."""
     for name in context.params:
         source = context.get_parameter_source(name)
         if name not in _FREE and source is not None and source.name == "COMMANDLINE":
             option = name.replace("_name", "").replace("_", "-")
-            raise InputError(f"sweep {folder}: goes on as it was begun, without --{option}")
+            raise InputError(f"sweep {folder}: continues with its original options; leave out --{option}")
 
 
 def _extended(record: SweepRecord, trials: int | None) -> SweepRecord:
-    """The record of a sweep that is to have so many trials; None leaves them. Raises `InputError`."""
+    """Return the record of a sweep with another number of trials; None leaves it unchanged. Raise `InputError`."""
     if trials is None:
         return record
     if record.plan.search == "grid" or trials < max((trial.number + 1 for trial in record.trials), default=0):
         raise InputError(
-            f"--trials {trials}: the sweep has {len(record.trials)} already, and a grid has all its points"
+            f"--trials {trials}: the sweep already has {len(record.trials)} trials, and a grid always has all its points"
         )
     return record.model_copy(update={"plan": record.plan.model_copy(update={"trials": trials})})

@@ -1,4 +1,4 @@
-"""Carrying out a sweep: trials to workers, what they found into sweep.json."""
+"""Runs the trials of a sweep, in this process or on workers, and writes their results to sweep.json."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _SHOWN, _SHOWN_LIVE = 10, 5
 
 
 def line(trial: TrialRecord) -> str:
-    """One trial in words."""
+    """Return the summary line of a trial."""
     what = f"trial {trial.number}: {_settings(trial)}: "
     if trial.status == "failed":
         return f"{what}failed: {trial.message}"
@@ -52,17 +52,19 @@ def line(trial: TrialRecord) -> str:
 
 
 def best_so_far(trials: Trials) -> Table:
-    """The best trials that have ended."""
+    """Return a table of the best completed trials."""
     return _table(list(trials.ended.values()), _SHOWN_LIVE)
 
 
 def show(console: Console, record: SweepRecord) -> None:
-    """The outcome: the best trials, how many there were, and what to type for the best one."""
+    """Print the outcome: the best trials, the number of trials, and the command for the best one."""
     if record.trials:
         console.print(_table(record.trials, _SHOWN))
     counts = {status: sum(t.status == status for t in record.trials) for status in ("finished", "pruned", "failed")}
-    told = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
-    console.print(f"{told or 'no trial has ended'}; {formatting.duration(record.wall_seconds)} in all", highlight=False)
+    outcome = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
+    console.print(
+        f"{outcome or 'no trial has ended'}; {formatting.duration(record.wall_seconds)} in all", highlight=False
+    )
     reasons: dict[str, list[int]] = {}
     for trial in record.trials:
         if trial.status == "failed":
@@ -99,7 +101,7 @@ def equally_good(record: SweepRecord) -> list[int]:
 
 
 def run_command(record: SweepRecord) -> str:
-    """What to type for a run with the best settings."""
+    """Return the command of a run with the best settings."""
     plan = record.plan
     words = ["unrender", "run", plan.problem, "--method", plan.method]
     words += [w for name, value in plan.problem_settings.items() for w in ("-p", f"{name}={value}")]
@@ -148,10 +150,10 @@ class Session:
     """One call of the command.
 
     Attributes:
-        folder: of the sweep.
-        workers: who carries out the trials; None for this process.
-        threads: of the processor for each run; None chooses.
-        fresh: whether the sweep begins, whatever the folder holds.
+        folder: folder of the sweep.
+        workers: workers that run the trials; None for this process.
+        threads: processor threads per run; None for an automatic choice.
+        fresh: whether the sweep starts from the beginning, regardless of the folder's contents.
     """
 
     folder: Path
@@ -162,7 +164,7 @@ class Session:
 
 @dataclass
 class _State:
-    """What changes as the sweep goes: its record, the trials under way, and when the session began."""
+    """Mutable state of the sweep: its record, the running trials, and the start of the session."""
 
     record: SweepRecord
     trials: Trials
@@ -187,15 +189,17 @@ class _State:
 
 
 def run_trials(console: Console, session: Session, record: SweepRecord, search: Search) -> None:
-    """Carry out the trials that have not ended, write the page, say what was found.
+    """Run the remaining trials, write the page, and print the results.
 
     Raises:
         InputError: the folder is in use or cannot be written, or the problem cannot be opened.
-        typer.Exit: with the status of an interrupted sweep, or of one of which no trial came to its end.
+        typer.Exit: with the status of an interrupted sweep, or if no trial completed.
     """
     plan = record.plan
     trials = Trials(search, plan.prune, plan.window or _WINDOW)
-    trials.ended = {t.number: t for t in record.trials if trials.dependent or t.status != "failed"}  # tried once more
+    trials.ended = {
+        t.number: t for t in record.trials if trials.dependent or t.status != "failed"
+    }  # failed trials are repeated
     state = _State(record, trials, before=record.wall_seconds)
     lock = Lock(session.folder)
     lock.acquire()
@@ -216,7 +220,7 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
     finally:
         if not trials.done and (session.folder / SWEEP).exists():
             state.save(session.folder, "interrupted")
-            again = f"to go on: unrender sweep {shlex.quote(str(session.folder))}"
+            again = f"to continue: unrender sweep {shlex.quote(str(session.folder))}"
             console.print(again, markup=False, highlight=False, soft_wrap=True)
         lock.release()
     if not trials.done:
@@ -226,7 +230,8 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
 
 
 def _choose_window(state: _State, executor: Executor) -> None:
-    """Unless it was given, or chosen when the sweep began: at least twice the workers, so that none waits for the slowest of the others."""
+    """Choose the number of concurrent trials, unless it was chosen before: at least twice the workers, so that none waits for a slow
+    trial."""
     if state.record.plan.window is None:
         state.trials.window = max(_WINDOW, 2 * executor.slots)
         plan = state.record.plan.model_copy(update={"window": state.trials.window})
@@ -235,7 +240,7 @@ def _choose_window(state: _State, executor: Executor) -> None:
 
 @contextlib.contextmanager
 def _executor(console: Console, session: Session, record: SweepRecord) -> Iterator[tuple[Executor, Job, Problem, str]]:
-    """Who carries out the trials, what they have in common, the problem, and the variant."""
+    """Yield the executor of the trials, their common data, the problem, and the variant."""
     plan = record.plan
     with contextlib.ExitStack() as stack:
         cluster = None
@@ -262,9 +267,9 @@ def _executor(console: Console, session: Session, record: SweepRecord) -> Iterat
             yield InProcess(partial(_here, problem)), job, problem, running
 
 
-def _here(problem: Problem, job: Job, given: list[RunTask]) -> tuple[list[RunOutcome], dict[str, bytes]]:
-    """What `tasks.on_worker` does, in this process."""
-    return tasks.in_turn(job, given, problem), {}
+def _here(problem: Problem, job: Job, run_tasks: list[RunTask]) -> tuple[list[RunOutcome], dict[str, bytes]]:
+    """Run the tasks in this process, with the result of `tasks.on_worker`."""
+    return tasks.in_turn(job, run_tasks, problem), {}
 
 
 def _announce(console: Console, session: Session, state: _State, executor: Executor) -> None:
@@ -277,18 +282,18 @@ def _announce(console: Console, session: Session, state: _State, executor: Execu
 
 
 def _drive(console: Console, session: Session, state: _State, executor: Executor, job: Job) -> None:
-    """Until all trials have ended, or one is interrupted."""
+    """Run trials until all have ended, or one is interrupted."""
     plan, trials = state.record.plan, state.trials
     display = TaskDisplay(console, trials.search.trials, "trials", lambda: best_so_far(trials))
     display.skip(len(trials.ended))
     with display:
         while not trials.done and not state.stopped:
             while executor.pending < executor.slots and (started := trials.next()) is not None:
-                given = _tasks(plan, started)
+                run_tasks = _tasks(plan, started)
                 label = ", ".join(f"{name}={value}" for name, value in started.settings.items())
-                display.begin(started.number, label, tuple(session.folder / task.name for task in given))
+                display.begin(started.number, label, tuple(session.folder / task.name for task in run_tasks))
                 state.under_way[started.number] = started
-                executor.start(started.number, job, given)
+                executor.start(started.number, job, run_tasks)
             for ended in executor.wait(_POLL_SECONDS):
                 record = _ended(session, state, ended)
                 if record is None:
@@ -299,7 +304,7 @@ def _drive(console: Console, session: Session, state: _State, executor: Executor
 
 
 def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:
-    """What became of a trial; None where this process was told to stop."""
+    """Return the record of a completed trial; None if this process was told to stop."""
     started = state.under_way.pop(ended.key)
     runs, message = [], ended.message
     if not message:
@@ -317,7 +322,7 @@ def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:
 
 
 def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
-    """The runs of a trial: the first one may be pruned."""
+    """Return the runs of a trial. Only the first one may be pruned."""
     return [
         RunTask(
             folders.name(started.number, plan.seed + i),
@@ -334,7 +339,7 @@ def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
 
 
 def _page(console: Console, folder: Path, state: _State) -> None:
-    """A page that compares the best trials."""
+    """Write a page that compares the best trials."""
     if folders.best(folder, state.record):
         page = report.write_page(folder, state.record)
         console.print(f"page: {page}", markup=False, highlight=False, soft_wrap=True)

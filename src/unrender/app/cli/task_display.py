@@ -1,4 +1,4 @@
-"""What is shown while a set of runs goes: a table that moves on a terminal, a line for each that ends elsewhere."""
+"""Display of a set of runs: a live table on a terminal, otherwise a line for each completed run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MOST_ROWS = 20
 
 @dataclass(frozen=True)
 class _UnderWay:
-    """A task that goes on: what it is called, since when, and the run folders that it may be in."""
+    """A running task: its label, start time, and possible run folders."""
 
     label: str
     since: float
@@ -35,13 +35,13 @@ class _UnderWay:
 
 
 class TaskDisplay:
-    """Shows the tasks under way. Use as a context manager.
+    """Shows the running tasks. Use as a context manager.
 
     Args:
-        console: where to.
-        total: how many tasks there are.
-        what: a task's name, such as "trials".
-        below: what stands below the table of those under way; None for nothing.
+        console: output console.
+        total: number of tasks.
+        what: name of the tasks, such as "trials".
+        below: renderable below the table of running tasks; None for nothing.
     """
 
     def __init__(self, console: Console, total: int, what: str, below: Callable[[], Renderable] | None = None):
@@ -66,12 +66,12 @@ class TaskDisplay:
             self._live = None
 
     def begin(self, key: object, label: str, folders: tuple[Path, ...]) -> None:
-        """A task has begun, in one of these run folders after the other."""
+        """Record the start of a task, which uses these run folders in turn."""
         with self._lock:
             self._under_way[key] = _UnderWay(label, time.monotonic(), folders)
 
     def end(self, key: object, line: str) -> None:
-        """A task has ended so."""
+        """Record the end of a task, with its summary line."""
         with self._lock:
             self._under_way.pop(key, None)
             self._ended += 1
@@ -79,11 +79,11 @@ class TaskDisplay:
             self.say(f"{self._ended}/{self._total} {line}")
 
     def skip(self, count: int) -> None:
-        """So many had ended before."""
+        """Record tasks that had ended before."""
         self._ended += count
 
     def say(self, line: str) -> None:
-        """A line that stays."""
+        """Print a permanent line."""
         self._console.print(visible(line), markup=False, highlight=False, soft_wrap=True)
         self._console.file.flush()
 
@@ -112,7 +112,7 @@ class TaskDisplay:
 
 
 def _status(folders: tuple[Path, ...]) -> tuple[Path, LiveStatus | None]:
-    """The folder whose run goes on, and how far it is; the first one and None where none is seen from here."""
+    """Return the folder of the current run and its live status; the first folder and None if no status is visible."""
     for folder in folders:
         path = folder / LIVE / LIVE_STATUS
         with contextlib.suppress(InputError, OSError):

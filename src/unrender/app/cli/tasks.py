@@ -1,4 +1,4 @@
-"""Runs as tasks: what is sent to a worker, what it does, what comes back. `compare` and `sweep` carry out their runs so."""
+"""Runs of `compare` and `sweep` as tasks: their input, execution on a worker, and output."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ from unrender.runs.resume import load_run, resume_run
 from unrender.scene.problem import Problem
 
 _PATIENCE_SECONDS = 30.0
-"""For a run folder that a dying process still holds."""
+"""Time to wait for a run folder that a dying process still holds, in seconds."""
 _MARK = ".unrender-folder"
 
 
 @dataclass(frozen=True)
 class Job:
-    """What all tasks of a command have in common. All of it can be sent to a worker.
+    """Common data of all tasks of a command. It is serialisable.
 
     Attributes:
         problem, problem_settings, cached: see `arguments.open_problem`; a file's path is absolute.
-        command: what was typed.
-        folder: where results go: an absolute path.
-        token: that the file `.unrender-folder` in it holds: a worker that reads another, or none, sends its results back.
+        command: typed command.
+        folder: output folder, an absolute path.
+        token: contents of the file `.unrender-folder` in it: a worker that reads something else, or nothing, sends its results back.
         variant, threads: of the workers.
     """
 
@@ -62,13 +62,13 @@ class Job:
 
 @dataclass(frozen=True)
 class RunTask:
-    """One run. All of it can be sent to a worker.
+    """One run. It is serialisable.
 
     Attributes:
-        name: of its run folder, within the job's.
+        name: name of its run folder in the job's folder.
         method, settings: as typed.
-        steps, seconds, seed, final_spp: see `Plan`.
-        limits: see `Pruning`; None for a run whose error on the way is not looked at.
+        steps, seconds, seed, final_spp: see `RunOrder`.
+        limits: see `Pruning`; None for a run whose intermediate errors are not evaluated.
     """
 
     name: str
@@ -89,7 +89,7 @@ def discard_earlier(folder: Path, tasks: Sequence[RunTask]) -> None:
 
 @contextlib.contextmanager
 def open_job(job: Job) -> Iterator[None]:
-    """Mark the job's folder, so that workers can tell whether they see it."""
+    """Mark the job's folder, so that workers can detect whether they share it."""
     mark = Path(job.folder, _MARK)
     files.write(mark, job.token.encode(), durable=False)
     try:
@@ -106,7 +106,7 @@ def carry_out(
     progress: Progress,
     callbacks: Sequence[Callback] = (),
 ) -> RunOutcome:
-    """One run, from where an earlier attempt left it. Raises `InputError` as `optimize` and `resume_run` do."""
+    """Run a task, from the state of an earlier attempt. Raise `InputError` as `optimize` and `resume_run` do."""
     folder = Path(job.folder, task.name)
     _wait_until_free(folder)
     record = reader.read_run_record(folder) if (folder / RECORD).is_file() else None
@@ -127,7 +127,7 @@ def carry_out(
 
 
 def outcome(folder: Path, task: RunTask, wall_seconds: float) -> RunOutcome:
-    """What a run folder says of the run's end. Raises `InputError`."""
+    """Return the outcome of a run from its folder. Raise `InputError`."""
     run = reader.read(folder)
     record = run.record
     rungs = read_rungs(folder / RUNG_FILE)
@@ -157,19 +157,19 @@ def outcome(folder: Path, task: RunTask, wall_seconds: float) -> RunOutcome:
 
 
 def quiet() -> tuple[Console, Progress]:
-    """A console that nobody reads, and a listener to phases that prints there."""
+    """Return a console without visible output, and a progress listener that prints there."""
     console = Console(file=io.StringIO(), force_terminal=False)
     return console, Progress(console)
 
 
-# ---------------------------------------------------------------------- on a worker
+# ---------------------------------------------------------------------- worker
 
 
 def on_worker(job: Job, tasks: Sequence[RunTask]) -> tuple[list[RunOutcome], dict[str, bytes]]:
-    """Carry out runs one after the other, until one does not come to its end.
+    """Run tasks in turn, until one does not complete.
 
     Returns:
-        How they ended; and, where the job's folder is not seen from here, {path within it: contents} of what they wrote.
+        Their outcomes; and, if the job's folder is not shared, {path within it: contents} of the written files.
     """
     prepare_worker(job.variant, job.threads)
     problem = _problem(job.problem, tuple(job.problem_settings.items()), job.cached)
@@ -178,15 +178,15 @@ def on_worker(job: Job, tasks: Sequence[RunTask]) -> tuple[list[RunOutcome], dic
         return in_turn(job, tasks, problem), {}
     place = Path(tempfile.mkdtemp(prefix="unrender-"))
     try:
-        found = in_turn(replace(job, folder=str(place)), tasks, problem)
+        outcomes = in_turn(replace(job, folder=str(place)), tasks, problem)
         written = (path for path in place.rglob("*") if path.is_file() and CHECKPOINTS not in path.parts)
-        return found, {str(path.relative_to(place)): path.read_bytes() for path in written}
+        return outcomes, {str(path.relative_to(place)): path.read_bytes() for path in written}
     finally:
         shutil.rmtree(place, ignore_errors=True)
 
 
 def receive(folder: Path, written: Mapping[str, bytes]) -> None:
-    """Write what a worker sent back. run.json comes last in each run folder. Raises `OSError`."""
+    """Write the files that a worker sent back. run.json comes last in each run folder. Raise `OSError`."""
     for name in sorted(written, key=lambda name: name.endswith(RECORD)):
         files.write(folder / name, written[name], durable=False)
 
@@ -205,15 +205,15 @@ def in_turn(job: Job, tasks: Sequence[RunTask], problem: Problem) -> list[RunOut
 
 @functools.lru_cache(maxsize=1)
 def _problem(name: str, options: tuple[tuple[str, str], ...], cached: bool) -> Problem:
-    """Opened once a process."""
+    """Return the problem, opened once per process."""
     return arguments.open_problem(name, dict(options), cached)
 
 
-# ---------------------------------------------------------------------- the parts
+# ---------------------------------------------------------------------- parts
 
 
 def _resumed(folder: Path, problem: Problem, callbacks: Sequence[Callback], command: str) -> bool:
-    """Whether the run could go on from its last checkpoint, and did."""
+    """Resume the run from its last checkpoint if possible; return whether this succeeded."""
     try:
         stored = load_run(folder)
         live = Live(folder, problem.name, stored.record.method, command)

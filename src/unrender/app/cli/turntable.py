@@ -1,4 +1,4 @@
-"""`unrender turntable`: a video of a run's result that turns under a light of the user's choice."""
+"""`unrender turntable`: a turntable video of a run's result under a chosen light."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ def turntable(
     environment: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The light: a picture of all directions (.exr, .hdr).")
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, max=100_000, help="Of one turn.")] = 48,
+    frames: Annotated[int, typer.Option(min=1, max=100_000, help="Frames of one turn.")] = 48,
     rate: Annotated[float, typer.Option(help="Frames a second.")] = 24.0,
     size: Annotated[int, typer.Option(help="Pixels a side.")] = 320,
     spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel.")] = 64,
-    elevation: Annotated[float, typer.Option(help="Of the camera, in degrees.")] = 15.0,
+    elevation: Annotated[float, typer.Option(help="Elevation of the camera in degrees.")] = 15.0,
     up: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="The axis. Default: the cameras' mean.")] = None,
     background: Annotated[str, typer.Option(help="light, black, grey or white.")] = "light",
     out: Annotated[
         Path | None, typer.Option(help=".mp4, .gif, or a folder for PNG files. Default: turntable.mp4 in DIR.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing files.")] = False,
     variant: Variant = "auto",
     allow_outside: AllowOutside = False,
 ) -> None:

@@ -25,11 +25,13 @@ def watch(
         list[Path],
         typer.Argument(
             metavar="DIR...",
-            help="Run folders: of runs under way, finished, or yet to begin; or folders of sweeps or stages.",
+            help="Run folders of running, finished or future runs; or folders of sweeps or stages.",
         ),
     ],
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Of 127.0.0.1; 0 takes a free one.")] = 0,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open nothing.")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 selects a free one.")] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Print the address without opening a browser.")
+    ] = False,
 ) -> None:
     """Serve a page that shows runs as they go, with buttons to pause, resume and stop them.
 
@@ -42,22 +44,24 @@ def watch(
         if directory.exists() and not directory.is_dir():
             raise InputError(f"{directory}: a file, expected a run folder")
     if len({directory.resolve() for directory in directories}) < len(directories):
-        raise InputError("watch: a run folder is given twice")
+        raise InputError("watch: a run folder is listed twice")
     for directory in directories:
         if not directory.is_dir():
             typer.echo(f"{directory}: no such folder yet: waiting for a run to begin there{_similar(directory)}")
     with server.listen(port) as opened:
         address = server.Address(opened.getsockname()[1])
-        typer.echo(f"watching at {address.url}\nCtrl-C ends this page; the runs go on")
+        typer.echo(f"watching at {address.url}\nCtrl-C stops this page; the runs continue")
         with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
-            found = None if no_browser else _open(address, stack)  # the socket listens already, and a browser waits
+            found = (
+                None if no_browser else _open(address, stack)
+            )  # the socket is listening already, so the browser can connect
             with contextlib.suppress(OSError):
-                os.nice(_NICE)  # what is watched goes first; only now, since the browser would inherit it
+                os.nice(_NICE)  # give the watched runs priority; not earlier, since the browser would inherit it
             server.serve([directory.absolute() for directory in directories], address, opened, found)
 
 
 def _runs(directory: Path) -> list[Path]:
-    """The run folders of a folder of stages or of a sweep; of any other, itself."""
+    """Return the run folders of a folder of stages or of a sweep; for any other folder, itself."""
     from unrender.app.stages import run_folders
     from unrender.app.sweeps import folders
 
@@ -65,7 +69,7 @@ def _runs(directory: Path) -> list[Path]:
 
 
 def _similar(directory: Path) -> str:
-    """A hint at a run folder beside it whose name is nearly the same."""
+    """Return a hint at a sibling run folder with a similar name."""
     siblings: list[str] = []
     with contextlib.suppress(OSError):
         siblings = [path.name for path in directory.parent.iterdir() if path.is_dir()]
@@ -73,7 +77,7 @@ def _similar(directory: Path) -> str:
 
 
 def _open(address: server.Address, stack: contextlib.ExitStack) -> Callable[[], object] | None:
-    """Open the page in a browser; returns what to call once the browser is there."""
+    """Open the page in a browser; return a function to call once the browser has connected."""
     from unrender.app.watch.connections import Redirect
 
     try:
