@@ -1,4 +1,4 @@
-"""Pages for people, made from run folders on disk: one run (`page`), or several methods at equal time (`compare`)."""
+"""HTML pages of run folders: the page of one run (`page`), and the comparison of several methods at equal time (`compare`)."""
 
 from unrender.app.report.comparison import compare, load_comparison, write_comparison
 from unrender.app.report.page import page

@@ -1,4 +1,4 @@
-"""Several runs at equal time: compare.html, compare.png and compare.json."""
+"""Comparison of several runs at equal time: compare.html, compare.png and compare.json."""
 
 from __future__ import annotations
 
@@ -24,23 +24,27 @@ _MAPS = 8
 
 
 def compare(directories: Sequence[str | Path], out: str | Path) -> Path:
-    """Compare runs of one problem, grouped by method over seeds; ratios are to the first one's method.
+    """Compare runs of one problem, grouped by method over seeds. Ratios are relative to the method of the first run.
 
     Args:
         directories: run folders.
-        out: where compare.html, compare.png and compare.json go; made where it is missing.
+        out: the folder of compare.html, compare.png and compare.json; it is created if it is missing.
 
     Returns:
         The path of compare.html.
 
     Raises:
-        InputError: no folders, one that is malformed or of another problem, or `out` cannot be written to.
+        InputError: no folders, a malformed folder, runs of different problems, or `out` cannot be written to.
     """
     return write_comparison(*load_comparison(directories), out)
 
 
 def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list[str]]:
-    """The numbers of a comparison, and what makes it weaker, one line each. Raises `InputError`."""
+    """Return the numbers of a comparison and its weaknesses, one line each.
+
+    Raises:
+        InputError: as in `compare`.
+    """
     runs = [read(directory) for directory in directories]
     with np.errstate(over="ignore", invalid="ignore"):  # runs that diverged are compared, too
         notices = grouping.check_comparable(runs)
@@ -87,7 +91,7 @@ def _page(comparison: Comparison, notices: list[str]) -> bytes:
 
 
 def _charts(comparison: Comparison, axis: str) -> list[Chart]:
-    found = []
+    charts = []
     for metric in comparison.metrics:
         lines = []
         for colour, (name, outcome) in enumerate(metric.methods.items()):
@@ -95,13 +99,13 @@ def _charts(comparison: Comparison, axis: str) -> list[Chart]:
             several = outcome.reached.runs > 1
             low, high = (band.low, band.high) if several else (None, None)
             lines.append(Line(name, band.x, band.median, low, high, colour))
-        found.append(plots.chart(metric.title, lines, axis, max(float(line.x[-1]) for line in lines)))
-    return [chart for chart in found if chart is not None]
+        charts.append(plots.chart(metric.title, lines, axis, max(float(line.x[-1]) for line in lines)))
+    return [chart for chart in charts if chart is not None]
 
 
 def _numbers(comparison: Comparison, notices: list[str]) -> bytes:
-    """compare.json. What is not known or not finite is null."""
-    found = {
+    """Return the content of compare.json. Values that are unknown or not finite are null."""
+    numbers = {
         "problem": comparison.groups[0].runs[0].record.name,
         "first": comparison.groups[0].label,
         "seconds": comparison.seconds,
@@ -129,7 +133,7 @@ def _numbers(comparison: Comparison, notices: list[str]) -> bytes:
             for metric in comparison.metrics
         ],
     }
-    return (json.dumps(_plain(found), indent=1, allow_nan=False) + "\n").encode()
+    return (json.dumps(_plain(numbers), indent=1, allow_nan=False) + "\n").encode()
 
 
 def _run(run: RunFolder) -> dict[str, Any]:

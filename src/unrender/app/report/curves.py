@@ -16,9 +16,9 @@ _TIMES = 2000
 
 @dataclass(frozen=True)
 class Series:
-    """A quantity of one run; arrays of one length, seconds and samples ascending, values NaN nowhere (infinity may be).
+    """A quantity of one run as a step function: each value holds until the next one.
 
-    It keeps each value until the next one is known.
+    The arrays have one length. Seconds and samples ascend. Values are never NaN, but can be infinite.
     """
 
     seconds: np.ndarray
@@ -26,12 +26,12 @@ class Series:
     values: np.ndarray
 
     def at(self, positions: np.ndarray, axis: str = "seconds") -> np.ndarray:
-        """The value last known at each position of the axis, "seconds" or "samples"; the first one before that."""
+        """Return the last known value at each position of the axis, "seconds" or "samples"; the first value before the first position."""
         known = getattr(self, axis)
         return self.values[np.maximum(np.searchsorted(known, positions, side="right") - 1, 0)]
 
     def time_to(self, level: float) -> float | None:
-        """The first time, in seconds, at which the value is at most `level`; None if it never is."""
+        """Return the first time, in seconds, at which the value is at most `level`; None if it never is."""
         below = np.flatnonzero(self.values <= level)
         return float(self.seconds[below[0]]) if below.size else None
 
@@ -46,13 +46,13 @@ class Band:
     high: np.ndarray
 
     def time_to(self, level: float) -> float | None:
-        """Where the median first is at most `level`; None if it never is."""
+        """Return the first position at which the median is at most `level`; None if it never is."""
         below = np.flatnonzero(self.median <= level)
         return float(self.x[below[0]]) if below.size else None
 
 
 def parameter_error(run: RunFolder, key: str) -> Series | None:
-    """A parameter's error from start to end of the run; None where its truth is unknown."""
+    """Return the error of a parameter over the run; None if its truth is unknown."""
     if key not in run.known:
         return None
     history = run.history
@@ -71,25 +71,29 @@ def parameter_error(run: RunFolder, key: str) -> Series | None:
 
 
 def relative_error(run: RunFolder, keys: Sequence[str]) -> Series | None:
-    """The mean over parameters of error / error at the start: 1 at first, 0 when all is found."""
+    """Return the mean over the parameters of error / error at the start: 1 at the start, 0 at full recovery.
+
+    Parameters without truth, or with an initial error of 0 or infinity, are left out; None if no parameter remains.
+    """
     known = [series for key in keys if (series := parameter_error(run, key)) is not None]
-    found = [series for series in known if 0 < series.values[0] < np.inf]
-    if not found:
+    usable = [series for series in known if 0 < series.values[0] < np.inf]
+    if not usable:
         return None
-    seconds = np.unique(np.concatenate([series.seconds for series in found]))
-    samples = found[0].samples[np.maximum(np.searchsorted(found[0].seconds, seconds, side="right") - 1, 0)]
-    return Series(seconds, samples, np.mean([series.at(seconds) / series.values[0] for series in found], axis=0))
+    seconds = np.unique(np.concatenate([series.seconds for series in usable]))
+    samples = usable[0].samples[np.maximum(np.searchsorted(usable[0].seconds, seconds, side="right") - 1, 0)]
+    return Series(seconds, samples, np.mean([series.at(seconds) / series.values[0] for series in usable], axis=0))
 
 
 def image_error(run: RunFolder) -> float | None:
-    """Of the result's pictures: root mean square over pixels and channels, mean over views; None without pictures."""
+    """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without
+    pictures."""
     errors = [root_mean_square(view.result, view.reference) for view in run.views.values()]
     known = [error for error in errors if error is not None]
     return float(np.mean(known)) if known else None
 
 
 def smoothed_loss(run: RunFolder, window: float) -> Series | None:
-    """The loss, each value the median of the records of the last `window` seconds. Skipped steps are left out."""
+    """Return the loss, each value the median of the records of the last `window` seconds. Skipped steps are left out."""
     known = np.isfinite(run.history.loss)
     seconds, samples, loss = run.history.seconds[known], run.history.samples[known], run.history.loss[known]
     if not len(loss):
@@ -101,7 +105,7 @@ def smoothed_loss(run: RunFolder, window: float) -> Series | None:
 
 
 def band(series: Sequence[Series], axis: str, end: float, count: int | None = None) -> Band:
-    """Median and spread of several runs from 0 to `end`, at `count` even positions or wherever one of them changes."""
+    """Return median and spread of several runs from 0 to `end`, at `count` even positions, or at each change of a run."""
     if count is None:
         positions = np.unique(np.concatenate([getattr(one, axis) for one in series] + [np.array([0.0, end])]))
         positions = positions[positions <= end]
@@ -113,7 +117,7 @@ def band(series: Sequence[Series], axis: str, end: float, count: int | None = No
 
 
 def binned(x: np.ndarray, y: np.ndarray) -> Band:
-    """A long noisy curve thinned for picture: median, minimum and maximum in at most 200 bins of x."""
+    """Return median, minimum and maximum of a noisy curve in at most 200 bins of x."""
     known = np.isfinite(y)
     x, y = x[known], y[known]
     if len(x) <= _BINS:
@@ -121,7 +125,7 @@ def binned(x: np.ndarray, y: np.ndarray) -> Band:
     bin_index = np.minimum((x / (x[-1] or 1.0) * _BINS).astype(int), _BINS - 1)
     starts = np.flatnonzero(np.r_[True, np.diff(bin_index) > 0])
     ends = np.r_[starts[1:], len(y)]
-    # All bins at once, since a page that follows a run draws these every second: sorted within each, the middle is the median.
+    # All bins at once, since the live page of a run computes these every second: within a sorted bin, the middle is the median.
     ordered = y[np.lexsort((y, bin_index))]
     left, right = (starts + ends - 1) // 2, (starts + ends) // 2
     middle, median = (x[left] + x[right]) / 2, (ordered[left] + ordered[right]) / 2

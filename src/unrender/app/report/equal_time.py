@@ -1,4 +1,4 @@
-"""Several methods at equal time and at equal samples: errors, ratios, times to a target error, curves."""
+"""Comparison of several methods at equal time and at equal samples: errors, ratios, times to a target error, curves."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from unrender.rendering import parameter_errors
 from unrender.runs.folder.reader import RunFolder
 
 SHARES = (0.25, 0.5, 1.0)
-"""Of the shortest run's time, or of the fewest samples: where methods are compared."""
+"""Fractions of the time of the shortest run, or of the fewest samples, at which methods are compared."""
 LOSS_WINDOW = 0.05
-"""Of the shortest run's time: over how long a loss is a median."""
+"""Window of the median of a loss, as a fraction of the time of the shortest run."""
 _POINTS = 200
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Over the runs of one method. None where nothing is known."""
+    """Median, minimum and maximum over the runs of one method; None where no value is known."""
 
     median: float | None
     low: float | None
@@ -36,13 +36,13 @@ class Spread:
 
 @dataclass(frozen=True)
 class ErrorAtBudget:
-    """One method's error at a fraction of the budget, in seconds or in samples.
+    """The error of one method at a fraction of the budget, in seconds or in samples.
 
     Attributes:
-        share: of the shortest run's time, or of the fewest samples.
-        seconds, samples: when; one of the two, the other one is None.
-        error: of the metric.
-        ratio: of the median to the first method's, None where that is 0 or not finite.
+        share: fraction of the time of the shortest run, or of the fewest samples.
+        seconds, samples: the position; one of the two is None.
+        error: error of the metric.
+        ratio: ratio of the median to that of the first method; None where that is 0 or not finite.
     """
 
     share: float
@@ -54,13 +54,13 @@ class ErrorAtBudget:
 
 @dataclass(frozen=True)
 class TimeToTarget:
-    """When one method reached the target: the lowest median error of the first method.
+    """The time at which one method reaches the target: the lowest median error of the first method.
 
     Attributes:
-        seconds: when the median over its runs reached it, None if never.
-        fastest, slowest: of the single runs that reached it.
-        count, runs: how many of how many runs reached it.
-        speedup: the first method's time over this one's; None where either is unknown or zero.
+        seconds: time at which the median over the runs reaches the target; None if it never does.
+        fastest, slowest: the least and the greatest time of the single runs that reach the target.
+        count, runs: number of the runs that reach the target, and number of all runs.
+        speedup: time of the first method divided by the time of this one; None where either is unknown or zero.
     """
 
     seconds: float | None
@@ -91,14 +91,14 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Metric:
-    """What is compared.
+    """A compared quantity.
 
     Attributes:
-        name: "loss", "relative parameter error", or a parameter's key.
-        title: for people.
-        best_of_first: the lowest median over the first method's runs.
-        improves: whether that is less than where it began.
-        methods: {method's label: outcome}.
+        name: "loss", "relative parameter error", or the key of a parameter.
+        title: title for readers.
+        best_of_first: the lowest median over the runs of the first method.
+        improves: whether `best_of_first` is less than the initial median.
+        methods: {label of the method: outcome}.
     """
 
     name: str
@@ -108,7 +108,7 @@ class Metric:
     methods: dict[str, MethodResult]
 
     def best_at(self, index: int, axis: str = "seconds") -> str | None:
-        """The method with the lowest median at `SHARES[index]` of the time or of the samples; None where there is only one."""
+        """Return the method with the lowest median at `SHARES[index]` of the time or of the samples; None for a single method."""
         errors = {label: of.moments if axis == "seconds" else of.at_samples for label, of in self.methods.items()}
         medians = {label: of[index].error.median for label, of in errors.items()}
         known = {label: value for label, value in medians.items() if value is not None}
@@ -138,7 +138,7 @@ class Comparison:
     representatives: dict[str, RunFolder]
 
     def best_image(self, metric: ImageMetric) -> str | None:
-        """The method with the best median of an image metric; None where there is only one, or nothing is known."""
+        """Return the method with the best median of an image metric; None for a single method, or if no value is known."""
         medians = {label: of.median for label, of in self.images[metric.name].items()}
         known = {label: value for label, value in medians.items() if value is not None}
         best = max if metric.larger_is_better else min
@@ -151,9 +151,9 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
     end = ends["seconds"]
     first_run = groups[0].runs[0]
     keys = [key for key in first_run.parameters if all(key in run.known for group in groups for run in group.runs)]
-    found = []
+    compared = []
     if len(keys) > 1:
-        found.append(
+        compared.append(
             _metric(
                 "relative parameter error",
                 "Parameter error, relative to the start (mean over parameters)",
@@ -164,19 +164,19 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
         )
     for key in keys:
         title = f"{parameter_errors.title([first_run.measure(key)])}: {key}"
-        found.append(_metric(key, title, lambda run, key=key: curves.parameter_error(run, key), groups, ends))
-    found.append(_metric("loss", "Loss", lambda run: curves.smoothed_loss(run, LOSS_WINDOW * end), groups, ends))
-    # With several parameters the mean over them comes first, then the loss, then each on its own.
-    order = [found[0], found[-1], *found[1:-1]] if len(found) > 1 else found
+        compared.append(_metric(key, title, lambda run, key=key: curves.parameter_error(run, key), groups, ends))
+    compared.append(_metric("loss", "Loss", lambda run: curves.smoothed_loss(run, LOSS_WINDOW * end), groups, ends))
+    # With several parameters, the mean over the parameters comes first, then the loss, then each parameter.
+    order = [compared[0], compared[-1], *compared[1:-1]] if len(compared) > 1 else compared
     metrics = tuple(metric for metric in order if metric is not None)
     if not metrics:
         raise InputError(
             f"{first_run.path / 'history.jsonl'}: no truth is known and no loss is finite: nothing to compare"
         )
     images = {g.label: _spread([curves.image_error(run) for run in g.runs]) for g in groups}
-    found_images = {g.label: [image_metrics.measure_run(run) for run in g.runs] for g in groups}
+    measured_images = {g.label: [image_metrics.measure_run(run) for run in g.runs] for g in groups}
     by_metric = {
-        metric.name: {label: _spread([run[metric.name] for run in runs]) for label, runs in found_images.items()}
+        metric.name: {label: _spread([run[metric.name] for run in runs]) for label, runs in measured_images.items()}
         for metric in image_metrics.available()
     }
     representatives = {g.label: _median_run(g, keys) for g in groups}
@@ -186,19 +186,19 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
 def _metric(
     name: str, title: str, series: Callable[[RunFolder], Series | None], groups: Sequence[Group], ends: dict[str, float]
 ) -> Metric | None:
-    """None where some method has no value of it."""
-    found = {group.label: [s for run in group.runs if (s := series(run)) is not None] for group in groups}
-    if not all(found.values()):
+    """Return a metric with its outcome for each method; None where some method has no value of it."""
+    series_of = {group.label: [s for run in group.runs if (s := series(run)) is not None] for group in groups}
+    if not all(series_of.values()):
         return None
-    full = {label: curves.band(of, "seconds", min(float(s.seconds[-1]) for s in of)) for label, of in found.items()}
+    full = {label: curves.band(of, "seconds", min(float(s.seconds[-1]) for s in of)) for label, of in series_of.items()}
     first = next(iter(full.values()))
     level = float(first.median.min())
     improves = level < float(first.median[0])
     at_first = first.time_to(level)
     methods = {}
-    for label, of in found.items():
+    for label, of in series_of.items():
         moments, at_samples = (
-            tuple(_error_at(share, axis, ends[axis], of, next(iter(found.values()))) for share in SHARES)
+            tuple(_error_at(share, axis, ends[axis], of, next(iter(series_of.values()))) for share in SHARES)
             for axis in AXES
         )
         reached = _time_to_target(of, full[label], level, at_first if improves else None)
@@ -232,9 +232,9 @@ def _spread(values: Sequence[float | None]) -> Spread:
 
 def _median_run(group: Group, keys: Sequence[str]) -> RunFolder:
     def last(run: RunFolder) -> float:
-        found = curves.relative_error(run, keys)
-        if found is not None:
-            return float(found.values[-1])
+        relative_error = curves.relative_error(run, keys)
+        if relative_error is not None:
+            return float(relative_error.values[-1])
         image = curves.image_error(run)
         return image if image is not None else math.inf
 

@@ -1,4 +1,4 @@
-"""Which runs are seeds of one method, and whether runs may be compared at all."""
+"""Grouping of runs that differ only in the seed, and tests of whether runs can be compared."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _ARGUMENT = re.compile(r"(\w+)=([^=(),]+)(?=[,)])")
 
 @dataclass(frozen=True)
 class Group:
-    """Runs of one method with equal settings, of different seeds.
+    """Runs of one method with equal settings and different seeds.
 
     Attributes:
-        label: the method's name; with the settings that differ where several groups share the method.
-        runs: in the order given.
+        label: name of the method, with the settings that differ if several groups share the method.
+        runs: the runs, in the order of the arguments.
     """
 
     label: str
@@ -34,7 +34,7 @@ class Group:
 
 
 def group(runs: Sequence[RunFolder]) -> tuple[Group, ...]:
-    """Runs by method and settings, in order of first appearance. Seeds and budgets are not settings."""
+    """Group runs by method and settings, in order of first appearance. Seeds and budgets are not settings."""
     kinds: dict[tuple, list[RunFolder]] = {}
     for run in runs:
         kinds.setdefault((run.record.method, tuple(_settings(run).items())), []).append(run)
@@ -46,10 +46,10 @@ def group(runs: Sequence[RunFolder]) -> tuple[Group, ...]:
 
 
 def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
-    """Refuse runs of different problems; return what makes a comparison weaker, one line each.
+    """Raise `InputError` for runs that cannot be compared; return the weaknesses of the comparison, one line each.
 
     Raises:
-        InputError: no runs, a run without steps, different parameters or pictures of different sizes.
+        InputError: no runs, the same run twice, a run without steps, different problems or parameters, or pictures of different sizes.
     """
     if not runs:
         raise InputError("compare: give at least one run folder")
@@ -94,7 +94,7 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
     for of in group(runs):
         seeds = [run.record.seed for run in of.runs]
         if len(set(seeds)) < len(seeds):
-            notices.append(f"{of.label}: some runs share a seed; the spread over them says too little.")
+            notices.append(f"{of.label}: some runs share a seed, so the spread over the runs is too small.")
     for run in runs:
         who = f"{run.record.method}, seed {run.record.seed}"
         notices += [f"{who}: {line}" for line in run.record.warnings]
@@ -105,7 +105,7 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
 
 
 def _relative_difference(a: np.ndarray, b: np.ndarray) -> float:
-    """The root mean square difference, relative to `b`; infinite for other shapes.
+    """Return the root mean square difference relative to `b`; infinity for different shapes.
 
     References that a gallery renders differ by rounding between machines, and in single paths between backends.
     """
@@ -113,8 +113,8 @@ def _relative_difference(a: np.ndarray, b: np.ndarray) -> float:
         return math.inf
     if np.array_equal(a, b, equal_nan=True):
         return 0.0
-    found = float(np.sqrt(np.mean((a - b) ** 2, dtype=np.float64) / (np.mean(b**2, dtype=np.float64) or 1e-30)))
-    return found if math.isfinite(found) else math.inf
+    difference = float(np.sqrt(np.mean((a - b) ** 2, dtype=np.float64) / (np.mean(b**2, dtype=np.float64) or 1e-30)))
+    return difference if math.isfinite(difference) else math.inf
 
 
 def _size(size: tuple[int, ...] | None) -> str:
@@ -122,16 +122,16 @@ def _size(size: tuple[int, ...] | None) -> str:
 
 
 def _settings(run: RunFolder) -> dict[str, str]:
-    """The settings that make the method, flat; arguments within "SGD(momentum=0.9)" each on their own."""
-    found = {}
+    """Return the settings that define the method, flat; arguments within "SGD(momentum=0.9)" are separate entries."""
+    settings = {}
     for name, text in sorted(flatten(run.record.settings).items()):
         if name.split(".")[-1] in _NOT_THE_METHOD:
             continue
         arguments = _ARGUMENT.findall(text)
-        found[name] = _ARGUMENT.sub(r"\1=…", text)
+        settings[name] = _ARGUMENT.sub(r"\1=…", text)
         for i, (argument, value) in enumerate(arguments):
-            found[f"{name}.{i}.{argument}"] = value.strip()
-    return found
+            settings[f"{name}.{i}.{argument}"] = value.strip()
+    return settings
 
 
 def _label(kind: tuple, kinds: Sequence[tuple]) -> str:

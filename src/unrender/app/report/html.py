@@ -1,4 +1,4 @@
-"""One self-contained page from a template: style and script within, nothing fetched, everything untrusted escaped."""
+"""Rendering of self-contained pages from templates: style and script are inline, and all untrusted text is escaped."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _SCRIPT = "viewer.js"
 
 
 def render(template: str, more_script: str = "", **context: Any) -> bytes:
-    """The page as UTF-8. Its content security policy lets no script run but the one of `viewer.js`, and `more_script` after it."""
+    """Render the page as UTF-8.
+
+    Its content security policy allows only `viewer.js` and, after it, `more_script`.
+    """
     script = source(_SCRIPT) + (source(more_script) if more_script else "")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
@@ -29,25 +32,25 @@ def render(template: str, more_script: str = "", **context: Any) -> bytes:
 
 
 def source(name: str) -> str:
-    """The text of a style sheet or script among the templates."""
+    """Return the text of a style sheet or script among the templates."""
     return loader().get_source(_environment(), name)[0]
 
 
 def flatten(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Nested fields as {"outer.inner": text}, what is empty left out."""
-    found: dict[str, str] = {}
+    """Return nested fields as {"outer.inner": text}, without empty fields."""
+    flat: dict[str, str] = {}
     for name, value in fields.items():
         if isinstance(value, Mapping):
-            found.update(flatten(value, f"{prefix}{name}."))
+            flat.update(flatten(value, f"{prefix}{name}."))
         elif isinstance(value, list) and all(isinstance(part, str) for part in value):
-            found[f"{prefix}{name}"] = ", ".join(value)
+            flat[f"{prefix}{name}"] = ", ".join(value)
         elif value not in (None, ""):
-            found[f"{prefix}{name}"] = value if isinstance(value, str) else json.dumps(value)
-    return {name: text for name, text in found.items() if text}
+            flat[f"{prefix}{name}"] = value if isinstance(value, str) else json.dumps(value)
+    return {name: text for name, text in flat.items() if text}
 
 
 def facts(record: RunRecord) -> dict[str, str]:
-    """What a run was made with, {name: value}: problem, settings, seed, hardware, versions."""
+    """Return the facts about a run, {name: value}: problem, settings, seed, hardware, versions."""
     return flatten(
         {
             "problem": {"name": record.name, **record.problem.description},
@@ -66,8 +69,8 @@ def facts(record: RunRecord) -> dict[str, str]:
 
 
 def environment(templates: BaseLoader) -> Environment:
-    """An environment that escapes everything that is put into its templates."""
-    found = Environment(
+    """Return a Jinja environment that escapes all values in its templates."""
+    jinja = Environment(
         loader=templates,
         autoescape=True,
         undefined=StrictUndefined,
@@ -75,12 +78,12 @@ def environment(templates: BaseLoader) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters.update(number=formatting.number, duration=formatting.duration, count=formatting.count)
-    return found
+    jinja.filters.update(number=formatting.number, duration=formatting.duration, count=formatting.count)
+    return jinja
 
 
 def _visible(value: Any) -> Any:
-    """Text of others without control characters: a page is copied from, and viewed in a terminal."""
+    """Remove control characters from untrusted text, since a page is copied from and viewed in a terminal."""
     if isinstance(value, str) and not isinstance(value, Markup):
         return visible(value, "\n\t")
     return value
@@ -88,7 +91,7 @@ def _visible(value: Any) -> Any:
 
 @cache
 def loader() -> PackageLoader:
-    """Of the report's templates."""
+    """Return the loader of the templates of the report."""
     return PackageLoader("unrender.app.report", "templates")
 
 

@@ -1,4 +1,4 @@
-"""Image metrics of a run's final pictures, by name."""
+"""Image metrics of the final pictures of a run, by name."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from unrender.losses import metrics
 from unrender.runs.folder.reader import RunFolder
 
 MOST_PIXELS = 1 << 21
-"""Of all views' pictures that are measured. FLIP takes a second or two for a megapixel."""
+"""Limit of the pixels that are measured, over all views. FLIP takes a second or two per megapixel."""
 
 
 @dataclass(frozen=True)
@@ -19,10 +19,10 @@ class ImageMetric:
     """A metric of a picture against its reference.
 
     Attributes:
-        name: in headings.
-        description: what it is, for people.
+        name: the name in headings.
+        description: the definition, for readers.
         larger_is_better: whether larger values are better.
-        compute: (picture, reference) to a number, or None where it is not defined.
+        compute: the function from (picture, reference) to a number, or None where the metric is undefined.
     """
 
     name: str
@@ -32,8 +32,8 @@ class ImageMetric:
 
 
 def available() -> list[ImageMetric]:
-    """Those that can be computed here; FLIP where its package is installed."""
-    found = [
+    """Return the metrics that can be computed here; FLIP is among them if its package is installed."""
+    result = [
         ImageMetric("RMSE", "root mean square error of linear values", False, metrics.rmse),
         ImageMetric(
             "relative MSE", "mean of (I - R)\u00b2 / (R\u00b2 + 0.01), of linear values", False, metrics.relative_mse
@@ -41,27 +41,32 @@ def available() -> list[ImageMetric]:
         ImageMetric("PSNR", "peak signal-to-noise ratio in dB, as displayed", True, metrics.psnr),
         ImageMetric("SSIM", "structural similarity, as displayed", True, metrics.ssim),
     ]
-    return found + ([ImageMetric("FLIP", "mean FLIP, as displayed", False, metrics.flip)] if metrics.has_flip() else [])
+    return result + (
+        [ImageMetric("FLIP", "mean FLIP, as displayed", False, metrics.flip)] if metrics.has_flip() else []
+    )
 
 
 def measure_views(run: RunFolder) -> dict[int, dict[str, float | None]]:
-    """{view: {name: value}} of the last pictures: of the first view, and of as many more as have `MOST_PIXELS` together."""
-    found: dict[int, dict[str, float | None]] = {}
+    """Return {view: {name: value}} of the last pictures.
+
+    The first view is always measured, and further views until the pixels exceed `MOST_PIXELS`.
+    """
+    values: dict[int, dict[str, float | None]] = {}
     pixels = 0
     for index, view in run.views.items():
         pixels += view.reference.size // 3
-        if found and pixels > MOST_PIXELS:
+        if values and pixels > MOST_PIXELS:
             break
-        found[index] = {metric.name: metric.compute(view.result, view.reference) for metric in available()}
-    return found
+        values[index] = {metric.name: metric.compute(view.result, view.reference) for metric in available()}
+    return values
 
 
 def measure_run(run: RunFolder) -> dict[str, float | None]:
-    """{name: mean over the views of `measure_views`}; None where nothing is known."""
+    """Return {name: mean over the views of `measure_views`}; None where no view has a value."""
     views = list(measure_views(run).values())
     return {metric.name: _mean([view[metric.name] for view in views]) for metric in available()}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    found = [value for value in values if value is not None]
-    return float(np.mean(found)) if found else None
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

@@ -1,4 +1,4 @@
-"""compare.png: pictures of the first view, the first recovered map, and the curves; for a README or a talk."""
+"""compare.png: pictures of the first view, the first recovered map, and the curves, for a README or a talk."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CURVES_HEIGHT = 3.4
 
 
 def overview_figure(comparison: Comparison) -> bytes:
-    """A PNG on white ground: a row of pictures, a row of maps (where there are any), a row of curves."""
+    """Return a PNG on a white background: a row of pictures, a row of maps (if there are any), a row of curves."""
     rows = [row[:_COLUMNS] for row in (_pictures(comparison), _maps(comparison)) if row]
     heights = [_WIDTH / len(row) * row[0][1].shape[0] / row[0][1].shape[1] + 0.3 for row in rows] + [_CURVES_HEIGHT]
     figure = Figure(figsize=(_WIDTH, sum(heights)), dpi=150, layout="constrained", facecolor="white")
@@ -55,9 +55,9 @@ def _pictures(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
         return []
     view, of = next(iter(first.views.items()))
     factor = tone_mapping.exposure(of.reference)
-    found = [("reference", of.reference)] + ([("start", of.initial)] if of.initial is not None else [])
-    found += [(label, run.views[view].result) for label, run in comparison.representatives.items()]
-    return [(title, tone_mapping.srgb(picture * factor)) for title, picture in found]
+    row = [("reference", of.reference)] + ([("start", of.initial)] if of.initial is not None else [])
+    row += [(label, run.views[view].result) for label, run in comparison.representatives.items()]
+    return [(title, tone_mapping.srgb(picture * factor)) for title, picture in row]
 
 
 def _maps(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
@@ -65,14 +65,14 @@ def _maps(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
     key = next((key for key, truth in first.truth.items() if panels.is_map(truth)), None)
     if key is None:
         return []
-    found = [(f"truth: {key}", first.truth[key]), ("start", first.initial[key])]
-    found += [(label, run.parameters[key]) for label, run in comparison.representatives.items()]
+    row = [(f"truth: {key}", first.truth[key]), ("start", first.initial[key])]
+    row += [(label, run.parameters[key]) for label, run in comparison.representatives.items()]
     show = panels.ColourScale(first.truth[key])
-    return [(title, show.colours(plane)) for title, array in found if (plane := pictures.plane(array)) is not None]
+    return [(title, show.colours(plane)) for title, array in row if (plane := pictures.plane(array)) is not None]
 
 
 def _draw(axes: Axes, metric: Metric, axis: str) -> None:
-    drawn = []
+    plotted = []
     for i, (name, outcome) in enumerate(metric.methods.items()):
         band: Band = getattr(outcome, f"over_{axis}")
         finite = np.where(np.isfinite(band.median), band.median, np.nan)
@@ -80,8 +80,8 @@ def _draw(axes: Axes, metric: Metric, axis: str) -> None:
         colour = _COLOURS[i % len(_COLOURS)]
         axes.plot(band.x, finite, color=colour, label=_plain(name), linewidth=1.6)
         axes.fill_between(band.x, band.low, high, color=colour, alpha=0.18, linewidth=0)
-        drawn.append(finite[np.isfinite(finite)])
-    values = np.concatenate(drawn)
+        plotted.append(finite[np.isfinite(finite)])
+    values = np.concatenate(plotted)
     if plots.is_logarithmic(values):
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -99,8 +99,10 @@ def _draw(axes: Axes, metric: Metric, axis: str) -> None:
 
 
 def _plain(text: str) -> str:
-    """Untrusted text without matplotlib's mathematics, without what has no glyph, and without a leading underscore, which hides from
-    legends."""
+    """Return untrusted text in a form that matplotlib can draw.
+
+    Mathematics is escaped. Characters without a glyph become "?". A leading underscore, which hides an entry of a legend, is removed.
+    """
     printable = "".join(letter if letter.isprintable() and ord(letter) < 0x2000 else "?" for letter in text)
     short = printable if len(printable) <= 60 else printable[:57] + "…"
     return short.lstrip("_").replace("$", r"\$")

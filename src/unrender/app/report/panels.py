@@ -1,4 +1,4 @@
-"""Pictures that belong together: views and recovered maps of one run, or of several methods beside one another."""
+"""Panels of pictures: views and recovered maps of one run, or of several methods side by side."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 
 
 _TENS = -3.0
-"""Where the colours of a sensitivity end, as a power of ten of the greatest."""
+"""The lower end of the colour scale of a sensitivity: log₁₀ of the ratio to the greatest."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Slider:
 
 @dataclass(frozen=True)
 class Figure:
-    """One picture and what it is; `bar` where its colours stand for numbers."""
+    """One picture and its caption; `bar` is its legend if its colours represent numbers."""
 
     picture: Picture
     caption: str
@@ -56,14 +56,14 @@ class Figure:
 
 @dataclass(frozen=True)
 class Panel:
-    """Stacks of pictures, side by side where the screen is wide.
+    """Stacks of pictures, side by side on a wide screen.
 
     Attributes:
-        title: of all of them.
-        note: on their exposure or scale.
-        stacks: each from top to bottom.
+        title: title of the panel.
+        note: remark on the exposure or the scale.
+        stacks: pictures from top to bottom, for each stack.
         first_is_large: whether the first stack is larger than the others.
-        independent: whether pictures of different stacks show different places.
+        independent: whether pictures of different stacks show different regions.
     """
 
     title: str
@@ -74,13 +74,16 @@ class Panel:
 
 
 def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE, name: str = "Result") -> Panel:
-    """Reference against result, the start, what is left of the error, and where the method looks or what it keeps.
+    """Return the panel of a view of one run.
+
+    It compares the result with the reference and shows the start, the errors, and the maps of the method (control weight, pixel
+    probability).
 
     Args:
-        view: its index.
-        shown: its pictures.
-        encoder: makes them.
-        name: of the result, "Current" while the run goes on.
+        view: index of the view.
+        shown: pictures of the view.
+        encoder: the encoder of the pictures.
+        name: name of the result, "Current" while the run continues.
     """
     factor = tone_mapping.exposure(shown.reference)
     what = name.lower()
@@ -104,29 +107,32 @@ def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE
 
 
 def _maps_of_view(view: int, shown: ViewPictures, encoder: PictureEncoder) -> list[Figure]:
-    """What the method keeps of the past, and where it looks."""
-    found = []
+    """Return the figures of the control weight and of the pixel probability of the method, if it has them."""
+    figures = []
     if shown.control_weight is not None:
         weight = np.mean(shown.control_weight, axis=-1)
         picture = encoder.false_colour(
             weight, 0.0, 1.0, tone_mapping.VALUE_COLORMAP, f"View {view}: control weight per pixel"
         )
         bar = tone_mapping.colour_bar(0.0, 1.0, tone_mapping.VALUE_COLORMAP, "Control weight")
-        note = f"mean {_finite_mean(weight):.2f}; 1 keeps all of the past, 0 starts anew"
-        found.append(Figure(picture, "Control weight", note, bar))
+        note = f"mean {_finite_mean(weight):.2f}; 1 uses the full history, 0 discards it"
+        figures.append(Figure(picture, "Control weight", note, bar))
     if shown.pixel_probability is not None:
         density = shown.pixel_probability
         high = tone_mapping.colour_limit(density)
         picture = encoder.false_colour(
             density, 0.0, high, tone_mapping.VALUE_COLORMAP, f"View {view}: probability of each pixel"
         )
-        bar = tone_mapping.colour_bar(0.0, high, tone_mapping.VALUE_COLORMAP, "Probability that a pixel is drawn")
-        found.append(Figure(picture, "Pixel probability", f"mean {formatting.number(_finite_mean(density))}", bar))
-    return found
+        bar = tone_mapping.colour_bar(0.0, high, tone_mapping.VALUE_COLORMAP, "Probability that a pixel is sampled")
+        figures.append(Figure(picture, "Pixel probability", f"mean {formatting.number(_finite_mean(density))}", bar))
+    return figures
 
 
 def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: PictureEncoder = INLINE) -> Panel:
-    """Each method's result against the reference, and its error, all on one exposure and one scale."""
+    """Return the panel of a view of several methods.
+
+    It compares the result of each method with the reference and shows its error. All methods share one exposure and one error scale.
+    """
     reference = next(iter(shown.values())).reference
     factor = tone_mapping.exposure(reference)
     errors = {label: tone_mapping.absolute_error(of.result, of.reference) for label, of in shown.items()}
@@ -147,7 +153,10 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: Pictu
 
 
 def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Panel:
-    """A recovered texture or volume against its truth, or against its start where the truth is unknown; and how much the images tell."""
+    """Return the panel of a recovered texture or volume, with its sensitivity if it is known.
+
+    The result is compared with the truth, or with the start where the truth is unknown.
+    """
     known = (of.get(key) for of in (run.parameters, run.initial, run.truth, run.sensitivity))
     columns = run.measure(key).repeated
     result, initial, truth, sensitivity = (
@@ -158,15 +167,15 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
     stacks: list[tuple[Slider | Figure, ...]] = []
     planes = pictures.planes(result)
     for label, plane in planes.items():
-        start, wanted = pictures.planes(initial).get(label), pictures.planes(truth).get(label)
+        start, true_plane = pictures.planes(initial).get(label), pictures.planes(truth).get(label)
         errors = {
-            caption: tone_mapping.absolute_error(one, wanted)
+            caption: tone_mapping.absolute_error(one, true_plane)
             for caption, one in (("Error at the start", start), ("Error", plane))
-            if one is not None and wanted is not None and one.shape == wanted.shape
+            if one is not None and true_plane is not None and one.shape == true_plane.shape
         }
         high = tone_mapping.colour_limit(next(iter(errors.values()))) if errors else 1.0
-        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, start, wanted)]
-        if wanted is not None and start is not None:
+        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, start, true_plane)]
+        if true_plane is not None and start is not None:
             column.append(
                 Figure(scale.picture(encoder, start, f"{key} {label}: before the first step"), "Start", "", scale.bar)
             )
@@ -176,9 +185,9 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
                     Figure(scale.picture(encoder, plane, f"{key} {label}: recovered"), "Recovered", "", scale.bar)
                 )
             column.append(_error(encoder, error, high, what, f"{key} {label}: {what.lower()}"))
-        if sensitivity is not None and (told := pictures.planes(sensitivity).get(label)) is not None:
+        if sensitivity is not None and (changes := pictures.planes(sensitivity).get(label)) is not None:
             column.append(
-                _sensitivity(encoder, told, float(np.max(around(sensitivity))), f"{key} {label}: sensitivity")
+                _sensitivity(encoder, changes, float(np.max(around(sensitivity))), f"{key} {label}: sensitivity")
             )
         if len(planes) == 1:
             stacks += [(item,) for item in column]
@@ -190,21 +199,24 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
 def map_of_methods(
     key: str, results: Mapping[str, np.ndarray], truth: np.ndarray, encoder: PictureEncoder = INLINE
 ) -> Panel:
-    """What each method recovered against the truth, and its error on one scale. Of a volume, the middle slice."""
+    """Return the panel of a map of several methods.
+
+    It compares the result of each method with the truth and shows its error, on one scale. It shows the middle slice of a volume.
+    """
     scale = ColourScale(truth)
-    label, wanted = next(iter(pictures.planes(truth).items()))
-    found = {name: pictures.planes(result).get(label) for name, result in results.items()}
+    label, true_plane = next(iter(pictures.planes(truth).items()))
+    planes = {name: pictures.planes(result).get(label) for name, result in results.items()}
     errors = {
-        name: tone_mapping.absolute_error(plane, wanted)
-        for name, plane in found.items()
-        if plane is not None and plane.shape == wanted.shape
+        name: tone_mapping.absolute_error(plane, true_plane)
+        for name, plane in planes.items()
+        if plane is not None and plane.shape == true_plane.shape
     }
     high = max([tone_mapping.colour_limit(error) for error in errors.values()], default=1.0)
     stacks = []
-    for name, plane in found.items():
+    for name, plane in planes.items():
         if plane is None:
             continue
-        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, None, wanted, name)]
+        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, None, true_plane, name)]
         if name in errors:
             column.append(_error(encoder, errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
         stacks.append(tuple(column))
@@ -212,9 +224,9 @@ def map_of_methods(
 
 
 class ColourScale:
-    """How one parameter's values become colours; fixed by one array, used for all that are compared with it.
+    """The mapping of the values of one parameter to colours; one array fixes it for all arrays that are compared with this one.
 
-    One channel: false colour over the range of `fixed_by`. Three: sRGB, exposed only where a value passes 1.
+    One channel: false colour over the range of `fixed_by`. Three channels: sRGB, with an exposure below 1 only where a value exceeds 1.
     """
 
     def __init__(self, fixed_by: np.ndarray):
@@ -226,20 +238,20 @@ class ColourScale:
             self.low, self.high = min(0.0, self.low), max(1.0, self.high)
 
     def colours(self, plane: np.ndarray) -> np.ndarray:
-        """(H, W, C) values as (H, W, 3) in [0, 1], ready to be seen."""
+        """Map (H, W, C) values to (H, W, 3) display colours in [0, 1]."""
         if plane.shape[-1] == 1:
             return tone_mapping.apply_colormap(plane[..., 0], self.low, self.high, tone_mapping.VALUE_COLORMAP)
         return tone_mapping.srgb(plane[..., :3] * self.factor)
 
     def picture(self, encoder: PictureEncoder, plane: np.ndarray, alt: str) -> Picture:
-        """The same as a picture of the page."""
+        """Encode (H, W, C) values as a picture of the page, in the same colours as `colours`."""
         if plane.shape[-1] == 1:
             return encoder.false_colour(plane[..., 0], self.low, self.high, tone_mapping.VALUE_COLORMAP, alt)
         return encoder.colour(plane[..., :3], self.factor, alt)
 
     @property
     def bar(self) -> ColourBar | None:
-        """The legend, where there is one channel."""
+        """The legend; None for several channels."""
         return (
             tone_mapping.colour_bar(self.low, self.high, tone_mapping.VALUE_COLORMAP, "Value") if self.scalar else None
         )
@@ -252,16 +264,16 @@ def _compare_map(
     label: str,
     plane: np.ndarray,
     start: np.ndarray | None,
-    wanted: np.ndarray | None,
+    reference: np.ndarray | None,
     name: str = "Recovered",
 ) -> Slider | Figure:
-    found = scale.picture(encoder, plane, f"{key} {label}: {name}")
+    picture = scale.picture(encoder, plane, f"{key} {label}: {name}")
     caption = label.capitalize()
-    if wanted is not None:
-        return Slider(scale.picture(encoder, wanted, f"{key} {label}: the truth"), found, "Truth", name, caption)
+    if reference is not None:
+        return Slider(scale.picture(encoder, reference, f"{key} {label}: the truth"), picture, "Truth", name, caption)
     if start is not None:
-        return Slider(scale.picture(encoder, start, f"{key} {label}: start"), found, "Start", name, caption)
-    return Figure(found, caption or name, "", scale.bar)
+        return Slider(scale.picture(encoder, start, f"{key} {label}: start"), picture, "Start", name, caption)
+    return Figure(picture, caption or name, "", scale.bar)
 
 
 def _error(encoder: PictureEncoder, error: np.ndarray, high: float, caption: str, alt: str) -> Figure:
@@ -269,14 +281,14 @@ def _error(encoder: PictureEncoder, error: np.ndarray, high: float, caption: str
     return Figure(encoder.error(error, high, alt), caption, note, tone_mapping.error_bar(high))
 
 
-def _sensitivity(encoder: PictureEncoder, told: np.ndarray, greatest: float, alt: str) -> Figure:
-    """Of the images to each texel, in powers of ten below the greatest."""
+def _sensitivity(encoder: PictureEncoder, sensitivity: np.ndarray, greatest: float, alt: str) -> Figure:
+    """Return the figure of the sensitivity of the images to each texel, in powers of ten below the greatest."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        tens = np.nan_to_num(np.log10(around(told) / greatest), nan=_TENS, neginf=_TENS)
+        tens = np.nan_to_num(np.log10(around(sensitivity) / greatest), nan=_TENS, neginf=_TENS)
     bar = tone_mapping.colour_bar(
         _TENS, 0.0, tone_mapping.VALUE_COLORMAP, "Change of the images, log₁₀ of the greatest"
     )
-    note = f"{hardly_seen(told).mean():.0%} of the texels hardly change the images"
+    note = f"{hardly_seen(sensitivity).mean():.0%} of the texels hardly change the images"
     return Figure(encoder.false_colour(tens, _TENS, 0.0, tone_mapping.VALUE_COLORMAP, alt), "Sensitivity", note, bar)
 
 

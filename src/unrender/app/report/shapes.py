@@ -1,4 +1,4 @@
-"""Meshes that turn on the page: start, result and truth beside one another, by WebGL, or as a picture where there is none."""
+"""Panels of rotating meshes: start, result and truth side by side, by WebGL, or as a picture without WebGL."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from unrender.runs.folder.reader import RunFolder
 from unrender.scene.surfaces import area_normals
 
 MOST_FACES = 200_000
-"""Of the meshes of a panel together; more are not shown."""
+"""Limit of the faces of all meshes of a panel; larger meshes are not shown."""
 _STEPS = (1 << 16) - 1
-"""Of positions, along each side of a cube around all meshes."""
+"""Number of quantisation steps of the positions along each side of the bounding cube of all meshes."""
 _SIZE = 280
-"""Pixels along a side of each mesh in the picture."""
+"""Width and height of each mesh in the picture, in pixels."""
 _TURN, _TILT = 0.6, 0.35
-"""Of the picture, and of the first view, in radians: about the vertical, and downwards."""
+"""Angles of the picture and of the first view, in radians: about the vertical, and downwards."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A mesh as the page has it.
+    """A mesh in the encoding of the page.
 
     Attributes:
-        label: what it is.
-        positions: base64 of uint16 (V, 3), little-endian: 0 to 65535 along each side of the cube that all meshes share.
+        label: name of the mesh: "Start", "Recovered" or "Truth".
+        positions: base64 of uint16 (V, 3), little-endian: 0 to 65535 along each side of the bounding cube that all meshes share.
         faces: base64 of uint32 (F, 3).
     """
 
@@ -39,13 +39,13 @@ class Solid:
 
 @dataclass(frozen=True)
 class ShapePanel:
-    """Meshes that turn together.
+    """Meshes that rotate together.
 
     Attributes:
-        title, note: above them.
-        solids: from left to right; none where they are too large.
-        picture: data URI of a PNG: all of them side by side from the first point of view.
-        width, height: of the picture.
+        title, note: text above the meshes.
+        solids: meshes from left to right; empty if they are too large or not finite.
+        picture: data URI of a PNG of all meshes side by side, from the first point of view.
+        width, height: size of the picture.
     """
 
     title: str
@@ -57,7 +57,7 @@ class ShapePanel:
 
 
 def panel(run: RunFolder, key: str) -> ShapePanel:
-    """Start, result and, where it is known, truth of the mesh whose vertex positions are a parameter."""
+    """Return the panel of a mesh whose vertex positions are a parameter: start, result and, where it is known, truth."""
     mesh = run.meshes[key]
     shown = {"Start": (run.initial[key], mesh.first_faces), "Recovered": (run.parameters[key], mesh.faces)}
     if mesh.truth is not None:
@@ -96,12 +96,12 @@ def _picture(solids: list[tuple[np.ndarray, np.ndarray]]) -> str:
     c, s, d, t = np.cos(_TURN), np.sin(_TURN), np.cos(_TILT), np.sin(_TILT)
     turn = np.array([[1, 0, 0], [0, d, -t], [0, t, d]]) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
     for number, (vertices, faces) in enumerate(solids):
-        seen = vertices @ turn.T
-        normals = area_normals(seen, faces)
+        rotated = vertices @ turn.T
+        normals = area_normals(rotated, faces)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
         shade = 0.25 + 0.65 * np.abs(normals @ np.array([0.36, 0.48, 0.8]))
-        at = _SIZE * (0.5 + seen[:, :2] * [0.29, -0.29]) + [_SIZE * number, 0]
-        for face in np.argsort(seen[faces][:, :, 2].sum(axis=1)):  # the farthest first
+        at = _SIZE * (0.5 + rotated[:, :2] * [0.29, -0.29]) + [_SIZE * number, 0]
+        for face in np.argsort(rotated[faces][:, :, 2].sum(axis=1)):  # painter's algorithm: the farthest face first
             grey = int(255 * shade[face])
             draw.polygon([tuple(p) for p in at[faces[face]].tolist()], fill=(grey, grey, grey, 255))
     buffer = io.BytesIO()

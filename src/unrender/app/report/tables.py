@@ -1,4 +1,4 @@
-"""What the page of a run tells in words and numbers: its head, its parameters, its views."""
+"""The text and the numbers on the page of a run: its head, its parameters, its views."""
 
 from __future__ import annotations
 
@@ -19,23 +19,26 @@ from unrender.statistics import debiased
 
 
 def charts(run: RunFolder, axis: str) -> list[Chart]:
-    """Parameter errors, loss, and gradient noise of one run, along "seconds" or "samples"."""
+    """Return the charts of one run along "seconds" or "samples": parameter errors, loss and gradient noise."""
     history = run.history
     x = getattr(history, axis)
     end = float(x[-1]) if len(x) else 0.0
     loss, noise = curves.binned(x, history.loss), curves.binned(x, history.gradient_noise)
     errors = [(key, s) for key in run.known if (s := curves.parameter_error(run, key)) is not None]
     lines = [Line(key, getattr(s, axis), s.values, colour=i) for i, (key, s) in enumerate(errors)]
-    found = [
+    all_charts = [
         plots.chart(parameter_errors.title(run.measure(key) for key, _ in errors), lines, axis, end),
         plots.chart("Loss", [Line("loss", loss.x, loss.median, loss.low, loss.high)], axis, end),
         plots.chart("Gradient noise (share)", [Line("noise", noise.x, noise.median, noise.low, noise.high)], axis, end),
     ]
-    return [chart for chart in found if chart is not None]
+    return [chart for chart in all_charts if chart is not None]
 
 
 def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], axis: str) -> list[Chart]:
-    """The same of several runs, one line each; of several parameters the mean error relative to the start."""
+    """Return the charts of several runs, one line per run.
+
+    With several parameters, the error is the mean over the parameters of error / error at the start.
+    """
     ends = [float(getattr(run.history, axis)[-1]) for run in runs.values() if len(run.history)]
     if not ends:
         return []
@@ -51,8 +54,8 @@ def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], ax
             _binned(label, run, "gradient_noise", axis, colours[label]) for label, run in runs.items()
         ],
     }
-    found = [plots.chart(name, of, axis, max(ends)) for name, of in lines.items()]
-    return [chart for chart in found if chart is not None]
+    all_charts = [plots.chart(name, of, axis, max(ends)) for name, of in lines.items()]
+    return [chart for chart in all_charts if chart is not None]
 
 
 def _error(run: RunFolder, single: bool) -> Series | None:
@@ -62,31 +65,31 @@ def _error(run: RunFolder, single: bool) -> Series | None:
 
 
 def _binned(label: str, run: RunFolder, column: str, axis: str, colour: int) -> Line:
-    found = curves.binned(getattr(run.history, axis), getattr(run.history, column))
-    return Line(label, found.x, found.median, colour=colour)
+    band = curves.binned(getattr(run.history, axis), getattr(run.history, column))
+    return Line(label, band.x, band.median, colour=colour)
 
 
 STOP_REASONS = {
     "steps": "all steps done",
     "seconds": "stopped when time was up",
-    "interrupted": "interrupted: this is what was reached",
-    "terminated": "terminated: this is what was reached",
+    "interrupted": "interrupted: this is the state at the interruption",
+    "terminated": "terminated: this is the state at the termination",
     "pruned": "pruned: its error was above the median of the sweep's trials",
     "callback": "stopped by a callback",
-    "non-finite": "failed, given up: gradients were not finite; this is what was finite",
+    "non-finite": "failed: gradients were not finite, and the run was stopped; these are the last finite values",
 }
-"""How a run may end, in words."""
+"""Descriptions of the ends of a run, by `RunRecord.stopped`."""
 
 
 def ending(record: RunRecord) -> str:
-    """Return how a run ended, in words, and what fresh pictures say where they contradict it; "" while it goes on."""
+    """Describe how a run ended, with its status where the verification contradicts the end; return "" while the run continues."""
     reason = STOP_REASONS.get(record.stopped, record.stopped)
     return "; ".join(part for part in (record.status if record.status in DOUBTFUL else "", reason) if part)
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One figure of the page's head: what it was, what it became."""
+    """One number in the head of the page: its title, its value and a note."""
 
     label: str
     value: str
@@ -95,13 +98,13 @@ class Tile:
 
 @dataclass(frozen=True)
 class ParameterRow:
-    """One line of the table of parameters. Values as text, errors as numbers, None where not known.
+    """One line of the table of parameters. Values are text; errors are numbers, None where they are unknown.
 
     Attributes:
-        recovered: with the standard errors of the run's noise where they are known.
-        unit: of the errors, "" for that of the values.
-        error_seen: at the end, over the cells that the pictures tell of.
-        seen: the share of these cells.
+        recovered: recovered values, with the standard errors from the noise of the run if they are known.
+        unit: unit of the errors; "" if it is the unit of the values.
+        error_seen: final error over the cells that the pictures depend on.
+        seen: fraction of these cells.
     """
 
     key: str
@@ -134,49 +137,49 @@ class ViewRow:
 
 
 def tiles(run: RunFolder) -> list[Tile]:
-    """The head of a run's page."""
-    found = []
+    """Return the tiles in the head of the page of a run."""
+    all_tiles = []
     series = [(key, s) for key in run.known if (s := curves.parameter_error(run, key)) is not None]
     if len(series) == 1:
         key, errors = series[0]
         first, last = float(errors.values[0]), float(errors.values[-1])
         measure = run.measure(key)
-        found.append(_tile("Parameter error", first, last, measure.name, measure.unit))
+        all_tiles.append(_tile("Parameter error", first, last, measure.name, measure.unit))
     elif (relative := curves.relative_error(run, run.known)) is not None:
-        found.append(Tile("Parameter error", f"{relative.values[-1]:.1%}", "of the start's, mean over parameters"))
+        all_tiles.append(Tile("Parameter error", f"{relative.values[-1]:.1%}", "of the start's, mean over parameters"))
     after = curves.image_error(run)
     if (measured := _image_error(run)) is not None:
-        found.append(measured)
+        all_tiles.append(measured)
     elif after is not None:
         views = run.views.values()
         before = [root_mean_square(of.initial, of.reference) for of in views if of.initial is not None]
         known = [error for error in before if error is not None]
         start = float(np.mean(known)) if len(known) == len(views) else None
-        found.append(_tile("Image error", start, after, "RMSE"))
+        all_tiles.append(_tile("Image error", start, after, "RMSE"))
     loss = curves.smoothed_loss(run, 0.05 * float(run.history.seconds[-1])) if len(run.history) else None
     if loss is not None:
-        found.append(_tile("Loss", float(loss.values[0]), float(loss.values[-1]), "of the step's samples"))
+        all_tiles.append(_tile("Loss", float(loss.values[0]), float(loss.values[-1]), "of the step's samples"))
     note = f"and {formatting.duration(run.record.warmup_seconds)} of warm-up" if run.record.warmup_seconds else ""
-    found.append(Tile("Time", formatting.duration(run.record.seconds), note))
+    all_tiles.append(Tile("Time", formatting.duration(run.record.seconds), note))
     skipped = f"{run.record.skipped} skipped, not finite" if run.record.skipped else ""
-    found.append(Tile("Steps", f"{run.record.steps:,}".replace(",", "\u202f"), skipped))
+    all_tiles.append(Tile("Steps", f"{run.record.steps:,}".replace(",", "\u202f"), skipped))
     if len(run.history):
         samples, seconds = float(run.history.samples[-1]), float(run.history.seconds[-1])
         rate = f"{formatting.count(samples / seconds)} per second" if seconds > 0 else ""
-        found.append(Tile("Samples", formatting.count(samples), rate))
-    return found
+        all_tiles.append(Tile("Samples", formatting.count(samples), rate))
+    return all_tiles
 
 
 def _image_error(run: RunFolder) -> Tile | None:
-    """The error of the last pictures without the noise of their rendering; None where it was not measured."""
+    """Return the debiased error of the last pictures, without their noise; None if it was not measured."""
     known = run.record.image_errors
     errors = {
         which: [known[name] for view in run.views if (name := f"view{view}/{which}") in known]
         for which in ("initial", "result")
     }
-    if not run.views or any(len(found) != len(run.views) for found in errors.values()):
+    if not run.views or any(len(measured) != len(run.views) for measured in errors.values()):
         return None
-    before, after = (formatting.with_error(*debiased.mean(found)) for found in errors.values())
+    before, after = (formatting.with_error(*debiased.mean(measured)) for measured in errors.values())
     return Tile("Image error", after, f"RMSE without the pictures' noise, from {before}")
 
 
@@ -186,8 +189,8 @@ def _tile(label: str, before: float | None, after: float, what: str, unit: str =
 
 
 def parameter_row(run: RunFolder, key: str) -> ParameterRow:
-    """One parameter."""
-    measure, told = run.measure(key), run.sensitivity.get(key)
+    """Return the line of one parameter."""
+    measure, sensitivity = run.measure(key), run.sensitivity.get(key)
     result, initial, truth = run.parameters[key], run.initial[key], run.truth.get(key)
     return ParameterRow(
         key,
@@ -199,20 +202,20 @@ def parameter_row(run: RunFolder, key: str) -> ParameterRow:
         run.error_before.get(key),
         run.error_after.get(key),
         measure.unit,
-        None if told is None or truth is None else measure.error(result, truth, seen_cells(told)),
-        None if told is None or (where := seen_cells(told)) is None else float(where.mean()),
+        None if sensitivity is None or truth is None else measure.error(result, truth, seen_cells(sensitivity)),
+        None if sensitivity is None or (where := seen_cells(sensitivity)) is None else float(where.mean()),
     )
 
 
 def _swatch(array: np.ndarray) -> str:
-    """The colour of a parameter of three values within [0, 1], as #rrggbb; empty for others."""
+    """Return the colour of a parameter of three values within [0, 1] as #rrggbb; "" for other parameters."""
     if array.size != 3 or not ((array >= 0) & (array <= 1)).all():
         return ""
     return "#" + "".join(f"{round(255 * float(value)):02x}" for value in tone_mapping.srgb(array.reshape(-1)))
 
 
 def view_rows(run: RunFolder) -> list[ViewRow]:
-    """All views."""
+    """Return the lines of all views."""
     measured = image_metrics.measure_views(run)
     return [
         ViewRow(

@@ -1,4 +1,4 @@
-"""From linear arrays to pictures that a browser shows: exposure, sRGB, false colour, PNG in the page itself."""
+"""Conversion of linear arrays to pictures that a browser shows: exposure, sRGB, false colour, PNG data URIs."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class Picture:
     """A picture within the page.
 
     Attributes:
-        source: a data URI, or where it is served.
-        width, height: in pixels of the array it shows.
-        alt: what it shows, in words.
-        linear: whether it shows linear colours, which may be exposed otherwise.
+        source: a data URI, or the address from which the picture is served.
+        width, height: size of the array in pixels.
+        alt: description in words.
+        linear: whether the picture shows linear colours, whose exposure can be changed.
     """
 
     source: str
@@ -65,13 +65,13 @@ class Picture:
 
 @dataclass(frozen=True)
 class PictureData:
-    """What a picture shows, not yet encoded.
+    """The values of a picture, not yet encoded.
 
     Attributes:
         values: (H, W, 3) linear RGB, or (H, W) numbers.
         factor: exposure of linear RGB.
-        low, high, map: of numbers: the ends of their colours, and the colour map's name.
-        root: whether colours go with the square root of numbers.
+        low, high, map: range of the colour scale and name of the colour map, for numbers.
+        root: whether the colour scale uses the square root of the numbers.
     """
 
     values: np.ndarray
@@ -82,11 +82,11 @@ class PictureData:
     root: bool = False
 
     def png(self, exposure: float = 1.0, effort: int = 9) -> bytes:
-        """The picture as a PNG file.
+        """Encode the picture as a PNG file.
 
         Args:
-            exposure: a further factor of linear RGB; numbers do not know it.
-            effort: of compression, 0 to 9.
+            exposure: a further factor of linear RGB; it does not apply to numbers.
+            effort: level of compression, 0 to 9.
         """
         shown = reduced(self.values, _LARGEST)
         if self.map:
@@ -102,30 +102,33 @@ class PictureData:
 
 
 def inline(picture: PictureData) -> str:
-    """The picture as a data URI, for a page that is complete in itself."""
+    """Return the picture as a data URI, for a self-contained page."""
     return f"data:image/png;base64,{base64.b64encode(picture.png()).decode('ascii')}"
 
 
 @dataclass(frozen=True)
 class PictureEncoder:
-    """Makes pictures for a page.
+    """An encoder of pictures for a page.
 
     Attributes:
-        source: what an `img` element takes for a picture: the data itself (`inline`), or where it is served.
+        source: the function from a picture to the `src` of its `img` element: the data itself (`inline`), or the address of the picture.
     """
 
     source: Callable[[PictureData], str] = field(default=inline)
 
     def colour(self, linear: np.ndarray, factor: float, alt: str) -> Picture:
-        """(H, W, 3) linear RGB, times the exposure `factor`, in sRGB."""
+        """Encode (H, W, 3) linear RGB, multiplied by the exposure `factor`, in sRGB."""
         return self._picture(PictureData(linear, factor), alt)
 
     def false_colour(self, values: np.ndarray, low: float, high: float, name: str, alt: str) -> Picture:
-        """(H, W) values from `low` to `high` in the colours of the map `name`."""
+        """Encode (H, W) values from `low` to `high` by the colour map `name`."""
         return self._picture(PictureData(values, 1.0, low, high, name), alt)
 
     def error(self, error: np.ndarray, high: float, alt: str) -> Picture:
-        """(H, W) errors from 0 to `high`, the colour by the square root, so that a tenth of `high` is still seen."""
+        """Encode (H, W) errors from 0 to `high`.
+
+        The colour scale uses the square root of the error, so that a tenth of `high` remains visible.
+        """
         return self._picture(PictureData(error, 1.0, 0.0, high, ERROR_COLORMAP, True), alt)
 
     def _picture(self, picture: PictureData, alt: str) -> Picture:
@@ -134,17 +137,17 @@ class PictureEncoder:
 
 
 INLINE = PictureEncoder()
-"""Makes pictures that are part of the page."""
+"""The encoder of pictures that are part of the page."""
 
 
 @dataclass(frozen=True)
 class ColourBar:
-    """What the colours of a false-colour picture mean.
+    """The legend of a false-colour picture.
 
     Attributes:
-        colours: hexadecimal, from low to high.
-        low, middle, high: the values at the ends and half-way between; beyond the ends the colour stays.
-        label: what is shown.
+        colours: hexadecimal colours, from low to high.
+        low, middle, high: values at the ends and in the middle; values beyond the ends have the colour of the nearer end.
+        label: name of the quantity.
     """
 
     colours: tuple[str, ...]
@@ -155,7 +158,7 @@ class ColourBar:
 
 
 def apply_colormap(values: np.ndarray, low: float, high: float, name: str) -> np.ndarray:
-    """Values from `low` to `high` through the colour map `name`: (H, W) -> (H, W, 3) in [0, 1]."""
+    """Map values from `low` to `high` to colours of the colour map `name`: (H, W) -> (H, W, 3) in [0, 1]."""
     import matplotlib
 
     span = high - low
@@ -164,12 +167,12 @@ def apply_colormap(values: np.ndarray, low: float, high: float, name: str) -> np
 
 
 def error_bar(high: float) -> ColourBar:
-    """The legend of `PictureEncoder.error`."""
+    """Return the legend of `PictureEncoder.error`."""
     return replace(colour_bar(0.0, high, ERROR_COLORMAP, "Mean |difference| over channels"), middle=high / 4)
 
 
 def colour_bar(low: float, high: float, name: str, label: str) -> ColourBar:
-    """The legend of `PictureEncoder.false_colour` with the same arguments."""
+    """Return the legend of `PictureEncoder.false_colour` with the same arguments."""
     import matplotlib
 
     stops = (matplotlib.colormaps[name](np.linspace(0.0, 1.0, 9))[:, :3] * 255 + 0.5).astype(int)
@@ -177,13 +180,16 @@ def colour_bar(low: float, high: float, name: str, label: str) -> ColourBar:
 
 
 def absolute_error(shown: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """|shown - reference|, its mean over channels: (H, W, C) -> (H, W)."""
+    """Return the mean of |shown - reference| over the channels: (H, W, C) -> (H, W)."""
     with np.errstate(over="ignore", invalid="ignore"):
         return np.mean(np.abs(shown - reference), axis=-1)
 
 
 def colour_limit(error: np.ndarray) -> float:
-    """The end of an error's colour scale: its 99th percentile (its maximum where that is 0)."""
+    """Return the upper end of the colour scale of an error.
+
+    It is the 99th percentile of the finite values; their maximum where that is 0; 1 where both are 0 or no value is finite.
+    """
     finite = error[np.isfinite(error)]
     if finite.size == 0:
         return 1.0
