@@ -1,1 +1,1 @@
-"""The result taken home: a scene folder that plain Mitsuba loads, and the recovered maps alone."""
+"""Export of results: a scene folder that plain Mitsuba loads, files for other programs, and the recovered maps alone."""

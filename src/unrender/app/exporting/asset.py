@@ -1,7 +1,7 @@
-"""What other programs can take of a scene: meshes with their materials, the light around them, the cameras.
+"""The content of a scene that other programs can import: meshes with their materials, the environment map, the cameras.
 
-Texture coordinates are Mitsuba's: (0, 0) is the upper left corner of a picture, v grows downwards, as in glTF. The world is Mitsuba's,
-right-handed; nothing is turned.
+Texture coordinates are those of Mitsuba: (0, 0) is the upper left corner of a picture and v points downwards, as in glTF. The world
+space is that of Mitsuba, right-handed, without a rotation.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class Part:
     """A mesh and its material.
 
     Attributes:
-        name: of the shape; no two parts share one.
-        vertices: (V, 3) float32, in the world.
-        faces: (F, 3) uint32, counter-clockwise seen from the side that the normals point to.
-        normals: (V, 3) float32, unit; None where faces are flat.
-        uv: (V, 2) float32; None where there are none.
-        material: see there.
+        name: unique name of the shape.
+        vertices: (V, 3) float32, in world space.
+        faces: (F, 3) uint32, counter-clockwise seen from the side of the normals.
+        normals: (V, 3) float32 unit vectors; None for flat shading.
+        uv: (V, 2) float32; None without texture coordinates.
+        material: the material.
     """
 
     name: str
@@ -68,14 +68,14 @@ class Camera:
 
 @dataclass(frozen=True)
 class Asset:
-    """See the module.
+    """The exportable content of a scene.
 
     Attributes:
-        parts: at least one.
-        environment: (H, W, 3) float32 radiance as `mitsuba.Emitter` envmap has it in a file; None where there is none.
-        environment_to_world: (3, 3), from the map's axes to the world's.
-        cameras: of the scene, in its order.
-        notices: one line for each thing that is not carried over.
+        parts: the meshes, at least one.
+        environment: (H, W, 3) float32 radiance, in the layout of the file of a `mitsuba.Emitter` envmap; None without an environment map.
+        environment_to_world: (3, 3) rotation from the axes of the map to those of the world.
+        cameras: the cameras of the scene, in its order.
+        notices: one line for each part of the scene that is not exported.
     """
 
     parts: tuple[Part, ...]
@@ -86,10 +86,10 @@ class Asset:
 
 
 def read(path: Path) -> Asset:
-    """The asset of a scene file.
+    """Return the asset of a scene file.
 
     Raises:
-        InputError: no mesh is in it, a material has maps but its mesh no texture coordinates, or a map is too large.
+        InputError: the scene has no mesh, a material has maps but its mesh no texture coordinates, or a map is too large.
     """
     scene: Any = load(path)
     notices: list[str] = []
@@ -117,7 +117,7 @@ def _part(shape: Any, notices: list[str]) -> Part | None:
         raise InputError(f"asset: {name} has maps but no texture coordinates; unwrap its mesh first")
     if uv is not None and material.to_uv is not None:
         uv = (uv @ material.to_uv[:2, :2].T + material.to_uv[:2, 2]).astype(np.float32)
-    if normals is not None:  # a mirrored to_world turns the winding, but not the normals
+    if normals is not None:  # a mirrored to_world reverses the winding, but not the normals
         corners = vertices[faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         if np.sum(across * normals[faces].sum(1)) < 0:
@@ -126,30 +126,37 @@ def _part(shape: Any, notices: list[str]) -> Part | None:
 
 
 def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Vertices, faces, normals, texture coordinates."""
-    found: Any = mesh_layout.traverse(shape)
-    if mesh_layout.POSITIONS not in found:  # a rectangle, whose mesh is made when it is rendered
+    """Return vertices, faces, normals and texture coordinates of a shape."""
+    parameters: Any = mesh_layout.traverse(shape)
+    if mesh_layout.POSITIONS not in parameters:  # a rectangle, whose mesh is made when it is rendered
         corners = np.array([[-1.0, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1], [-1, 1, 0, 1]])
-        vertices = corners @ np.array(found["to_world"].matrix, float).reshape(4, 4).T
+        vertices = corners @ np.array(parameters["to_world"].matrix, float).reshape(4, 4).T
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
         return vertices[:, :3].astype(np.float32), np.array([[0, 1, 2], [0, 2, 3]], np.uint32), None, uv
     vertices = np.array(mesh_layout.vertex_positions(shape), np.float32).reshape(-1, 3)
-    faces = np.array(found[mesh_layout.FACES], np.uint32).reshape(-1, 3)
+    faces = np.array(parameters[mesh_layout.FACES], np.uint32).reshape(-1, 3)
     normals = (
-        np.array(found[mesh_layout.NORMALS], np.float32).reshape(-1, 3) if mesh_layout.has_normals(shape) else None
+        np.array(parameters[mesh_layout.NORMALS], np.float32).reshape(-1, 3) if mesh_layout.has_normals(shape) else None
     )
     if normals is not None:
         normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
-    uv = np.array(found[mesh_layout.TEXCOORDS], np.float32).reshape(-1, 2) if mesh_layout.has_texcoords(shape) else None
+    uv = (
+        np.array(parameters[mesh_layout.TEXCOORDS], np.float32).reshape(-1, 2)
+        if mesh_layout.has_texcoords(shape)
+        else None
+    )
     return vertices, faces, None if shape.has_face_normals() else normals, uv
 
 
 def read_environment(scene: Any, notices: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
-    """The light all around a live scene, as in `Asset`; adds a line for each light that is none. Raises `InputError` where too large.
+    """Return the environment map of a live scene and its rotation, as in `Asset`; add a notice for each light that is not exported.
 
-    That of a turntable is as the first camera had it.
+    The map of a turntable has its orientation at the first camera.
+
+    Raises:
+        InputError: the map is too large.
     """
-    found, turned = None, np.eye(3)
+    environment, to_world = None, np.eye(3)
     for emitter in scene.emitters():
         before = np.eye(3)
         if turntable_light.is_turntable(emitter):
@@ -159,14 +166,14 @@ def read_environment(scene: Any, notices: list[str]) -> tuple[np.ndarray | None,
         if emitter.class_name() == "EnvironmentMapEmitter":
             pixels = np.array(values["data"])[:, 1:-1, :3]  # without the columns that Mitsuba repeats
             check_size("environment map", pixels)
-            found = np.ascontiguousarray(pixels * float(np.array(values["scale"]).ravel()[0]), np.float32)
-            turned = before @ np.array(values["to_world"].matrix, float).reshape(4, 4)[:3, :3]
+            environment = np.ascontiguousarray(pixels * float(np.array(values["scale"]).ravel()[0]), np.float32)
+            to_world = before @ np.array(values["to_world"].matrix, float).reshape(4, 4)[:3, :3]
         elif emitter.class_name() == "ConstantBackgroundEmitter" and "radiance.value" in values:
             radiance = np.broadcast_to(np.array(values["radiance.value"], np.float32).ravel(), (3,))
-            found = np.broadcast_to(radiance, (*_CONSTANT_SIZE, 3)).copy()
-        elif emitter.class_name() != "AreaLight":  # of which its shape tells
+            environment = np.broadcast_to(radiance, (*_CONSTANT_SIZE, 3)).copy()
+        elif emitter.class_name() != "AreaLight":  # exported with its shape
             notices.append(f"{emitter.id() or 'light'}: a {emitter.class_name()} is not carried over")
-    return found, turned
+    return environment, to_world
 
 
 def _camera(sensor: Any, notices: list[str]) -> Camera | None:
@@ -195,10 +202,10 @@ def _with_different_names(parts: Sequence[Part]) -> tuple[Part, ...]:
     from unrender.app.exporting.ready_made import file_name
 
     taken: set[str] = set()
-    found = []
+    renamed = []
     for index, part in enumerate(parts):
         name = file_name(part.name)
         name = f"{name}-{index}" if name in taken or not part.name else name
         taken.add(name)
-        found.append(replace(part, name=name))
-    return tuple(found)
+        renamed.append(replace(part, name=name))
+    return tuple(renamed)

@@ -1,4 +1,4 @@
-"""A script that opens an exported asset in Blender as Mitsuba shows it: mesh, maps, light, cameras."""
+"""A Blender script that reproduces the appearance of an exported asset in Mitsuba: meshes, maps, light, cameras."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 
 SCRIPT = "open_in_blender.py"
 _TEMPLATE, _PLACE = "open_in_blender.py.txt", '"SETTINGS"'
-# glTF's and Mitsuba's y is up, Blender's z is: its importer takes (x, y, z) to (x, -z, y).
+# The y axis points up in glTF and Mitsuba, the z axis in Blender: its importer maps (x, y, z) to (x, -z, y).
 _TO_BLENDER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-# Mitsuba looks a direction (x, y, z) up at u = atan2(x, -z) / 2π, Blender (x, -z, y) at u = 1/2 - atan2(-z, x) / 2π: a quarter more.
+# The map coordinate of a direction (x, y, z) is u = atan2(x, -z) / 2π in Mitsuba, and that of (x, -z, y) is u = 1/2 - atan2(-z, x) / 2π
+# in Blender: a quarter more.
 _QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
 
 def write(asset: Asset, folder: Path) -> None:
-    """Write the script beside asset.glb and environment.exr."""
+    """Write the script to the folder of asset.glb and environment.exr."""
     template = resources.files("unrender.app.exporting").joinpath(_TEMPLATE).read_text(encoding="utf-8")
     text = json.dumps(settings(asset), indent=1, allow_nan=False)
     (folder / SCRIPT).write_text(template.replace(_PLACE, f"json.loads({text!r})"), encoding="utf-8")
 
 
 def settings(asset: Asset) -> dict[str, Any]:
-    """What the script sets: cameras with Blender's matrices, lens shifts in widths, and the rotation of directions before the light's
-    picture is looked up."""
+    """Return the settings of the script: cameras, with the matrices of Blender and lens shifts in units of the sensor width, and the
+    rotation of directions before the look-up in the environment map."""
     to_light = _QUARTER @ _TO_BLENDER @ np.linalg.inv(asset.environment_to_world) @ _TO_BLENDER.T
     return {
         "environment": None if asset.environment is None else "environment.exr",

@@ -16,10 +16,10 @@ from unrender.io import mesh_files
 
 
 def write_obj(asset: Asset, folder: Path) -> None:
-    """asset.obj, asset.mtl and their maps.
+    """Write asset.obj, asset.mtl and their maps.
 
-    MTL has `map_Kd` (base colour, sRGB), `map_Pr` and `map_Pm` (roughness and metallic, linear) and `norm` of the format's extension for
-    physically based rendering; constants as `Kd`, `Pr`, `Pm`, `Ni`.
+    MTL contains `map_Kd` (base colour, sRGB), `map_Pr` and `map_Pm` (roughness and metallic, linear) and `norm`, from the extension of
+    the format for physically based rendering; constants are `Kd`, `Pr`, `Pm` and `Ni`.
     """
     lines, materials = ["# written by unrender", "mtllib asset.mtl"], ["# written by unrender"]
     first = np.zeros(3, int)
@@ -39,7 +39,7 @@ def write_obj(asset: Asset, folder: Path) -> None:
 
 
 def write_ply(asset: Asset, folder: Path) -> None:
-    """NAME.ply for each part, binary, with normals and s, t where it has them, and its maps as PNG files."""
+    """Write a binary NAME.ply for each part, with its normals and s, t, and its maps as PNG files."""
     for part in asset.parts:
         content = mesh_files.ply(part.vertices, part.faces, part.normals, part.uv)
         (folder / f"{part.name}.ply").write_bytes(content)
@@ -47,7 +47,8 @@ def write_ply(asset: Asset, folder: Path) -> None:
 
 
 def _faces(part: Part, first: np.ndarray) -> list[str]:
-    """Faces that name vertex, texture coordinate and normal, of which `first` are written already."""
+    """Return the lines of faces, with indices of vertices, texture coordinates and normals; `first` are the counts that precede this
+    part."""
     place = [0, None if part.uv is None else 1, None if part.normals is None else 2]
     start = [None if i is None else int(first[i]) + 1 for i in place]
 
@@ -58,29 +59,29 @@ def _faces(part: Part, first: np.ndarray) -> list[str]:
 
 
 def _maps(part: Part, folder: Path) -> dict[str, str]:
-    """Write the maps of a part, those that are no constants: {what: file name}."""
-    given = part.material
+    """Write the maps of a part that are not constant; return {map: file name}."""
+    material = part.material
     pixels = {
-        "base-colour": textures.base_colour(part) if given.base_colour.ndim == 3 else None,
-        "roughness": textures.grey(given.roughness) if given.roughness.ndim else None,
-        "metallic": textures.grey(given.metallic) if given.metallic.ndim else None,
+        "base-colour": textures.base_colour(part) if material.base_colour.ndim == 3 else None,
+        "roughness": textures.grey(material.roughness) if material.roughness.ndim else None,
+        "metallic": textures.grey(material.metallic) if material.metallic.ndim else None,
         "normal": textures.normal_map(part),
     }
-    found = {what: f"{part.name}-{what}.png" for what, picture in pixels.items() if picture is not None}
-    for what, name in found.items():
+    names = {what: f"{part.name}-{what}.png" for what, picture in pixels.items() if picture is not None}
+    for what, name in names.items():
         picture = pixels[what]
         if picture is not None:
             (folder / name).write_bytes(textures.png(picture))
-    return found
+    return names
 
 
 def _material(part: Part, folder: Path) -> list[str]:
-    given, maps = part.material, _maps(part, folder)
-    colour = [1.0] * 3 if "base-colour" in maps else given.base_colour.tolist()
+    material, maps = part.material, _maps(part, folder)
+    colour = [1.0] * 3 if "base-colour" in maps else material.base_colour.tolist()
     lines = [f"newmtl {part.name}", "Kd " + " ".join(f"{x:.6g}" for x in colour)]
-    lines += [f"Pr {float(given.roughness):.6g}"] if not given.roughness.ndim else []
-    lines += [f"Pm {float(given.metallic):.6g}"] if not given.metallic.ndim else []
-    lines += [f"Ni {given.ior:.6g}", "illum 2"] if given.ior > 1 else ["Ks 0 0 0", "illum 1"]
+    lines += [f"Pr {float(material.roughness):.6g}"] if not material.roughness.ndim else []
+    lines += [f"Pm {float(material.metallic):.6g}"] if not material.metallic.ndim else []
+    lines += [f"Ni {material.ior:.6g}", "illum 2"] if material.ior > 1 else ["Ks 0 0 0", "illum 1"]
     names = {"base-colour": "map_Kd", "roughness": "map_Pr", "metallic": "map_Pm", "normal": "norm"}
     return lines + [f"{names[what]} {name}" for what, name in maps.items()]
 
@@ -90,13 +91,13 @@ MITSUBA = "mitsuba"
 
 @dataclass(frozen=True)
 class Format:
-    """What a format writes.
+    """A format and its files.
 
     Attributes:
-        write: given the asset and the folder.
-        files: the names in the folder, besides those of the formats that it needs.
+        write: the function from the asset and the folder that writes the files.
+        files: the names in the folder, without those of the formats in `needs`.
         needs: formats that are written with it.
-        check_installed: raises `InputError` where a package is missing.
+        check_installed: the function that raises `InputError` if a package is missing.
     """
 
     write: Callable[[Asset, Path], None]
@@ -134,25 +135,29 @@ FORMATS = {
     "blender": Format(blender.write, (blender.SCRIPT,), ("glb", "environment"), gltf.check_installed),
     "usd": Format(usd.write, (usd.FILE,), check_installed=usd.check_installed),
 }
-"""All but Mitsuba's own."""
+"""The formats except that of Mitsuba."""
 OWN = frozenset(name for known in FORMATS.values() for name in known.files)
 
 
 def check(formats: Sequence[str]) -> tuple[str, ...]:
-    """The formats to write, with those that they need, each once. Raises `InputError` for unknown ones and missing packages."""
+    """Return the formats to write, with those that they need, each once.
+
+    Raises:
+        InputError: an unknown format, or a missing package.
+    """
     known = (MITSUBA, *FORMATS)
     for name in formats:
         if name not in known:
             raise InputError(f"--format {name}: expected {', '.join(known)}{did_you_mean(name, known)}")
     if not formats:
         raise InputError(f"--format: expected one or more of {', '.join(known)}")
-    found = dict.fromkeys(
+    selected = dict.fromkeys(
         each for name in formats for each in (*(FORMATS[name].needs if name in FORMATS else ()), name)
     )
-    for name in found:
+    for name in selected:
         if name in FORMATS:
             FORMATS[name].check_installed()
-    return tuple(found)
+    return tuple(selected)
 
 
 def write(asset: Asset, folder: Path, formats: Sequence[str]) -> list[str]:

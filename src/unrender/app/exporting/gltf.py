@@ -27,13 +27,17 @@ _ROUNDING = 1e-4
 
 
 def check_installed() -> None:
-    """Raise `InputError` where the package that writes glTF is missing."""
+    """Raise `InputError` if the package that writes glTF is missing."""
     if importlib.util.find_spec("pygltflib") is None:
         raise InputError("--format glb needs pygltflib: pip install 'unrender[capture]'")
 
 
 def glb(asset: Asset) -> bytes:
-    """The parts of an asset as a .glb file; light and cameras are not in it. Raises `InputError` where pygltflib is missing."""
+    """Return the parts of an asset as a .glb file, without light and cameras.
+
+    Raises:
+        InputError: pygltflib is missing.
+    """
     check_installed()
     import pygltflib
 
@@ -44,14 +48,14 @@ def glb(asset: Asset) -> bytes:
 
 
 class _Writer:
-    """Collects what goes into the binary part, and refers to it."""
+    """A writer that collects the arrays and images of the binary chunk and refers to them from the glTF document."""
 
     def __init__(self, gltf: pygltflib.GLTF2):
         self._gltf: Any = gltf
         self._blob = bytearray()
 
     def add(self, part: Part) -> None:
-        """A node, its mesh and its material."""
+        """Add a node with its mesh and its material."""
         import pygltflib as kit
 
         attributes = kit.Attributes(POSITION=self._array(part.vertices, _FLOAT, _VERTICES, bounds=True))
@@ -65,7 +69,7 @@ class _Writer:
         self._gltf.nodes.append(kit.Node(name=part.name, mesh=len(self._gltf.meshes) - 1))
 
     def finish(self) -> bytes:
-        """The file."""
+        """Return the content of the file."""
         import pygltflib as kit
 
         self._gltf.scenes = [kit.Scene(nodes=list(range(len(self._gltf.nodes))))]
@@ -110,28 +114,28 @@ class _Writer:
     def _material(self, part: Part) -> int:
         import pygltflib as kit
 
-        given = part.material
+        source = part.material
         model = kit.PbrMetallicRoughness(baseColorFactor=[1.0] * 4, roughnessFactor=1.0, metallicFactor=1.0)
-        if given.base_colour.ndim == 3:
+        if source.base_colour.ndim == 3:
             index = self._texture(textures.base_colour(part), part, "base colour")
             model.baseColorTexture = kit.TextureInfo(index=index)
         else:
-            model.baseColorFactor = [*map(float, given.base_colour), 1.0]
-        if given.roughness.ndim or given.metallic.ndim:
+            model.baseColorFactor = [*map(float, source.base_colour), 1.0]
+        if source.roughness.ndim or source.metallic.ndim:
             index = self._texture(textures.metallic_roughness(part), part, "metallic roughness")
             model.metallicRoughnessTexture = kit.TextureInfo(index=index)
         else:
-            model.roughnessFactor, model.metallicFactor = float(given.roughness), float(given.metallic)
-        material = kit.Material(name=part.name, pbrMetallicRoughness=model, doubleSided=given.two_sided)
-        material.alphaCutoff = None  # which pygltflib writes though alphaMode is OPAQUE
+            model.roughnessFactor, model.metallicFactor = float(source.roughness), float(source.metallic)
+        material = kit.Material(name=part.name, pbrMetallicRoughness=model, doubleSided=source.two_sided)
+        material.alphaCutoff = None  # pygltflib would write it although alphaMode is OPAQUE
         if (normals := textures.normal_map(part)) is not None:
             material.normalTexture = kit.NormalMaterialTexture(index=self._texture(normals, part, "normal map"))
-        self._extend(material, given.ior)
+        self._extend(material, source.ior)
         self._gltf.materials.append(material)
         return len(self._gltf.materials) - 1
 
     def _extend(self, material: Any, ior: float) -> None:
-        """An index of refraction other than 1.5, by Khronos's extensions: a viewer that does not know them shows 1.5."""
+        """Add an index of refraction other than 1.5 by Khronos's extensions; viewers without them use 1.5."""
         if abs(ior - _USUAL_IOR) < _ROUNDING:
             return
         name, value = (

@@ -1,7 +1,7 @@
-"""A scene's description as a graph of plugins: found by parameter, changed, written as XML.
+"""The description of a scene as a graph of plugins: look-up by parameter, changes, output as XML.
 
-Mitsuba's parser makes the graph from a dictionary and from XML alike, and writes it. What it does not write are the names of plugins to
-which nothing refers; without those no parameter could be named again.
+Mitsuba's parser makes the graph from a dictionary or from XML, and writes it as XML. It does not write the ids of plugins without
+references; these ids are added here, since the keys of parameters contain them.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _Kind = mi.Properties.Type
 
 @dataclass(frozen=True)
 class Place:
-    """Where the description holds a parameter.
+    """The place of a parameter in the description.
 
     Attributes:
         node: index of the plugin.
         path: the names below it, such as ("reflectance", "value").
         owner: the live object of that plugin.
-        key: of the parameter in `SceneGraph.live`.
+        key: key of the parameter in `SceneGraph.live`.
     """
 
     node: int
@@ -44,32 +44,32 @@ class Place:
 
 
 class SceneGraph:
-    """A description, and a live scene made of it whose objects tell which plugin they come from.
+    """A description, and a live scene made from it whose objects identify their plugins.
 
     Args:
         description: an XML file, or a dictionary without ready-made objects.
 
     Attributes:
-        nodes: `mitsuba.parser.SceneNode`, to be changed.
-        names: the id of each node, as given.
+        nodes: mutable `mitsuba.parser.SceneNode` objects.
+        names: the original id of each node.
         live: `mitsuba.SceneParameters` of the live scene.
     """
 
     def __init__(self, description: Path | Mapping[str, Any]):
         try:
             self._state = parse(description).state
-            lively = parse(description)  # which is used up
+            lively = parse(description)  # the instantiation consumes it
             for index, node in enumerate(lively.state.nodes):
                 node.props.set_id(f"n{index}")
             self._scene: Any = lively.instantiate()
         except Exception as error:
             raise InputError(f"scene: its description cannot be read: {' '.join(str(error).split())[:400]}") from error
         self.nodes: Any = self._state.nodes
-        for emitter in self._scene.emitters():  # of plugins in Python, the parser does not know of what kind they are
+        for emitter in self._scene.emitters():  # the parser does not know the object type of plugins in Python
             if (label := _LABEL.fullmatch(emitter.id())) and self.nodes[int(label[1])].type == mi.ObjectType.Unknown:
                 self.nodes[int(label[1])].type = mi.ObjectType.Emitter
         self.names = [node.props.id() for node in self.nodes]
-        self.live = ObjectGraph(self._scene).parameters()  # named as a problem's parameters are
+        self.live = ObjectGraph(self._scene).parameters()  # the same keys as the parameters of a problem
 
     @property
     def root(self) -> Any:
@@ -77,12 +77,12 @@ class SceneGraph:
         return self.nodes[0].props
 
     def children(self, index: int) -> dict[str, int]:
-        """The nodes that a node holds, by property."""
+        """Return {property: index} of the children of a node."""
         props = self.nodes[index].props
         return {name: props[name].index() for name in props.keys() if props.type(name) == _Kind.ResolvedReference}  # noqa: SIM118
 
     def add(self, parent: int, name: str, kind: Any, plugin: str) -> int:
-        """A new plugin as the property `name` of `parent`: its index."""
+        """Add a plugin as the property `name` of `parent`; return its index."""
         node = mi.parser.SceneNode()
         node.type, node.props = kind, mi.Properties(plugin)
         self.nodes.append(node)
@@ -91,46 +91,46 @@ class SceneGraph:
         return len(self.nodes) - 1
 
     def replace(self, index: int, plugin: str) -> Any:
-        """The properties of a node, emptied, now of another plugin."""
+        """Replace the plugin of a node; return its properties, which are empty."""
         self.nodes[index].props = mi.Properties(plugin)
         return self.nodes[index].props
 
     def child(self, parent: int, kind: Any, plugin: str) -> Any:
-        """The properties of the child of that kind of object, emptied, of that plugin; a new one where there is none."""
+        """Replace the child of that object type by the plugin, or add it; return its properties, which are empty."""
         index = self.descendant(parent, kind)
         if index is None:
             return self.nodes[self.add(parent, plugin, kind, plugin)].props
         return self.replace(index, plugin)
 
     def descendant(self, parent: int, *kinds: Any) -> int | None:
-        """The child of a kind of object, its child of the next kind, and so on; None where one is missing."""
-        found: int | None = parent
+        """Return the child of the first object type, its child of the next type, and so on; None if one is missing."""
+        index: int | None = parent
         for kind in kinds:
-            if found is not None:
-                found = next((i for i in self.children(found).values() if self.nodes[i].type == kind), None)
-        return found
+            if index is not None:
+                index = next((i for i in self.children(index).values() if self.nodes[i].type == kind), None)
+        return index
 
     def of(self, kind: Any) -> list[int]:
-        """The children of the scene that are of a kind of object."""
+        """Return the children of the scene that have the object type `kind`."""
         return [index for index in self.children(0).values() if self.nodes[index].type == kind]
 
     def used(self) -> set[int]:
-        """The nodes that the scene holds, however deep."""
-        found: set[int] = set()
+        """Return all nodes that are reachable from the scene."""
+        reachable: set[int] = set()
         waiting = [0]
         while waiting:
             index = waiting.pop()
-            if index not in found:
-                found.add(index)
+            if index not in reachable:
+                reachable.add(index)
                 waiting += self.children(index).values()
-        return found
+        return reachable
 
     def sensors(self) -> list[Any]:
-        """Of the live scene; their ids tell their nodes, n0 to nN."""
+        """Return the sensors of the live scene; their ids are n0 to nN, after their nodes."""
         return list(self._scene.sensors())
 
     def places(self, scene: Any) -> dict[str, Place]:
-        """Where each parameter of `scene` (`mitsuba.SceneParameters`), made of the same description, is held, by its key."""
+        """Return {key: place} of all parameters of `scene` (`mitsuba.SceneParameters`), which was made from the same description."""
         if [key.rpartition(".")[2] for key in scene.properties] != [
             key.rpartition(".")[2] for key in self.live.properties
         ]:
@@ -149,14 +149,14 @@ class SceneGraph:
         node, path = int(label[1]) if label else 0, tuple(parts[-depth:])
         while len(path) > 1 and path[0] in (
             children := self.children(node)
-        ):  # a texture, whose object does not tell its id
+        ):  # the object of a texture does not have its id
             node, path = children[path[0]], path[1:]
         return Place(node, path, owner, key)
 
     # ------------------------------------------------------------------ writing
 
     def xml(self) -> bytes:
-        """The description as Mitsuba's XML."""
+        """Return the description as Mitsuba's XML."""
         for index, node in enumerate(self.nodes):
             node.props.set_id(f"n{index}")
             node.props[_MARK] = str(index)
@@ -180,7 +180,7 @@ class SceneGraph:
         return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
 
     def _final_names(self, root: ElementTree.Element, elements: Mapping[int, ElementTree.Element]) -> dict[int, str]:
-        """The names that plugins keep: of the scene's own parts, of what is referred to, and those given on purpose."""
+        """Return the ids that plugins have in the XML: those of direct children of the scene, of referenced plugins, and explicit ones."""
         referred = {int(str(reference.get("id"))[1:]) for reference in root.iter("ref")}
         own = set(self.children(0).values())
         taken: Counter[str] = Counter()

@@ -1,8 +1,8 @@
-"""Materials that other programs know: base colour, roughness, metallic, normal map.
+"""Materials in the model of other programs: base colour, roughness, metallic, normal map.
 
 Mitsuba's `principled`, glTF's metallic-roughness model and Blender's Principled BSDF share roughness (α = roughness², B. Burley,
-"Physically based shading at Disney", 2012), base colour, metallic and an index of refraction. They differ in the diffuse lobe: Mitsuba's
-is Burley's, theirs Lambert's.
+"Physically based shading at Disney", 2012), base colour, metallic and an index of refraction. They differ in the diffuse lobe: that of
+Mitsuba is Burley's, that of the others Lambert's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from unrender.core.errors import InputError
 from unrender.io.images import luminance
 
 MOST_TEXELS = 8192
-"""Along a side of a map: what graphics cards and browsers take."""
+"""Limit of the width and height of a map in graphics cards and browsers."""
 _WRAPPERS = {"TwoSidedBRDF": "brdf_0.", "NormalMap": "nested_bsdf."}
 _LEFT_OUT = ("anisotropic", "sheen", "clearcoat", "spec_trans", "spec_tint", "flatness")
 _GREY = 0.5
@@ -27,14 +27,14 @@ _DIFFUSE = "SmoothDiffuse"
 
 @dataclass(frozen=True)
 class Material:
-    """What is carried over of a material.
+    """The exported part of a material.
 
     Attributes:
         base_colour: linear, (3,) or (H, W, 3).
         roughness, metallic: in [0, 1], () or (H, W).
-        normal_map: (H, W, 3) in [0, 1], 0.5 + 0.5 n with n in the frame of ∂p/∂u and the shading normal; None where there is none.
-        ior: index of refraction of the dielectric part; 1 where there is no specular reflection.
-        two_sided: whether it is seen from behind, too.
+        normal_map: (H, W, 3) in [0, 1], 0.5 + 0.5 n with n in the frame of ∂p/∂u and the shading normal; None without a normal map.
+        ior: index of refraction of the dielectric part; 1 without specular reflection.
+        two_sided: whether the back is visible, too.
         to_uv: (3, 3), applied to texture coordinates before a look-up; None for the identity.
     """
 
@@ -58,7 +58,11 @@ class Material:
 
 
 def read_material(bsdf: Any) -> tuple[Material, list[str]]:
-    """The material of a live BSDF, and a line for each thing of it that is not carried over. Raises `InputError` for maps too large."""
+    """Return the material of a live BSDF, and a line for each property that is not exported.
+
+    Raises:
+        InputError: a map is too large.
+    """
     values: Any = mi.traverse(bsdf)
     notes: list[str] = []
     kinds = {bsdf.class_name()} | {node.class_name() for node in values.hierarchy if isinstance(node, mi.BSDF)}
@@ -76,18 +80,18 @@ def read_material(bsdf: Any) -> tuple[Material, list[str]]:
         return grey, notes
     names = {"base_colour": "reflectance"} if kind == _DIFFUSE else _PRINCIPLED
     maps |= {ours: f"{prefix}{theirs}" for ours, theirs in names.items()}
-    found = {ours: _value(values, key, notes) for ours, key in maps.items()}
+    values_by_name = {ours: _value(values, key, notes) for ours, key in maps.items()}
     to_uv = _to_uv(values, maps.values())
     if kind == "Principled":
         left_out = [name for name in _LEFT_OUT if _is_used(values, f"{prefix}{name}")]
         notes += [f"{', '.join(left_out)}: not carried over"] if left_out else []
-    normal = found.get("normal_map")
+    normal = values_by_name.get("normal_map")
     if normal is not None and normal.ndim != 3:
         normal = None
     return Material(
-        _colour(found["base_colour"], _GREY, notes),
-        _number(found.get("roughness"), 1.0 if kind == _DIFFUSE else 0.5),
-        _number(found.get("metallic"), 0.0),
+        _colour(values_by_name["base_colour"], _GREY, notes),
+        _number(values_by_name.get("roughness"), 1.0 if kind == _DIFFUSE else 0.5),
+        _number(values_by_name.get("metallic"), 0.0),
         None if normal is None else np.clip(normal, 0, 1),
         1.0 if kind == _DIFFUSE else _ior(values, prefix),
         two_sided,
@@ -99,47 +103,47 @@ _PRINCIPLED = {"base_colour": "base_color", "roughness": "roughness", "metallic"
 
 
 def _kind_at(values: Any, bsdf: Any, prefix: str) -> str:
-    """The class of the material below a bsdf that keys with a prefix belong to."""
-    found = bsdf
+    """Return the class name of the nested BSDF that owns the keys with a prefix."""
+    material = bsdf
     for _ in range(prefix.count(".")):
-        inner = [node for node, (parent, *_) in values.hierarchy.items() if parent is not None and parent == found]
-        found = next((node for node in inner if isinstance(node, mi.BSDF)), found)
-    return found.class_name()
+        inner = [node for node, (parent, *_) in values.hierarchy.items() if parent is not None and parent == material]
+        material = next((node for node in inner if isinstance(node, mi.BSDF)), material)
+    return material.class_name()
 
 
 def _value(values: Any, key: str, notes: list[str]) -> np.ndarray | None:
-    """A parameter that is a map (H, W, C), a colour (3,) or a number (1,); None where it is none of these."""
+    """Return a parameter that is a map (H, W, C), a colour (3,) or a number (1,); None for other parameters."""
     for end in ("data", "value"):
         if f"{key}.{end}" in values:
-            found = np.array(values[f"{key}.{end}"], np.float32)
+            value = np.array(values[f"{key}.{end}"], np.float32)
             if end == "data":
-                check_size(key.rpartition(".")[2], found)
-                return found if found.ndim == 3 else found[..., None]
-            return found.ravel()
+                check_size(key.rpartition(".")[2], value)
+                return value if value.ndim == 3 else value[..., None]
+            return value.ravel()
     name = key.rpartition(".")[2]
     if name != "metallic":
         notes.append(f"{name}: neither a bitmap nor a constant, not carried over")
     return None
 
 
-def _colour(found: np.ndarray | None, default: float, notes: list[str]) -> np.ndarray:
-    if found is None:
+def _colour(value: np.ndarray | None, default: float, notes: list[str]) -> np.ndarray:
+    if value is None:
         return np.full(3, default, np.float32)
-    colour = found[..., :3] if found.shape[-1] >= 3 else np.repeat(found[..., :1], 3, -1)
+    colour = value[..., :3] if value.shape[-1] >= 3 else np.repeat(value[..., :1], 3, -1)
     if (outside := int(np.sum((colour < 0) | (colour > 1)))) > 0:
         notes.append(f"base colour: {outside} values outside [0, 1] are clipped")
     return np.clip(colour, 0, 1)
 
 
-def _number(found: np.ndarray | None, default: float) -> np.ndarray:
-    if found is None:
+def _number(value: np.ndarray | None, default: float) -> np.ndarray:
+    if value is None:
         return np.array(default)
-    one = (luminance(found[..., :3]) if found.shape[-1] >= 3 else found)[..., 0]
+    one = (luminance(value[..., :3]) if value.shape[-1] >= 3 else value)[..., 0]
     return np.clip(one, 0, 1)
 
 
 def _ior(values: Any, prefix: str) -> float:
-    """As Mitsuba's `principled` has it: specular = ((η - 1) / (η + 1))² / 0.08."""
+    """Return the index of refraction of Mitsuba's `principled`: specular = ((η - 1) / (η + 1))² / 0.08; 1.5 by default."""
     if f"{prefix}eta" in values:
         return float(np.array(values[f"{prefix}eta"]).ravel()[0])
     if f"{prefix}specular" in values:
@@ -149,17 +153,21 @@ def _ior(values: Any, prefix: str) -> float:
 
 
 def _is_used(values: Any, key: str) -> bool:
-    found = next((values[f"{key}.{end}"] for end in ("data", "value") if f"{key}.{end}" in values), None)
-    return found is not None and float(np.max(np.array(found))) > 0
+    value = next((values[f"{key}.{end}"] for end in ("data", "value") if f"{key}.{end}" in values), None)
+    return value is not None and float(np.max(np.array(value))) > 0
 
 
 def _to_uv(values: Any, keys: Any) -> np.ndarray | None:
-    """Of all maps together. Raises `InputError` where they have different ones."""
-    found = [np.array(values[f"{key}.to_uv"].matrix, float) for key in keys if f"{key}.to_uv" in values]
-    found = [matrix.reshape(3, 3) for matrix in found]
-    if any(not np.allclose(matrix, found[0]) for matrix in found[1:]):
+    """Return the common transformation of the maps.
+
+    Raises:
+        InputError: maps have different transformations.
+    """
+    matrices = [np.array(values[f"{key}.to_uv"].matrix, float) for key in keys if f"{key}.to_uv" in values]
+    matrices = [matrix.reshape(3, 3) for matrix in matrices]
+    if any(not np.allclose(matrix, matrices[0]) for matrix in matrices[1:]):
         raise InputError("asset: maps of one material have different to_uv; give them the same")
-    return None if not found or np.allclose(found[0], np.eye(3)) else found[0]
+    return None if not matrices or np.allclose(matrices[0], np.eye(3)) else matrices[0]
 
 
 def check_size(name: str, pixels: np.ndarray) -> None:

@@ -1,7 +1,7 @@
-"""Scene dictionaries that hold ready-made Mitsuba objects, turned into ones that name files.
+"""Conversion of scene dictionaries with ready-made Mitsuba objects to dictionaries that refer to files.
 
-A mesh, a bitmap or a grid goes to a file as it is. Of a material the description is known if it was made by `load_described`; plain
-diffuse ones are read off the object.
+A mesh, a bitmap or a grid is written to a file. The description of a material is known if `load_described` created it; that of a plain
+diffuse material is read from the object.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from unrender.rendering.mitsuba.described import Recorded, recorded_descriptions
 __all__ = ["FilesOnly", "as_bitmap", "diffuse_description", "file_name", "make", "write_bitmap"]
 
 BITMAPS, VOLUMES, MESHES = "textures", "volumes", "meshes"
-"""The folders of a scene's files."""
+"""Names of the sub-folders of the files of a scene."""
 
 
 def make(description: Callable[[], Any]) -> tuple[Any, Recorded]:
-    """What `description()` returns, and the objects that it made by `load_described`, with their descriptions."""
+    """Return the result of `description()`, and the objects that it created by `load_described`, with their descriptions."""
     with recorded_descriptions() as recorded:
         return description(), recorded
 
 
 class FilesOnly:
-    """Walks a scene dictionary and writes what is no plain value to files.
+    """A converter of a scene dictionary, which writes ready-made objects to files.
 
     Args:
-        folder: where the files go, in sub-folders.
-        recorded: of `make`.
+        folder: parent of the sub-folders of the files.
+        recorded: the descriptions that `make` returns.
     """
 
     def __init__(self, folder: Path, recorded: Recorded):
@@ -46,21 +46,25 @@ class FilesOnly:
         self._placed: list[tuple[Any, str]] = []
 
     def dictionary(self, given: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[str, Any]:
-        """`given` with files in place of objects. Raises `InputError` for an object that has no description."""
-        found: dict[str, Any] = {}
+        """Return `given` with files in place of objects.
+
+        Raises:
+            InputError: an object has no description.
+        """
+        converted: dict[str, Any] = {}
         for key, value in given.items():
             here = (*place, key)
             if isinstance(value, Mapping):
-                found[key] = self.dictionary(value, here)
+                converted[key] = self.dictionary(value, here)
             elif isinstance(value, mi.VolumeGrid) or (key == "data" and given.get("type") == "gridvolume"):
-                found["filename"] = self._volume(value, here)
+                converted["filename"] = self._volume(value, here)
             elif isinstance(value, mi.Bitmap) or (key == "data" and given.get("type") in ("bitmap", "envmap")):
-                found["filename"] = self._bitmap(value, here)
+                converted["filename"] = self._bitmap(value, here)
             elif isinstance(value, mi.Object):
-                found[key] = self._object(value, here)
+                converted[key] = self._object(value, here)
             else:
-                found[key] = value
-        return found
+                converted[key] = value
+        return converted
 
     def _object(self, value: Any, place: tuple[str, ...]) -> dict[str, Any]:
         for other, name in self._placed:
@@ -74,7 +78,7 @@ class FilesOnly:
             description = diffuse_description(value)
         if description is None:
             raise InputError(
-                f"{'.'.join(place)}: a ready-made {value.class_name()}, which tells no description of itself; give its dictionary, or "
+                f"{'.'.join(place)}: a ready-made {value.class_name()}, which has no description; give its dictionary, or "
                 "make it by unrender.rendering.mitsuba.described.load_described inside the function that returns the scene"
             )
         return self.dictionary(description, place)
@@ -82,15 +86,15 @@ class FilesOnly:
     def _mesh(self, mesh: Any, place: tuple[str, ...]) -> dict[str, Any]:
         path = self._path(MESHES, place, ".ply")
         mesh.write_ply(str(path))
-        found: dict[str, Any] = {"type": "ply", "filename": str(path)}
+        description: dict[str, Any] = {"type": "ply", "filename": str(path)}
         if mesh.id() and mesh.id() != place[-1]:
-            found["id"] = mesh.id()
+            description["id"] = mesh.id()
         if not mesh_layout.has_normals(mesh):
-            found["face_normals"] = True  # or Mitsuba makes some up
+            description["face_normals"] = True  # otherwise Mitsuba computes vertex normals
         for name, part in (("bsdf", mesh.bsdf()), ("emitter", mesh.emitter())):
             if part is not None:
-                found[name] = self._object(part, (*place, name))
-        return found
+                description[name] = self._object(part, (*place, name))
+        return description
 
     def _bitmap(self, value: Any, place: tuple[str, ...]) -> str:
         bitmap = value if isinstance(value, mi.Bitmap) else as_bitmap(np.array(value))
@@ -110,19 +114,21 @@ class FilesOnly:
 
 
 def diffuse_description(bsdf: Any) -> dict[str, Any] | None:
-    """The description of a diffuse material of one colour, two-sided or not; None of others, whose settings (distributions, filters) are
-    not all among their parameters."""
-    found = mi.traverse(bsdf)
+    """Return the description of a diffuse material of one colour, one- or two-sided; None for other materials.
+
+    The parameters of other materials do not include all of their settings (distributions, filters).
+    """
+    parameters = mi.traverse(bsdf)
     if bsdf.class_name() == "TwoSidedBRDF":
         sides = {}
         for side in ("brdf_0", "brdf_1"):
             key = f"{side}.reflectance.value"
-            owner = found.hierarchy[found.properties[key][2]][0] if key in found else None
-            if owner is not None and (inner := _diffuse(owner, found, key)):
+            owner = parameters.hierarchy[parameters.properties[key][2]][0] if key in parameters else None
+            if owner is not None and (inner := _diffuse(owner, parameters, key)):
                 sides[side] = inner
-        count = len({key.split(".")[0] for key in found.keys()})  # noqa: SIM118
+        count = len({key.split(".")[0] for key in parameters.keys()})  # noqa: SIM118
         return {"type": "twosided", **sides} if sides and len(sides) == count else None
-    return _diffuse(bsdf, found, "reflectance.value")
+    return _diffuse(bsdf, parameters, "reflectance.value")
 
 
 def _diffuse(bsdf: Any, parameters: Any, key: str) -> dict[str, Any] | None:
@@ -139,7 +145,7 @@ def _diffuse(bsdf: Any, parameters: Any, key: str) -> dict[str, Any] | None:
 
 
 def as_bitmap(values: np.ndarray) -> Any:
-    """A float32 bitmap of (H, W) or (H, W, C) with C of 1, 3 or 4."""
+    """Return a float32 bitmap of (H, W) or (H, W, C) values, with C of 1, 3 or 4."""
     pixels = np.ascontiguousarray(values if values.ndim == 3 else values[..., None], np.float32)
     if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
         raise InputError(f"no picture has {values.shape[-1]} channels; expected 1, 3 or 4")
@@ -153,5 +159,5 @@ def write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
 
 
 def file_name(text: str) -> str:
-    """`text` as a file's name without its ending: letters, digits, dots, hyphens and underscores."""
+    """Return `text` as a file name without extension: letters, digits, dots, hyphens and underscores."""
     return re.sub(r"[^A-Za-z0-9_.-]+", "-", text).strip(".-")[:100] or "unnamed"

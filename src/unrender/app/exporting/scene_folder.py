@@ -1,4 +1,4 @@
-"""A scene folder that plain Mitsuba loads: scene.xml, the files that it names, and the recovered values alone."""
+"""Export of a scene as a folder that plain Mitsuba loads: scene.xml, the files that it refers to, and the recovered values alone."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ _ROUNDING = 1e-4
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written.
+    """The result of an export.
 
     Attributes:
-        folder: where.
-        scene: the XML file; None where it was not asked for, or there is none, as plain Mitsuba has no emissive media.
-        notices: one line for each thing that its user should know of.
-        renamed: {key: its name in the scene that was written}, of all parameters of the scene that have another one there.
+        folder: the folder.
+        scene: the XML file; None if it was not requested, or for an emissive medium, which plain Mitsuba does not have.
+        notices: notices for the user, one line each.
+        renamed: {key: key in the exported scene} of all parameters of the scene whose key differs there.
     """
 
     folder: Path
@@ -80,28 +80,28 @@ def export(
         ur.app.export((problem, result.parameters), "out/room-2")
         ur.app.export("out/indirect-room-auto", "out/room-3", formats=["obj", "ply"])
 
-    The folder holds scene.xml, which names its textures, meshes and volumes by relative paths; the recovered values alone, as maps/*.exr,
-    maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders what the run's last picture shows, up to noise: the
-    integrator is `path`, or `volpath` where there are participating media, with the problem's depth; every film keeps its reconstruction
-    filter. Sensors come in the problem's order (`-s 1` for the second). Of a scene with an emissive medium, which plain Mitsuba does not
-    have, only the recovered values are written.
+    The folder contains scene.xml, which refers to its textures, meshes and volumes by relative paths, and the recovered values alone as
+    maps/*.exr, maps/*.png, parameters.json and parameters.csv. `mitsuba scene.xml` renders the last picture of the run, up to noise. Its
+    integrator is `path`, or `volpath` with participating media, with the depth of the problem; every film has its own reconstruction
+    filter. Sensors are in the order of the problem (`-s 1` selects the second). Plain Mitsuba has no emissive media, so only the
+    recovered values are written for a scene with an emissive medium.
 
-    The other formats take meshes with base colour, roughness, metallic and normal map (`exporting.materials`), the environment map and
-    the cameras; what they cannot take is a notice.
+    The other formats contain meshes with base colour, roughness, metallic and normal map (`exporting.materials`), the environment map and
+    the cameras. Notices list the parts of the scene that a format cannot represent.
 
     Args:
         what: a run folder; a problem file, for its initial values; or a problem and {key: array} of all its parameters.
         out: the new folder.
         overwrite: whether an earlier export may be replaced.
-        spp: samples per pixel that scene.xml asks for.
+        spp: samples per pixel in scene.xml.
         formats: "mitsuba", "glb", "obj", "ply", "environment", "blender", "usd".
 
     Raises:
-        InputError: the run folder or the problem cannot be read, `out` cannot be written, a parameter has no place in a description, the
-            scene has no mesh, a mesh with maps no texture coordinates, or a map is too large. Nothing is left behind then.
+        InputError: the run folder or the problem cannot be read, `out` cannot be written, a description cannot hold a parameter, the
+            scene has no mesh, a mesh with maps has no texture coordinates, or a map is too large. No files remain after an error.
 
-    What is written is on the disk when this returns. An earlier export stands at its place until the new one does, which then takes its
-    place in one instant (where the system cannot exchange two names: in two, between which the next export sets right what was left).
+    The files are on the disk when this function returns. The new export replaces an earlier one atomically. On a system that cannot
+    exchange two names, the replacement takes two steps, and the next export repairs an interrupted one.
     """
     variant.ensure()
     out, asked = Path(out), check_formats(formats)
@@ -140,20 +140,22 @@ def _write(
     asked: Sequence[str],
     spp: int,
 ) -> tuple[list[str], dict[str, str]]:
-    """Write the recovered values and the formats that were asked for: notices, and `Exported.renamed`."""
+    """Write the recovered values and the requested formats; return the notices and `Exported.renamed`."""
     repeated = problem.coordinates.repeated
     notices = textures.write({k: periodic.interior(x, repeated.get(k, 0)) for k, x in values.items()}, folder)
     others = [name for name in asked if name != MITSUBA]
     if renderer.pair.emissive:
         if others:
             raise InputError(f"{problem.name}: an emissive medium has no mesh; expected --format {MITSUBA} alone")
-        why = f"no {SCENE}: plain Mitsuba has no emissive medium; what was recovered is in {textures.FOLDER}"
+        why = f"no {SCENE}: plain Mitsuba has no emissive medium; the recovered values are in {textures.FOLDER}"
         return [*notices, why], {}
     of_scene = scene_values(problem.renderer, values)
     renamed = _fill(folder, renderer, of_scene, problem.max_depth, spp)
     if MITSUBA in asked:
-        told = [f"{key} is called {name} in the exported scene" for key, name in renamed.items() if key in of_scene]
-        notices = told + notices
+        renamings = [
+            f"{key} is called {name} in the exported scene" for key, name in renamed.items() if key in of_scene
+        ]
+        notices = renamings + notices
     if others:
         notices += write_formats(asset.read(folder / SCENE), folder, others)
     if MITSUBA not in asked:
@@ -198,11 +200,11 @@ def _fill(
 
 
 def _description(description: Any, folder: Path) -> Path | dict[str, Any]:
-    """An XML file, or a dictionary without ready-made objects."""
+    """Return the XML file, or the dictionary with files in place of ready-made objects."""
     if isinstance(description, (str, Path)):
         return Path(description)
-    given, recorded = ready_made.make(description) if callable(description) else (description, [])
-    return ready_made.FilesOnly(folder, recorded).dictionary(given)
+    scene, recorded = ready_made.make(description) if callable(description) else (description, [])
+    return ready_made.FilesOnly(folder, recorded).dictionary(scene)
 
 
 def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
@@ -210,7 +212,7 @@ def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
     kinds = mi.ObjectType.Shape, mi.ObjectType.Emitter, mi.ObjectType.Sensor
     index = next(i for kind in kinds for i in graph.of(kind) if graph.names[i] == target)
     props = graph.nodes[index].props
-    # An emitter may be placed by a point or a direction of the world instead; a sky's sun is given beside its `to_world`.
+    # A point or a direction in world space may place an emitter instead; the sun of a sky is given in addition to its `to_world`.
     placed = [name for name in ("position", "direction", "sun_direction") if name in props]
     for name in placed:
         vector = [*np.array(props[name], float).reshape(3), 1.0 if name == "position" else 0.0]
@@ -224,7 +226,7 @@ def _move(graph: SceneGraph, target: str, matrix: np.ndarray) -> int:
 
 
 def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: int, spp: int) -> None:
-    """What the run's pictures were rendered with: paths of that depth, independent samples, the films' own filters."""
+    """Set the rendering of the pictures of the run: the same path depth, independent samples, the reconstruction filters of the films."""
     integrator = graph.child(0, mi.ObjectType.Integrator, "volpath" if renderer.pair.volumetric else "path")
     integrator["max_depth"], integrator["rr_depth"] = max_depth, renderer.light_paths.rr_depth
     if renderer.light_paths.hide_emitters:
@@ -248,7 +250,7 @@ def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: i
 
 
 def _gather_files(graph: SceneGraph, folder: Path) -> None:
-    """Copy what the description names into the folder, and name it from there."""
+    """Copy the files that the description refers to into the folder, and refer to the copies."""
     taken: dict[Path, str] = {}
     for index in sorted(graph.used()):
         node = graph.nodes[index]
@@ -267,7 +269,7 @@ def _gather_files(graph: SceneGraph, folder: Path) -> None:
                 shutil.copyfile(path, folder / kind / name)
                 taken[path] = f"{kind}/{name}"
         node.props["filename"] = taken[path]
-    for path in folder.glob("*/*"):  # what a recovered value took the place of
+    for path in folder.glob("*/*"):  # files that a recovered value replaces
         if path.parent.name != textures.FOLDER and path.relative_to(folder).as_posix() not in taken.values():
             path.unlink()
 
@@ -285,25 +287,25 @@ def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: 
         the name of each parameter of the live scene in the one that was written.
     """
     try:
-        found = ObjectGraph(load(path)).parameters()
+        written = ObjectGraph(load(path)).parameters()
     except Exception as error:
         raise InputError(
             f"export: Mitsuba refuses the scene that was written: {' '.join(str(error).split())[:400]}"
         ) from error
-    ends = [[key.rpartition(".")[2] for key in scene.properties] for scene in (graph.live, found)]
+    ends = [[key.rpartition(".")[2] for key in scene.properties] for scene in (graph.live, written)]
     if ends[0] != ends[1]:
         raise InputError("export: the scene that was written has other parameters than the one it was made of")
-    names = dict(zip(graph.live.properties, found.properties, strict=True))
-    given = {own: key for key, own in recovered.items()}
+    names = dict(zip(graph.live.properties, written.properties, strict=True))
+    keys = {own: key for key, own in recovered.items()}
     moved = tuple(f"n{index}." for index in posed)
     for own, name in names.items():
         if own.startswith(moved):
             continue
         try:
-            before, after = (to_tensor(scene[key]).numpy() for scene, key in ((graph.live, own), (found, name)))
-        except TypeError:  # what is no array, such as a transformation
+            before, after = (to_tensor(scene[key]).numpy() for scene, key in ((graph.live, own), (written, name)))
+        except TypeError:  # no array, such as a transformation
             continue
-        key = given.get(own, name)
+        key = keys.get(own, name)
         scale = max(1.0, float(np.max(np.abs(before), initial=0)))
         if before.shape != after.shape or not np.allclose(before, after, rtol=0, atol=_ROUNDING * scale):
             raise InputError(f"parameter {key} cannot be exported: the scene that was written has another value")

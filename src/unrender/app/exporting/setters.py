@@ -1,4 +1,4 @@
-"""A recovered value in the place of the one that a scene's description has."""
+"""Replacement of the values in the description of a scene by recovered values."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ _VERTEX = ("vertex_", "face_")
 
 
 def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: Path) -> None:
-    """Change the description so that it has `value` at `place`; maps and meshes become files in `folder`.
+    """Store `value` at `place` of the description; write maps and meshes to files in `folder`.
 
     Args:
-        graph: whose live scene has all recovered values already.
-        place: of the parameter.
-        value: its recovered value.
-        key: its name, which its file takes.
-        folder: of the exported scene.
+        graph: the description; its live scene already has all recovered values.
+        place: place of the parameter.
+        value: recovered value.
+        key: key of the parameter, which names its file.
+        folder: folder of the exported scene.
 
     Raises:
-        InputError: what reads the description knows no such value.
+        InputError: a description cannot hold this parameter.
     """
     node, path = graph.nodes[place.node], place.path
     if isinstance(place.owner, mi.Mesh) and len(path) == 1 and path[0].startswith(_VERTEX):
@@ -43,12 +43,10 @@ def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: 
         _whole_texture(graph, place.node, value)
     elif len(path) == 2 and path[1] == "value":
         _colour(graph, place, path[0], value)
-    elif (
-        len(path) == 3 and path[0] == "bsdf" and path[2] == "value"
-    ):  # of the material that a shape has when none is given
+    elif len(path) == 3 and path[0] == "bsdf" and path[2] == "value":  # the default material of a shape
         material = graph.add(place.node, "bsdf", mi.ObjectType.BSDF, "diffuse")
         graph.nodes[material].props[path[1]] = _native(value)
-    elif len(path) == 3 and path[1:] == ("value", "value"):  # a medium's volume that is one colour
+    elif len(path) == 3 and path[1:] == ("value", "value"):  # a constant volume of a medium
         node.props[path[0]] = _native(value)
     elif len(path) == 1:
         _number(node.props, path[0], value)
@@ -57,14 +55,14 @@ def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: 
 
 
 def _mesh(graph: SceneGraph, place: Place, folder: Path) -> None:
-    """The mesh as it is now, in the world's space."""
+    """Write the current mesh, in world space."""
     mesh, old = place.owner, graph.nodes[place.node].props
     path = _path(folder, MESHES, graph.names[place.node] or f"mesh-{place.node}", ".ply")
     mesh.write_ply(str(path))
-    kept = {name: old[name] for name in old.keys() if old.type(name) in _KEPT or name == "flip_normals"}  # noqa: SIM118
+    properties = {name: old[name] for name in old.keys() if old.type(name) in _KEPT or name == "flip_normals"}  # noqa: SIM118
     props = graph.replace(place.node, "ply")
     props["filename"] = str(path)
-    for name, value in kept.items():
+    for name, value in properties.items():
         props[name] = value
     if mesh.has_face_normals() or not mesh_layout.has_normals(mesh):
         props["face_normals"] = True
@@ -88,11 +86,11 @@ def _map(props: Any, value: np.ndarray, name: str, folder: Path) -> None:
         _forget(props, other)
     props["filename"] = str(path)
     if plugin == "bitmap":
-        props["format"] = "variant"  # as many bits as were recovered
+        props["format"] = "variant"  # float32, as recovered
 
 
 def _whole_texture(graph: SceneGraph, index: int, value: np.ndarray) -> None:
-    """A texture that is one value: whoever holds it gets the value itself."""
+    """Replace a constant texture by its value in each of its parents."""
     for parent in range(len(graph.nodes)):
         for name, child in graph.children(parent).items():
             if child == index:
@@ -118,7 +116,7 @@ def _number(props: Any, name: str, value: np.ndarray) -> None:
     elif name == "eta" and props.plugin_name() in _REFRACTING:
         props["ext_ior"] = 1.0
         name = "int_ior"
-    elif name in ("eta", "specular"):  # one tells the other
+    elif name in ("eta", "specular"):  # each determines the other
         _forget(props, "specular" if name == "eta" else "eta")
     elif name == "position":
         _forget(props, "to_world")
@@ -131,7 +129,7 @@ def _number(props: Any, name: str, value: np.ndarray) -> None:
 
 
 def _native(value: np.ndarray) -> Any:
-    """A number or a colour as a description has it."""
+    """Return a number or a colour in the type that a description holds."""
     flat = [float(x) for x in np.reshape(value, -1)]
     if len(flat) not in (1, 3):
         raise InputError(f"expected a number or a colour, got an array of shape {np.shape(value)}")

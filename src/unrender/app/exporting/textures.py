@@ -1,4 +1,4 @@
-"""Maps as 8-bit pictures in the conventions of other programs."""
+"""Maps as 8-bit pictures in the conventions of other programs, and the recovered values as files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from unrender.losses.metrics import srgb
 
 FOLDER, RECORD, TABLE = "maps", "parameters.json", "parameters.csv"
 _LARGEST = 64
-"""Numbers of a parameter that are written out as text."""
+"""Limit of the numbers of a parameter that are written as text."""
 
 
 def write(parameters: Mapping[str, np.ndarray], folder: Path) -> list[str]:
@@ -71,25 +71,25 @@ def _large(key: str, value: np.ndarray, folder: Path) -> dict[str, Any]:
 
 
 def png(pixels: np.ndarray) -> bytes:
-    """(H, W, 3) or (H, W) bytes as a PNG file."""
+    """Encode (H, W, 3) or (H, W) bytes as a PNG file."""
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")
     return buffer.getvalue()
 
 
 def base_colour(part: Part) -> np.ndarray:
-    """(H, W, 3) bytes, sRGB; one texel of a constant."""
+    """Return the base colour as (H, W, 3) sRGB bytes; a constant has one texel."""
     colour = part.material.base_colour
     return _bytes(srgb(colour if colour.ndim == 3 else colour.reshape(1, 1, 3)))
 
 
 def grey(values: np.ndarray) -> np.ndarray:
-    """A number or (H, W) as (H, W) bytes, linear; one texel of a constant."""
+    """Return a number or (H, W) values as (H, W) linear bytes; a constant has one texel."""
     return _bytes(values if values.ndim == 2 else values.reshape(1, 1))
 
 
 def metallic_roughness(part: Part) -> np.ndarray:
-    """(H, W, 3) bytes, linear: roughness in the green channel, metallic in the blue one, as glTF has them; the red one is white."""
+    """Return the map of glTF, (H, W, 3) linear bytes: red is 1, green is roughness, blue is metallic."""
     maps = [part.material.roughness, part.material.metallic]
     size = np.max([value.shape for value in maps if value.ndim == 2] or [(1, 1)], axis=0)
     large = [upsample(np.broadcast_to(x, x.shape or (1, 1))[..., None], size)[..., 0] for x in maps]
@@ -97,21 +97,23 @@ def metallic_roughness(part: Part) -> np.ndarray:
 
 
 def normal_map(part: Part) -> np.ndarray | None:
-    """(H, W, 3) bytes, linear, green upwards along the picture (OpenGL's, which glTF, OBJ and Blender have); None where there is none.
+    """Return the normal map as (H, W, 3) linear bytes; None without one.
 
-    Mitsuba's second tangent is n × ∂p/∂u. Others follow the picture, so green is turned around where a face lies mirrored in it.
+    Green points upwards in the picture, the convention of OpenGL, glTF, OBJ and Blender. The second tangent of Mitsuba is n × ∂p/∂u;
+    that of the other programs follows the picture. Therefore green is inverted where the texture coordinates of a face are mirrored.
     """
     values = part.material.normal_map
     if values is None:
         return None
-    found = values.copy()
+    flipped = values.copy()
     mirrored = mirrored_texels(part, *values.shape[:2])
-    found[mirrored, 1] = 1 - found[mirrored, 1]
-    return _bytes(found)
+    flipped[mirrored, 1] = 1 - flipped[mirrored, 1]
+    return _bytes(flipped)
 
 
 def mirrored_texels(part: Part, height: int, width: int) -> np.ndarray:
-    """(H, W), true where the nearest face lies mirrored in the picture: clockwise seen with v downwards upside down."""
+    """Return (H, W) booleans: whether the nearest face is mirrored, i.e. clockwise in the picture, whose origin is the upper left
+    corner."""
     if part.uv is None:
         return np.zeros((height, width), bool)
     corners = (part.uv * [width, height])[part.faces]

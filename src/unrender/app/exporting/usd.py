@@ -18,13 +18,13 @@ FILE = "asset.usdz"
 
 
 def check_installed() -> None:
-    """Raise `InputError` where the package that writes USD is missing."""
+    """Raise `InputError` if the package that writes USD is missing."""
     if importlib.util.find_spec("pxr") is None:
         raise InputError("--format usd needs usd-core: pip install 'unrender[usd]'")
 
 
 def _module(name: str) -> Any:
-    """A part of USD, whose types are not known to type checkers."""
+    """Import a module of USD, which has no type annotations."""
     return importlib.import_module(f"pxr.{name}")
 
 
@@ -73,7 +73,7 @@ def _material(stage: Any, path: str, part: Part, place: Path) -> Any:
     Sdf, UsdShade = map(_module, ("Sdf", "UsdShade"))
 
     types = Sdf.ValueTypeNames
-    given = part.material
+    source = part.material
     material: Any = UsdShade.Material.Define(stage, path)
     surface: Any = UsdShade.Shader.Define(stage, f"{path}/surface")
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -97,11 +97,11 @@ def _material(stage: Any, path: str, part: Part, place: Path) -> Any:
         surface.CreateInput(name, kind).ConnectToSource(texture.ConnectableAPI(), channel)
         return texture
 
-    if given.base_colour.ndim == 3:
+    if source.base_colour.ndim == 3:
         connect("diffuseColor", types.Color3f, textures.base_colour(part), "rgb", "sRGB")
     else:
-        surface.CreateInput("diffuseColor", types.Color3f).Set(tuple(map(float, given.base_colour)))
-    for name, value in (("roughness", given.roughness), ("metallic", given.metallic)):
+        surface.CreateInput("diffuseColor", types.Color3f).Set(tuple(map(float, source.base_colour)))
+    for name, value in (("roughness", source.roughness), ("metallic", source.metallic)):
         if value.ndim:
             connect(name, types.Float, textures.grey(value), "r", "raw")
         else:
@@ -110,5 +110,5 @@ def _material(stage: Any, path: str, part: Part, place: Path) -> Any:
         texture = connect("normal", types.Normal3f, normals, "rgb", "raw")
         texture.CreateInput("scale", types.Float4).Set((2.0, 2.0, 2.0, 2.0))
         texture.CreateInput("bias", types.Float4).Set((-1.0, -1.0, -1.0, -1.0))
-    surface.CreateInput("ior", types.Float).Set(max(given.ior, 1.0))
+    surface.CreateInput("ior", types.Float).Set(max(source.ior, 1.0))
     return material
