@@ -1,4 +1,4 @@
-"""A search over a method's options: what to try, what to give up early, what was found."""
+"""Sweeps over the options of a method: the search, the early stopping of runs, and the record of the results."""
 
 from unrender.app.sweeps.axes import Axis
 from unrender.app.sweeps.pruning import Pruning

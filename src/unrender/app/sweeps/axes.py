@@ -1,4 +1,4 @@
-"""What a sweep varies: the values of one option, or the range they are drawn from."""
+"""The axes of a sweep: the values of an option, or the range that they are sampled from."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from unrender.core.errors import InputError
 from unrender.methods.base import Method
 
 _DIGITS = 4
-"""Significant digits of numbers from a range, so that they can be typed again."""
+"""Significant digits of numbers from a range, so that they are short to type."""
 _MOST_POINTS = 10_000
 
 
 @dataclass(frozen=True)
 class Axis:
-    """An option and what it may be.
+    """An option and its possible values.
 
     Attributes:
-        name: of the option.
-        text: as it was typed, after NAME=.
-        choices: the values as text; () for a range.
+        name: name of the option.
+        text: text after NAME=, as typed.
+        choices: values as text; () for a range.
         low, high: ends of a range, both included.
-        logarithmic: whether a range is even in the logarithm.
-        count: points of a range on a grid; None where none were given.
-        integer: whether a range holds whole numbers alone.
+        logarithmic: whether a range is uniform in the logarithm.
+        count: number of points of a range on a grid; None if unspecified.
+        integer: whether a range contains only integers.
     """
 
     name: str
@@ -39,20 +39,25 @@ class Axis:
     integer: bool = False
 
     def at(self, share: float) -> str:
-        """The value at a share in [0, 1) of the axis: shares drawn evenly give each choice, or whole number, its even chance."""
+        """Return the value at a position in [0, 1) along the axis: uniform positions give each choice, or each integer, the same
+        probability."""
         if self.choices:
             return self.choices[min(int(share * len(self.choices)), len(self.choices) - 1)]
         low, high = (self.low - 0.5, self.high + 0.5) if self.integer else (self.low, self.high)
         return self.typed(self._between(max(low, 0.5) if self.integer and self.logarithmic else low, high, share))
 
     def typed(self, number: float) -> str:
-        """A number of the range as text: rounded, within the ends."""
+        """Return a number of the range as text: rounded, and clamped to the ends."""
         if self.integer:
             return str(int(min(max(round(number), self.low), self.high)))
         return repr(min(max(float(f"{number:.{_DIGITS}g}"), self.low), self.high))
 
     def points(self) -> tuple[str, ...]:
-        """The values on a grid, without repetition. Raises `InputError` for a range without a number of points."""
+        """Return the values on a grid, without repetition.
+
+        Raises:
+            InputError: a range without a number of points.
+        """
         if self.choices:
             return self.choices
         if self.count is None:
@@ -62,8 +67,8 @@ class Axis:
                 )
             return tuple(str(n) for n in range(int(self.low), int(self.high) + 1))
         ends = max(self.count - 1, 1)
-        found = [self.typed(self._between(self.low, self.high, i / ends)) for i in range(self.count)]
-        return tuple(dict.fromkeys(found))
+        values = [self.typed(self._between(self.low, self.high, i / ends)) for i in range(self.count)]
+        return tuple(dict.fromkeys(values))
 
     def _between(self, low: float, high: float, share: float) -> float:
         if self.logarithmic:
@@ -77,26 +82,26 @@ def parse_axes(
     """Return the axes of a sweep.
 
     Args:
-        given: `NAME=VALUE,VALUE` and `NAME=LOW:HIGH[:log][:POINTS]`; or by name, the text after `NAME=` or a list of values.
-        method: whose options they are; every value must be one that it takes.
+        given: `NAME=VALUE,VALUE` and `NAME=LOW:HIGH[:log][:POINTS]`; or, by name, the text after `NAME=` or a list of values.
+        method: the method of the options; it must accept every value.
         fixed: options that are set already.
 
     Raises:
-        InputError: none is given, or one is malformed, given twice, fixed already, or no option of the method.
+        InputError: no axis, a malformed or repeated axis, an option that is fixed already, or no option of the method.
     """
-    found = []
+    axes = []
     taken = set(fixed)
     for name, values in (given if isinstance(given, Mapping) else _by_name(given)).items():
         if name in taken:
             raise InputError(f"--over {name}: it is fixed by --set")
         if isinstance(values, str):
-            found.append(_range(name, values, method) or _choices(name, values, _split(values), method))
+            axes.append(_range(name, values, method) or _choices(name, values, _split(values), method))
         else:
             listed = [as_text(value) for value in values]
-            found.append(_choices(name, ",".join(listed), listed, method))
-    if not found:
+            axes.append(_choices(name, ",".join(listed), listed, method))
+    if not axes:
         raise InputError("sweep: nothing to vary; give --over NAME=VALUE,VALUE or --over NAME=LOW:HIGH")
-    return tuple(found)
+    return tuple(axes)
 
 
 def as_text(value: Any) -> str:
@@ -104,16 +109,16 @@ def as_text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _by_name(given: Iterable[str]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for text in given:
+def _by_name(texts: Iterable[str]) -> dict[str, str]:
+    values_of: dict[str, str] = {}
+    for text in texts:
         name, equals, values = (part.strip() for part in text.partition("="))
         if not (equals and name and values):
             raise InputError(f"--over {text}: expected NAME=VALUE,VALUE or NAME=LOW:HIGH[:log][:POINTS]")
-        if name in found:
+        if name in values_of:
             raise InputError(f"--over {text}: {name} is given twice")
-        found[name] = values
-    return found
+        values_of[name] = values
+    return values_of
 
 
 def _choices(name: str, text: str, values: Sequence[str], method: Method) -> Axis:
@@ -130,7 +135,7 @@ def _choices(name: str, text: str, values: Sequence[str], method: Method) -> Axi
 
 
 def _split(values: str) -> list[str]:
-    """At commas that stand in no parentheses: "cosine(300),steps(100, 0.5)" are two."""
+    """Split the text at commas outside of parentheses: "cosine(300),steps(100, 0.5)" has two parts."""
     parts, depth = [""], 0
     for character in values:
         depth += (character == "(") - (character == ")")
@@ -142,7 +147,7 @@ def _split(values: str) -> list[str]:
 
 
 def _range(name: str, values: str, method: Method) -> Axis | None:
-    """The range, or None for what is none: no two numbers first, apart by a colon."""
+    """Return the range of the text; None if it does not begin with two numbers separated by a colon."""
     low_text, colon, rest = values.partition(":")
     high_text, *extras = rest.split(":")
     try:
@@ -163,16 +168,20 @@ def _range(name: str, values: str, method: Method) -> Axis | None:
         raise InputError(f"{where}: expected two finite numbers, the lower one first")
     if logarithmic and low <= 0:
         raise InputError(f"{where}: a logarithmic range must begin above 0")
-    whole = _is_whole(name, method)
+    integer = _is_whole(name, method)
     for end in (low, high):
-        if whole and end != int(end):
+        if integer and end != int(end):
             raise InputError(f"{where}: expected whole numbers, got {end:g}")
-        method.configure({name: int(end) if whole else end})
-    return Axis(name, values, (), low, high, logarithmic, count, whole)
+        method.configure({name: int(end) if integer else end})
+    return Axis(name, values, (), low, high, logarithmic, count, integer)
 
 
 def _is_whole(name: str, method: Method) -> bool:
-    """Whether the option takes whole numbers and no others. Raises `InputError` for text and the like, or an unknown option."""
+    """Whether the option accepts integers only.
+
+    Raises:
+        InputError: an option that is not a number, or an unknown option.
+    """
     if name not in method.options.model_fields:
         method.configure({name: 0})  # says so
     words = method.expected(name)

@@ -1,4 +1,4 @@
-"""Where the runs of a sweep lie."""
+"""The run folders of a sweep."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ _MOST_WATCHED = 64
 
 
 def name(trial: int, seed: int) -> str:
-    """Of a run folder within the sweep's."""
+    """Return the name of a run folder within the folder of its sweep."""
     return f"trial-{trial:03d}-seed{seed}"
 
 
 def best(folder: Path, record: SweepRecord, most: int = 1) -> list[Path]:
-    """The run folders of the finished trials of the least error, the best one first."""
+    """Return the run folders of the `most` finished trials with the least error, the best trial first."""
     known = [(trial.error, trial) for trial in record.trials if trial.status == "finished" and trial.error is not None]
     ordered = sorted(known, key=lambda entry: (entry[0], entry[1].number))[:most]
     return [folder / run.folder for _, trial in ordered for run in trial.runs]
 
 
 def watched(folder: Path) -> list[Path]:
-    """The folder itself; of a sweep's, those of its runs, also of trials yet to begin: the first ones, where there are many."""
+    """Return the run folders to watch: those of a sweep, or the folder itself if it is no sweep.
+
+    Folders of trials that have not started yet are included, up to `_MOST_WATCHED` folders.
+    """
     if not (folder / SWEEP).is_file():
         return [folder]
     try:
@@ -33,5 +36,7 @@ def watched(folder: Path) -> list[Path]:
         return [folder]
     plan = record.plan
     numbers = range(min(plan.trials or len(record.trials) or 1, _MOST_WATCHED))
-    found = [folder / name(number, plan.seed + i) for number in numbers for i in range(min(plan.seeds, _MOST_WATCHED))]
-    return found[:_MOST_WATCHED]
+    run_folders = [
+        folder / name(number, plan.seed + i) for number in numbers for i in range(min(plan.seeds, _MOST_WATCHED))
+    ]
+    return run_folders[:_MOST_WATCHED]

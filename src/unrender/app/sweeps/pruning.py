@@ -1,5 +1,5 @@
-"""Giving up runs whose error is above the median of earlier trials' at the same share of the budget (Golovin et al. 2017), and does not
-fall fast enough to end below it."""
+"""Early stopping by the median rule (Golovin et al. 2017): it ends runs whose error exceeds the median of earlier trials at the same
+fraction of the budget, unless the error falls fast enough to end below the final median."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ if TYPE_CHECKING:
     from unrender.runs.run import Run
 
 RUNGS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8)
-"""Shares of the budget at which a run's error is looked at; none is pruned at the first."""
+"""Fractions of the budget at which the error of a run is measured; no run is pruned at the first one."""
 RUNG_FILE = "rungs.json"
 _FEWEST = 4
-"""Trials that must have come to their end before any is pruned."""
+"""Least number of finished trials before a run is pruned."""
 _PATHS, _MOST_SPP = 1 << 19, 64
 _SEED = 1 << 20
-"""Of pictures on the way: not those of final pictures."""
+"""Seed of the pictures during a run; it differs from the seeds of the final pictures."""
 
 
 def medians(finished: Iterable[Mapping[float, float]]) -> dict[float, float]:
-    """{share: median error there} of trials that came to their end, their last error at the share 1; {} for fewer than four.
+    """Return {fraction: median error} of finished trials; a fraction with fewer than four errors is left out.
 
     Args:
-        finished: {share: error} of each such trial.
+        finished: {fraction: error} of each finished trial; its final error has the fraction 1.
     """
-    given = list(finished)
-    found = {}
+    trials = list(finished)
+    median_errors = {}
     for share in (*RUNGS, 1.0):
-        values = [errors[share] for errors in given if share in errors]
+        values = [errors[share] for errors in trials if share in errors]
         if len(values) >= _FEWEST:
-            found[share] = statistics.median(values)
-    return found
+            median_errors[share] = statistics.median(values)
+    return median_errors
 
 
 def is_hopeless(errors: Mapping[float, float], limits: Mapping[float, float]) -> bool:
-    """Whether to give up a run: its last error is above the median there, and would end above the median of last errors, too, if it went on
-    to fall by the same factor for the same share of the budget as since the look before.
+    """Whether a run should be stopped: its last error exceeds the median there, and its predicted final error exceeds the final median.
 
-    The second condition spares those that begin slowly and end best, as small learning rates do.
+    The prediction assumes that the error continues to fall by the factor per fraction of the budget between its last two measurements.
+    The second condition spares runs that converge slowly at first and end best, as small learning rates do.
 
     Args:
-        errors: {share: error} of the run so far.
+        errors: {fraction: error} of the run so far.
         limits: `medians` of other trials.
     """
     if len(errors) < 2:
@@ -71,27 +71,27 @@ def is_hopeless(errors: Mapping[float, float], limits: Mapping[float, float]) ->
 
 
 def stated_error(run: RunFolder) -> tuple[float, float | None]:
-    """What a sweep makes small, and its standard error where it has one.
+    """Return the error that a sweep minimises, and its standard error if it has one.
 
-    Of problems whose truth is known, the root mean square error of the parameter; of several parameters, the mean of their errors relative
-    to the start's. Of others, the root mean square error of the final pictures, their noise taken out, the mean over views.
+    If the truth is known, the error is the root mean square error of the parameter; with several parameters, the mean of their errors,
+    each relative to its initial error. Otherwise it is the debiased root mean square error of the final pictures, the mean over views.
 
     Raises:
         InputError: the run has neither.
     """
     if run.error_after:
         return _combined(run.error_after, run.error_before), None
-    given = [error for name, error in run.record.image_errors.items() if name.endswith("/result")]
-    if not given:
+    image_errors = [error for name, error in run.record.image_errors.items() if name.endswith("/result")]
+    if not image_errors:
         raise InputError(f"run folder {run.path}: neither the truth nor an error of final pictures is known")
-    return debiased.mean(given)
+    return debiased.mean(image_errors)
 
 
 class Pruning(Callback):
-    """Measures a run's error at `RUNGS`, writes it to rungs.json in the run folder, and ends the run where it `is_hopeless`.
+    """A callback that measures the error of a run at `RUNGS`, writes it to rungs.json, and ends the run if it `is_hopeless`.
 
-    The error is that of `stated_error`, of parameters where the truth is known, else of pictures with few samples; in either case a
-    function of the run alone.
+    The error is that of `stated_error`, of parameters if the truth is known, otherwise of pictures with few samples. In both cases it
+    is a function of the run alone.
 
     Args:
         folder: the run folder.
@@ -131,37 +131,37 @@ class Pruning(Callback):
 
 
 def read_rungs(path: Path) -> dict[float, float]:
-    """{share: error} of a file that `Pruning` wrote; {} where there is none, or it is malformed."""
+    """Return {fraction: error} of a file of `Pruning`; {} if the file is missing or malformed."""
     try:
-        given = bounded_files.parse_json(bounded_files.read_bytes(path, 1 << 12), str(path))
+        content = bounded_files.parse_json(bounded_files.read_bytes(path, 1 << 12), str(path))
     except (InputError, OSError):
         return {}
-    found = {}
-    for name, value in given.items() if isinstance(given, dict) else ():
+    errors = {}
+    for name, value in content.items() if isinstance(content, dict) else ():
         share = next((share for share in RUNGS if str(share) == name), None)
         if share is not None and isinstance(value, (int, float)) and not isinstance(value, bool):
-            found[share] = float(value)
-    return found
+            errors[share] = float(value)
+    return errors
 
 
 def _combined(errors: Mapping[str, float], initial: Mapping[str, float]) -> float:
-    """One parameter's error; of several, the mean relative to the start."""
+    """Return the error of a single parameter; with several, the mean of the errors relative to the initial ones."""
     if len(errors) == 1:
         return next(iter(errors.values()))
     return float(np.mean([error / (initial.get(key) or 1.0) for key, error in errors.items()]))
 
 
 def _finite(error: float) -> float:
-    """With the greatest number in place of none, so that it can be compared and written."""
+    """Return the error, with the greatest float64 in place of infinity or NaN, so that it can be compared and written."""
     return error if math.isfinite(error) else float(np.finfo(np.float64).max)
 
 
 def _picture_error(problem: Problem, values: Mapping[str, np.ndarray]) -> float:
     pixels = problem.pixels
     spp = min(max(_PATHS // max(pixels, 1), 1), _MOST_SPP)
-    found = []
+    errors = []
     for index, view in enumerate(problem.views):
         one, other = (render(problem, values, index, spp, _SEED + half) for half in (0, 1))
         mask = None if view.mask is None else np.asarray(view.mask)
-        found.append(debiased.rmse(one, other, np.asarray(view.reference), mask))
-    return debiased.mean(found)[0]
+        errors.append(debiased.rmse(one, other, np.asarray(view.reference), mask))
+    return debiased.mean(errors)[0]

@@ -1,4 +1,4 @@
-"""sweep.json: what a sweep tries, and what it has found so far."""
+"""sweep.json: the plan of a sweep and its results so far."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ _Text = Annotated[StrictStr, Field(max_length=4096)]
 
 
 class SweepPlan(BaseModel):
-    """What a sweep is: two with equal plans have equal trials.
+    """The plan of a sweep: sweeps with equal plans have equal trials.
 
     Attributes:
-        problem, problem_settings: as typed.
-        method, settings: of all trials.
+        problem, problem_settings: the problem and its settings, as typed.
+        method, settings: the method and the settings that all trials share.
         over: the axes, as typed.
-        search: how trials are chosen.
-        trials: how many; None on a grid, for all of it.
-        seed, seeds: of the first run of each trial and of the search; how many runs a trial has, of one seed after the other.
+        search: the search that proposes the settings of trials.
+        trials: number of trials; None for all points of a grid.
+        seed, seeds: seed of the first run of each trial and of the search; number of runs of a trial, with consecutive seeds.
         steps, seconds: the budget of each run.
-        prune: whether runs above the median are given up.
-        window: of sweeps whose trials depend on earlier ones, see `Trials`; None before it is chosen.
+        prune: whether runs with an error above the median are stopped early.
+        window: the window of a sweep whose trials depend on earlier ones, see `Trials`; None before it is chosen.
         final_spp, variant: see `unrender run`.
         cached: whether references may come from the cache.
     """
@@ -56,18 +56,18 @@ class SweepPlan(BaseModel):
 
 
 class RunOutcome(BaseModel):
-    """One run of a trial.
+    """The outcome of one run of a trial.
 
     Attributes:
-        folder: its run folder, within the sweep's.
-        seed: of its random numbers.
-        status: "pruned", or that of the run folder when its run ended.
+        folder: its run folder, within the folder of the sweep.
+        seed: seed of its random numbers.
+        status: "pruned", or the status in the run folder at the end of the run.
         stopped: see `Result.stopped`.
-        error, standard_error: see `pruning.stated_error`; None where they are not known.
-        rungs: {share of the budget: error} on the way.
-        steps, samples, seconds: that it took; seconds are of optimization.
-        wall_seconds: from its beginning to its end, compilation and pictures included; 0 for a run that was there already.
-        message: what went wrong; "" for nothing.
+        error, standard_error: see `pruning.stated_error`; None if unknown.
+        rungs: {fraction of the budget: error} during the run.
+        steps, samples, seconds: its work; the seconds are those of the optimisation.
+        wall_seconds: duration including compilation and pictures; 0 for a run that existed before the session.
+        message: the error message; "" for none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -87,17 +87,17 @@ class RunOutcome(BaseModel):
 
 
 class TrialRecord(BaseModel):
-    """One trial that came to an end.
+    """One trial that has ended.
 
     Attributes:
-        number: from 0.
-        settings: of the method, those of the axes.
-        status: "finished"; "pruned"; or "failed".
-        error: the mean over its runs; None for one that failed.
-        standard_error: of that mean: from the spread over runs, or the run's own; None where it is not known.
-        runs: its runs, in order of their seeds; fewer than planned where it was pruned or failed.
-        attempts: how often it was begun: more than once where workers died.
-        message: what went wrong; "" for nothing.
+        number: index of the trial, from 0.
+        settings: values of the axes.
+        status: "finished", "pruned" or "failed".
+        error: mean over its runs; None for a failed trial.
+        standard_error: standard error of the mean, from the spread over runs, or that of a single run; None if unknown.
+        runs: its runs, in order of their seeds; fewer than planned in a pruned or failed trial.
+        attempts: number of attempts: more than one if workers died.
+        message: the error message; "" for none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -120,17 +120,17 @@ class TrialRecord(BaseModel):
 
 
 class SweepRecord(BaseModel):
-    """sweep.json.
+    """The content of sweep.json.
 
     Attributes:
-        format: of the file.
+        format: format of the file.
         status: "running", "finished" or "interrupted".
-        command: what was typed.
-        plan: what the sweep is.
-        best: the number of the finished trial of the least error; None before there is one.
-        best_line: its settings, as they are typed; "" likewise.
-        wall_seconds: of all sessions so far.
-        trials: those that came to an end, in ascending order.
+        command: the command line.
+        plan: the plan of the sweep.
+        best: number of the finished trial with the least error; None before a trial has finished.
+        best_line: the settings of that trial, as they are typed; "" before a trial has finished.
+        wall_seconds: duration of all sessions so far.
+        trials: the trials that have ended, in ascending order.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -146,7 +146,11 @@ class SweepRecord(BaseModel):
 
 
 def read_sweep(folder: Path) -> SweepRecord:
-    """The record of a sweep's folder. Raises `InputError` where there is none, or it is malformed."""
+    """Return the record in the folder of a sweep.
+
+    Raises:
+        InputError: no record exists, or it is malformed.
+    """
     if bounded_files.kind(folder / SWEEP) != "file":
         raise InputError(f"{folder}: holds no sweep ({SWEEP} is missing)")
     record = schema.validate(SweepRecord, bounded_files.read_object(folder / SWEEP, folder), str(folder / SWEEP))
@@ -157,7 +161,11 @@ def read_sweep(folder: Path) -> SweepRecord:
 
 
 def write_sweep(folder: Path, record: SweepRecord) -> None:
-    """Write sweep.json beside its place, and rename it. Raises `InputError` where that cannot be."""
+    """Write sweep.json to a temporary file and rename it.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     data = schema.encode(SweepRecord, record.model_dump(), str(folder / SWEEP))
     try:
         files.write(folder / SWEEP, data)

@@ -1,4 +1,4 @@
-"""Which settings a sweep tries: all of a grid, random ones, or those that a model of the earlier ones proposes."""
+"""Search strategies of a sweep: all points of a grid, random settings, or proposals of a model of the earlier trials."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _MOST_TRIALS = 100_000
 
 @dataclass(frozen=True)
 class TrialOutcome:
-    """What became of a trial.
+    """The outcome of a trial.
 
     Attributes:
         status: "finished", "pruned" or "failed".
-        error: what is to be small; None for a trial that failed.
-        rungs: {share of the budget: error} on the way.
+        error: the error to minimise; None for a failed trial.
+        rungs: {fraction of the budget: error} during the trial.
     """
 
     status: str
@@ -31,7 +31,7 @@ class TrialOutcome:
 
 
 class Search(Protocol):
-    """Proposes settings by number. Trials are asked for, and told of, in ascending order, each once."""
+    """A search that proposes settings by number. `ask` and `tell` are called in ascending order of the numbers, once for each."""
 
     @property
     def trials(self) -> int:
@@ -40,15 +40,15 @@ class Search(Protocol):
 
     @property
     def learns(self) -> bool:
-        """Whether settings depend on what was told."""
+        """Whether proposals depend on the outcomes of earlier trials."""
         ...
 
     def ask(self, number: int) -> dict[str, str]:
-        """{option: value as text} of a trial."""
+        """Return {option: value as text} of a trial."""
         ...
 
     def tell(self, number: int, outcome: TrialOutcome) -> None:
-        """What became of one that was asked for."""
+        """Report the outcome of a trial that `ask` proposed."""
         ...
 
 
@@ -75,12 +75,12 @@ class Grid:
         return False
 
     def ask(self, number: int) -> dict[str, str]:
-        found: dict[str, str] = {}
+        values: dict[str, str] = {}
         for axis in reversed(self.axes):
             points = axis.points()
             number, index = divmod(number, len(points))
-            found[axis.name] = points[index]
-        return {axis.name: found[axis.name] for axis in self.axes}
+            values[axis.name] = points[index]
+        return {axis.name: values[axis.name] for axis in self.axes}
 
     def tell(self, number: int, outcome: TrialOutcome) -> None:
         """See `Search.tell`."""
@@ -108,10 +108,10 @@ class Random:
 
 @dataclass
 class TPE:
-    """Settings that earlier trials make likely to be good.
+    """The tree-structured Parzen estimator, which proposes settings that are likely to be good after the earlier trials.
 
-    A trial's settings are a function of the axes, the seed and what was told before it was asked for: the same sequence of calls gives the
-    same trials, with one version of Optuna. Those under way count as bad ones, so that they are not proposed again.
+    The settings of a trial are a function of the axes, of the seed and of the outcomes reported before. The same sequence of calls
+    gives the same trials, with one version of Optuna. Trials in progress count as bad, so that their settings are not proposed again.
 
     Raises:
         InputError: Optuna is not installed.
@@ -132,7 +132,7 @@ class TPE:
             raise InputError(f"--search tpe needs Optuna ({error}): pip install 'unrender[sweep]'") from error
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what is experimental there
+            warnings.simplefilter("ignore")  # warnings of experimental features
             sampler = optuna.samplers.TPESampler(seed=self.seed % 2**32, constant_liar=True, multivariate=True)
             self._study = optuna.create_study(sampler=sampler)
 
@@ -169,12 +169,12 @@ def _text(axis: Axis, value: Any) -> str:
 def _distributions(axes: Sequence[Axis]) -> dict[str, Any]:
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
-    found: dict[str, Any] = {}
+    distributions: dict[str, Any] = {}
     for axis in axes:
         if axis.choices:
-            found[axis.name] = CategoricalDistribution(axis.choices)
+            distributions[axis.name] = CategoricalDistribution(axis.choices)
         elif axis.integer:
-            found[axis.name] = IntDistribution(int(axis.low), int(axis.high), log=axis.logarithmic)
+            distributions[axis.name] = IntDistribution(int(axis.low), int(axis.high), log=axis.logarithmic)
         else:
-            found[axis.name] = FloatDistribution(axis.low, axis.high, log=axis.logarithmic)
-    return found
+            distributions[axis.name] = FloatDistribution(axis.low, axis.high, log=axis.logarithmic)
+    return distributions

@@ -1,4 +1,4 @@
-"""The order of a sweep: which trial may begin, by what it is judged, and what is known when."""
+"""The schedule of a sweep: which trial starts next, and the limits of its runs."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ class Started:
 
 @dataclass
 class Trials:
-    """Hands out trials in ascending order.
+    """A schedule that starts trials in ascending order.
 
-    Where trials depend on earlier ones, by a search that learns or by pruning, trial i depends on trials 0 to i - window alone, whatever
-    else has ended by then, and begins once these have: so the sweep's outcome is the same for any number of workers.
+    If trials depend on earlier ones (a search that learns, or pruning), trial i depends on trials 0 to i - window alone, whatever else
+    has ended by then, and starts after these have ended. Therefore the results of the sweep are the same for any number of workers.
 
     Attributes:
-        search: what proposes settings.
-        prune: whether runs are given up.
-        window: how many trials may be under way at once where they depend on earlier ones, >= 1.
-        ended: {number: what became of it}.
+        search: the search that proposes settings.
+        prune: whether runs are stopped early.
+        window: limit of the trials in progress if they depend on earlier ones, >= 1.
+        ended: {number: record of the trial}.
     """
 
     search: Search
@@ -47,7 +47,7 @@ class Trials:
     window: int = 4
     ended: dict[int, TrialRecord] = field(default_factory=dict)
     _asked: int = 0
-    _told: int = 0
+    _reported: int = 0
 
     @property
     def dependent(self) -> bool:
@@ -60,14 +60,14 @@ class Trials:
         return len(self.ended) >= self.search.trials
 
     def next(self) -> Started | None:
-        """A trial to begin now; None where none may yet, or none is left. Those that have ended already are passed over."""
+        """Return a trial to start now; None if none can start yet, or none is left. Trials that have ended already are skipped."""
         while self._asked < self.search.trials:
             number = self._asked
-            while self.dependent and self._told <= number - self.window:
-                if self._told not in self.ended:
+            while self.dependent and self._reported <= number - self.window:
+                if self._reported not in self.ended:
                     return None
-                self._tell(self._told)
-                self._told += 1
+                self._tell(self._reported)
+                self._reported += 1
             settings = self.search.ask(number)
             self._asked += 1
             if number not in self.ended:
@@ -80,7 +80,7 @@ class Trials:
         return None
 
     def end(self, record: TrialRecord) -> None:
-        """Note what became of a trial."""
+        """Store the record of a trial that has ended."""
         self.ended[record.number] = record
 
     @property
@@ -108,7 +108,7 @@ class Trials:
 def trial_record(
     number: int, settings: dict[str, str], runs: Sequence[RunOutcome], attempts: int = 1, message: str = ""
 ) -> TrialRecord:
-    """What became of a trial whose runs ended so; `message`: why it failed as a whole."""
+    """Return the record of a trial from the outcomes of its runs; `message` is the error of the trial as a unit."""
     message = message or next((run.message for run in runs if run.message), "")
     errors = [run.error for run in runs if run.error is not None]
     status = "finished"
@@ -119,7 +119,7 @@ def trial_record(
             status="failed",
             runs=list(runs),
             attempts=attempts,
-            message=message or "a run was given up: its gradients were not finite",
+            message=message or "a run was stopped: its gradients were not finite",
         )
     if any(run.status == "pruned" for run in runs):
         status = "pruned"
@@ -136,5 +136,5 @@ def trial_record(
 
 
 def _rungs(trial: TrialRecord) -> dict[float, float]:
-    """The errors on the way of the trial's first run: it alone is pruned."""
+    """Return the errors during the first run of the trial, the only one that is pruned."""
     return {float(share): error for share, error in trial.runs[0].rungs.items()} if trial.runs else {}

@@ -1,4 +1,4 @@
-"""A live page of runs: what they look like now, on this machine alone, with buttons to pause, resume and stop them."""
+"""The live page of runs: their current state, on this machine only, with buttons to pause, resume and stop them."""
 
 from unrender.app.watch.server import Address, application, serve
 

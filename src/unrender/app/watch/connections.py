@@ -1,9 +1,10 @@
-"""Connections of the live page: how long each may take to ask, and how many may be open that have not shown the token.
+"""Connections of the live page: a time limit on each request, and a limit on the open connections that have not shown the token.
 
-Whoever has an account on this machine can connect to 127.0.0.1. Connections that ask nothing, ask slowly, or ask without the token
-must not keep the owner's browser out.
+Every account on this machine can connect to 127.0.0.1. Connections that send no request, send it slowly, or send it without the token
+must not block the browser of the owner.
 
-Everyone can read the arguments of a process, so the browser is handed a file that only its owner can read, which leads to the page.
+Every account can read the arguments of a process. Therefore the browser opens a file that only its owner can read, which redirects to
+the page.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from typing import Any
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 BACKLOG = 1024
-"""Connections that may wait to be accepted; accepting them all at once must not use up the process's files."""
+"""Limit of the connections that wait to be accepted; accepting all of them must not exhaust the open files of the process."""
 
 _STRANGERS = 768
-"""Open connections whose last request did not show the token, at most: another one ends the oldest of them."""
+"""Limit of the open connections whose last request did not show the token; one more closes the oldest of them."""
 
 _FILES = 4096
-"""Open files that the server asks the system for."""
+"""Limit of open files that the server requests from the system."""
 
 _ADMITTED = "unrender.admitted"
 
@@ -38,7 +39,7 @@ def admit(scope: Any) -> None:
 
 
 class Connection(H11Protocol):
-    """One connection, which must bring each whole request, body included, within `seconds_to_ask`."""
+    """A connection that must send each complete request, body included, within `seconds_to_ask`."""
 
     seconds_to_ask = 10.0
     strangers = _STRANGERS
@@ -57,7 +58,7 @@ class Connection(H11Protocol):
         return not self.admitted and not self.transport.is_closing()
 
     def connection_made(self, transport: Any) -> None:
-        """Start the clock. Where too many strangers are connected, the oldest one's connection ends."""
+        """Start the clock. If too many connections have not shown the token, close the oldest of them."""
         super().connection_made(transport)
         self._start_clock()
         if len(self.connections) <= self.strangers:
@@ -67,7 +68,7 @@ class Connection(H11Protocol):
             min(strangers, key=lambda each: each.began).transport.abort()
 
     def data_received(self, data: bytes) -> None:
-        """The clock runs from a request's first byte to its last; answering may take longer."""
+        """Run the clock from the first byte of a request to its last; the response has no time limit."""
         if self._deadline is None and (self.cycle is None or self.cycle.response_complete):
             self._start_clock()
         super().data_received(data)
@@ -89,15 +90,15 @@ class Connection(H11Protocol):
 
 
 def enough_files() -> None:
-    """Raise this process's limit of open files, where the system has such a limit and lets it be raised."""
+    """Raise the limit of open files of this process, if the system has such a limit and permits it."""
     try:
         import resource
     except ImportError:  # Windows
         return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    target = _FILES if hard == resource.RLIM_INFINITY else min(_FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < target:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
 
 
 _PAGE = """<!doctype html>
@@ -110,23 +111,25 @@ _PAGE = """<!doctype html>
 
 
 class Redirect:
-    """A file that leads a browser to an address, in a folder of its own; both are the owner's alone. A context manager: removed at the end.
+    """A file that redirects a browser to an address, in a folder of its own. Only the owner can read either. The context manager
+    removes both.
 
     Args:
-        url: where it leads.
+        url: the target address.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
 
-    Raises `OSError` where it cannot be written.
+    Raises:
+        OSError: the file cannot be written.
     """
 
     def __init__(self, url: str):
         self._folder = Path(tempfile.mkdtemp(prefix="unrender-watch-"))  # mode 0700
         self.path = self._folder / "open.html"
         try:
-            found = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-            with os.fdopen(found, "w", encoding="utf-8") as file:
+            descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with os.fdopen(descriptor, "w", encoding="utf-8") as file:
                 file.write(_PAGE.format(url=html.escape(url)))
         except BaseException:
             self.remove()
@@ -139,6 +142,6 @@ class Redirect:
         self.remove()
 
     def remove(self) -> None:
-        """Remove it: once the browser has followed it, it is of no more use. Again does nothing."""
+        """Remove the file and its folder. Further calls do nothing."""
         with contextlib.suppress(OSError):
             shutil.rmtree(self._folder)

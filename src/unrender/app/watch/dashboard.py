@@ -1,4 +1,4 @@
-"""What the live page shows, from snapshots of runs: with the panels, tables and charts of a report."""
+"""The content of the live page, from snapshots of runs, with the panels, tables and charts of a report."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ _STATES = {
 
 @dataclass(frozen=True)
 class RunRow:
-    """One run among those that are watched; all of it text.
+    """The row of one of the watched runs, all text.
 
     Attributes:
         number: its index, from 0.
-        label, state, state_text: its name, what it does (see `monitor`), and that for people.
+        label, state, state_text: its name, its state (see `monitor`), and the description of its state.
         step, seconds, samples, loss, error: its progress.
-        accepts_commands, paused: whether its buttons are shown, and which of them.
+        accepts_commands, paused: whether its buttons are shown, and whether it is paused.
     """
 
     number: int
@@ -77,11 +77,11 @@ class PictureCache:
         self._entries = {name: of for name, of in self._entries.items() if self.has_page(of[0])}
 
     def has_page(self, page: int) -> bool:
-        """Whether the pictures of a page, numbered as `pages` was, are still cached."""
+        """Whether the pictures of the page with number `page` (the value of `pages` at that time) are still cached."""
         return page > self.pages - _CACHED_PAGES
 
     def add(self, picture: PictureData) -> str:
-        """Cache a picture; returns its address, the same for the same picture."""
+        """Cache a picture and return its address. Equal pictures have the same address."""
         values = np.ascontiguousarray(picture.values)
         fields = (
             values.shape,
@@ -97,24 +97,24 @@ class PictureCache:
         return f"picture/{name}"
 
     def get(self, name: str) -> PictureData | None:
-        """The picture of this name, while it is cached."""
+        """Return the picture of this name; None if it is not cached."""
         return self._entries[name][1] if name in self._entries else None
 
 
 def render(template: str, snapshots: Sequence[Snapshot], pictures: PictureCache, chosen: int = 0, view: int = 0) -> str:
-    """The page or the part of it that changes, as HTML with everything that comes from the runs escaped.
+    """Render the page, or its part that changes, as HTML. All text that comes from the runs is escaped.
 
     Args:
-        template: "watch.html", or "watch_main.html" for the part.
+        template: "watch.html", or "watch_main.html" for the part that changes.
         snapshots: the runs, at least one.
-        pictures: where the pictures go.
-        chosen, view: the run and the view whose pictures are shown; the first ones where there are no such.
+        pictures: the cache that receives the pictures.
+        chosen, view: indices of the run and of the view whose pictures are shown; the first one for an index out of range.
     """
     pictures.start_page()
     labels = _labels([snapshot.path for snapshot in snapshots])
     chosen = chosen if 0 <= chosen < len(snapshots) else 0
     run = snapshots[chosen].run
-    with np.errstate(all="ignore"):  # pictures of a run that diverges overflow, and are shown all the same
+    with np.errstate(all="ignore"):  # pictures of a diverging run overflow, but are shown nevertheless
         context: dict[str, Any] = {
             "rows": [_row(i, labels[i], snapshot) for i, snapshot in enumerate(snapshots)],
             "name": next((s.run.record.name for s in snapshots if s.run is not None), labels[0]),
@@ -185,36 +185,36 @@ def _row(number: int, label: str, snapshot: Snapshot) -> RunRow:
 def _charts(snapshots: Sequence[Snapshot], labels: Sequence[str]) -> dict[str, list[plots.Chart]]:
     runs = {label: s.run for label, s in zip(labels, snapshots, strict=True) if s.run is not None}
     if len(snapshots) == 1 and runs:
-        found = {axis: tables.charts(next(iter(runs.values())), axis) for axis in plots.AXES}
+        charts = {axis: tables.charts(next(iter(runs.values())), axis) for axis in plots.AXES}
     else:
         colours = {label: i % _COLOURS for i, label in enumerate(labels)}
-        found = {axis: tables.charts_of_runs(runs, colours, axis) for axis in plots.AXES}
-    return found
+        charts = {axis: tables.charts_of_runs(runs, colours, axis) for axis in plots.AXES}
+    return charts
 
 
 def _notices(snapshots: Sequence[Snapshot], labels: Sequence[str]) -> list[str]:
-    found = []
+    lines = []
     for label, snapshot in zip(labels, snapshots, strict=True):
         who = f"{label}: " if len(labels) > 1 else ""
         fields = [*snapshot.problems, *(snapshot.run.record.warnings if snapshot.run is not None else ())]
-        found += [who + line for line in fields]
-    return found
+        lines += [who + line for line in fields]
+    return lines
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
-    """The folders' names; their whole paths where names repeat."""
+    """Return the names of the folders; their full paths where names repeat."""
     names = [path.resolve().name or str(path) for path in paths]
     return [str(path) if names.count(name) > 1 else name for name, path in zip(names, paths, strict=True)]
 
 
 @cache
 def environment() -> Environment:
-    """The report's templates and those of the live page."""
+    """Return a Jinja environment with the templates of the report and of the live page."""
     return html.environment(_loader())
 
 
 def source(name: str) -> str:
-    """The text of a style sheet or script among the templates."""
+    """Return the text of a style sheet or script among the templates."""
     return _loader().get_source(environment(), name)[0]
 
 

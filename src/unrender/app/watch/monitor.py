@@ -1,4 +1,4 @@
-"""One run folder as it is now: not there yet, running, paused, finished, or gone."""
+"""The current state of a run folder: waiting, running, paused, finished, lost or vanished."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ _LIVE_FILES = (LIVE_STATUS, schema.LIVE_START, schema.LIVE_VIEWS, *_FILES)
 
 WAITING, RUNNING, PAUSED, SAVING = "waiting", "running", "paused", "saving"
 FINISHED, LOST, VANISHED = "finished", "lost", "vanished"
-"""States of a run. Lost: its process ended before the run did."""
+"""States of a run. A lost run is one whose process ended before the run did."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What is known of a run.
+    """The known state of a run.
 
     Attributes:
         path: the run folder.
-        state: one of the above.
-        run: all that could be read, or None.
-        status: of a run that is live, or None.
-        problems: what could not be read, one line each.
+        state: one of the states above.
+        run: the data that could be read; None without any.
+        status: status of a live run; None otherwise.
+        problems: data that could not be read, one line each.
     """
 
     path: Path
@@ -60,11 +60,11 @@ class Snapshot:
 
 
 class RunMonitor:
-    """Follows a run folder. Nothing in it is trusted, nothing of it is required.
+    """A monitor of a run folder. Its content is untrusted, and every file may be missing.
 
     Attributes:
         path: the folder.
-        revision: how often a change was found.
+        revision: number of changes so far.
     """
 
     def __init__(self, path: Path):
@@ -76,27 +76,28 @@ class RunMonitor:
         self.revision = 0
 
     def snapshot(self) -> Snapshot:
-        """What is there now; the same object as before where nothing has changed. Never raises for what is in the folder."""
+        """Return the current state; the same object as before if no file has changed. It never raises because of the content of the
+        folder."""
         stamps = self._stamps()
         if stamps != self._last_stamps:
-            found = self._read()
-            if found.run is None and self._last.run is not None and found.state in (VANISHED, WAITING):
-                found = Snapshot(self.path, VANISHED, self._last.run, self._last.status, found.problems)
-            self._last_stamps, self._last = stamps, found
+            current = self._read()
+            if current.run is None and self._last.run is not None and current.state in (VANISHED, WAITING):
+                current = Snapshot(self.path, VANISHED, self._last.run, self._last.status, current.problems)
+            self._last_stamps, self._last = stamps, current
             self.revision += 1
         return self._last
 
     def _stamps(self) -> tuple:
-        """Change times, sizes and inodes of every file that is read, and whether the run's process lives."""
-        found: list[Any] = []
+        """Return the change times, sizes and inodes of all files that are read, and whether the process of the run is alive."""
+        stamps: list[Any] = []
         for path in [self.path / name for name in _FILES] + [self.path / LIVE / name for name in _LIVE_FILES]:
             try:
                 status = os.stat(path, follow_symlinks=False)
-                found.append((status.st_mtime_ns, status.st_size, status.st_ino))
+                stamps.append((status.st_mtime_ns, status.st_size, status.st_ino))
             except OSError:
-                found.append(None)
+                stamps.append(None)
         status = self._last.status
-        return (self.path.is_dir(), status is not None and _alive(status), *found)
+        return (self.path.is_dir(), status is not None and _alive(status), *stamps)
 
     def _read(self) -> Snapshot:
         if not self.path.is_dir():
@@ -122,7 +123,7 @@ class RunMonitor:
         return schema.validate(LiveStatus, bounded_files.read_object(path, self.path), str(path))
 
     def _live(self, status: LiveStatus, problems: list[str]) -> RunFolder:
-        """A run under way, from live/. What is missing is left out; what cannot be read is fields in `problems`."""
+        """Return the data of a live run, from live/. Missing data is left out; unreadable data is left out and noted in `problems`."""
         live = self.path / LIVE
         record = read_record(live / RECORD, self.path)
         fields = {"stopped": status.stopped, "steps": status.step, "seconds": status.seconds}
@@ -147,7 +148,7 @@ class RunMonitor:
         )
 
     def _history(self) -> History | None:
-        """The one that grows: in live/ where there is one, else the folder's own."""
+        """Return the growing history: that in live/ if it exists, otherwise that of the folder."""
         for path in (self.path / LIVE / HISTORY, self.path / HISTORY):
             if bounded_files.exists(path):
                 return self._histories.setdefault(path, HistoryReader(path, self.path)).read(to_the_end=False)
@@ -159,13 +160,13 @@ class RunMonitor:
         return self._try(problems, lambda: bounded_files.read_float_arrays(path, self.path)) or {}
 
     def _try(self, problems: list[str], function: Callable[[], Any]) -> Any:
-        """What `function` returns; None, and a line in `problems`, where what it reads is malformed."""
+        """Return the result of `function`; None, and a line in `problems`, if the data is malformed or cannot be read."""
         try:
             return function()
         except InputError as error:
             problems.append(str(error))
         except FileNotFoundError:
-            pass  # replaced or removed while it was read: the next snapshot will show
+            pass  # the file was replaced or removed during the read; the next snapshot sees the change
         except OSError as error:
             problems.append(f"{self.path}: cannot be read: {error.strerror or error}")
         return None
@@ -175,25 +176,25 @@ _EMPTY = History(*(np.array([]) for _ in range(4)), parameter_error={})
 
 
 def _views(start: dict[str, np.ndarray], now: dict[str, np.ndarray], where: Path) -> dict[int, ViewPictures]:
-    """Views that have a reference and a picture. A weight of one channel, or none, is spread over three."""
+    """Return the views that have a reference and a picture. A control weight of one channel is repeated over three channels."""
     arrays = {**start, **now}
-    found: dict[str, np.ndarray] = {}
+    complete: dict[str, np.ndarray] = {}
     for name, array in arrays.items():
         view = name.partition("/")[0]
         if f"{view}/reference" not in arrays or f"{view}/result" not in arrays:
             continue
         if name.endswith("/control_weight") and (array.ndim == 2 or array.shape[-1] == 1):
             array = np.repeat(array.reshape(*array.shape[:2], 1), 3, axis=2)
-        found[name] = array
-    return pictures_by_view(found, where / "views.npz")
+        complete[name] = array
+    return pictures_by_view(complete, where / "views.npz")
 
 
 def _alive(status: LiveStatus) -> bool:
-    """Whether the run's process lives, as far as this machine can tell."""
+    """Whether the process of the run is alive; True if this machine cannot tell."""
     if status.process is None or status.host != platform.node():
         return True
     try:
-        os.kill(status.process, 0)  # signal 0 asks, and does nothing
+        os.kill(status.process, 0)  # signal 0 only tests for existence
     except ProcessLookupError:
         return False
     except OSError:

@@ -1,4 +1,4 @@
-"""The server of the live page: on this machine alone, behind a secret in the address."""
+"""The server of the live page: on this machine only, with a secret in the address."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from unrender.runs.folder.schema import COMMANDS, CONTROL
 HOST = "127.0.0.1"
 _NAMES = {HOST, "localhost"}
 _LONGEST_COMMAND = 1024
-_LONGEST_NUMBER = 9  # digits of a run's number in an address
+_LONGEST_NUMBER = 9  # limit of the digits of the number of a run in an address
 _REFUSAL_SECONDS = 2.0
 _STOPS = 8.0
 _POLICY = (
@@ -52,10 +52,10 @@ _HEADERS = {
 
 @dataclass(frozen=True)
 class Address:
-    """Where the page is.
+    """The address of the page.
 
     Attributes:
-        port: of 127.0.0.1.
+        port: port on 127.0.0.1.
         token: the secret that every path begins with.
     """
 
@@ -64,21 +64,25 @@ class Address:
 
     @property
     def url(self) -> str:
-        """What to open."""
+        """The URL to open."""
         return f"http://{HOST}:{self.port}/{self.token}/"
 
 
 def listen(port: int) -> socket.socket:
-    """A socket on 127.0.0.1, on any free port for 0. Raises `InputError` where the port is taken."""
-    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    """Open a listening socket on 127.0.0.1; port 0 selects any free port.
+
+    Raises:
+        InputError: the port cannot be used.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        found.bind((HOST, port))
-        found.listen(connections.BACKLOG)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((HOST, port))
+        listener.listen(connections.BACKLOG)
     except (OSError, OverflowError) as error:
-        found.close()
+        listener.close()
         raise InputError(f"--port {port}: {getattr(error, 'strerror', None) or error}") from error
-    return found
+    return listener
 
 
 def serve(
@@ -88,7 +92,7 @@ def serve(
 
     Args:
         directories: run folders.
-        address: where the page is.
+        address: address of the page.
         on: a socket of `listen`.
         on_admission: called once, at the first request that shows the token.
     """
@@ -103,7 +107,7 @@ def _config(page: ASGIApp) -> uvicorn.Config:
         http=connections.Connection,
         backlog=connections.BACKLOG,
         log_level="error",
-        access_log=False,  # which would write the secret down
+        access_log=False,  # a log would contain the secret
         lifespan="off",
         ws="none",
         server_header=False,
@@ -117,12 +121,12 @@ def application(
     refusal_seconds: float = 0.0,
     on_admission: Callable[[], object] | None = None,
 ) -> ASGIApp:
-    """The page as an ASGI application; whatever does not carry the token is answered with 403.
+    """Return the page as an ASGI application. Requests without the token are answered with 403.
 
     Args:
         directories: run folders.
-        address: where the page is.
-        refusal_seconds: that a 403 lets wait for it, so that asking again and again takes no time from the runs.
+        address: address of the page.
+        refusal_seconds: delay of a 403, so that repeated requests take no time from the runs.
         on_admission: as for `serve`.
     """
     page = _Page(directories)
@@ -138,7 +142,7 @@ def application(
 
 
 class _AccessControl:
-    """Lets in what names this machine as its host, carries the token, and comes from no other page."""
+    """Middleware that admits requests that name this machine as the host, carry the token, and come from no other page."""
 
     def __init__(
         self, app: ASGIApp, address: Address, refusal_seconds: float, on_admission: Callable[[], object] | None
@@ -176,7 +180,7 @@ class _AccessControl:
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers = dict(scope["headers"])
-        # A foreign name that was made to lead here (DNS rebinding) gives another page the right to read ours.
+        # DNS rebinding: a foreign host name that resolves to this machine would permit another page to read this one.
         host = headers.get(b"host", b"").decode("latin-1").lower()
         if host.partition(":")[0] not in _NAMES or host.partition(":")[2] not in ("", str(self._port)):
             return PlainTextResponse("this page is served to this machine alone", 403)
@@ -200,7 +204,7 @@ class _RenderedPage:
 
 
 class _Page:
-    """What is served, from the runs as they are at that time."""
+    """The routes of the page, with the current state of the runs."""
 
     def __init__(self, directories: Sequence[Path]):
         self._monitors = [RunMonitor(path) for path in directories]
@@ -209,11 +213,11 @@ class _Page:
         self._rendered: dict[tuple[str, int, int], _RenderedPage] = {}
 
     def full(self, request: Request) -> Response:
-        """The page."""
+        """Respond with the page."""
         return Response(self._render("watch.html", request)[0], media_type="text/html")
 
     def update(self, request: Request) -> Response:
-        """The part that changes; 204 where it is what the asker has seen."""
+        """Respond with the part of the page that changes; 204 if its digest is that of the query."""
         began = time.perf_counter()
         text, digest = self._render("watch_main.html", request)
         if request.query_params.get("seen") == digest:
@@ -222,7 +226,7 @@ class _Page:
         return Response(text, media_type="text/html", headers={"x-digest": digest, "x-milliseconds": took})
 
     def picture(self, request: Request) -> Response:
-        """A picture, as PNG, at `stops` above its own exposure."""
+        """Respond with a picture as PNG, `stops` above its own exposure."""
         with self._lock:
             picture = self._pictures.get(request.path_params["name"])
         if picture is None:
@@ -245,10 +249,10 @@ class _Page:
             if len(body) > _LONGEST_COMMAND:
                 raise HTTPException(413, "too long for a command")
         try:
-            found = json.loads(body)
+            message = json.loads(body)
         except (ValueError, RecursionError) as error:
             raise HTTPException(400, "expected JSON") from error
-        command = found.get("command") if isinstance(found, dict) else None
+        command = message.get("command") if isinstance(message, dict) else None
         if command not in COMMANDS:
             raise HTTPException(400, f"expected one of {', '.join(COMMANDS)}")
         return await run_in_threadpool(self._command, number, command)
@@ -258,7 +262,7 @@ class _Page:
         with self._lock:
             accepts_commands = monitor.snapshot().accepts_commands
         if not accepts_commands:
-            return PlainTextResponse("this run does not go on: it takes no commands", 409)
+            return PlainTextResponse("this run has ended: it accepts no commands", 409)
         try:
             files.write(monitor.path / CONTROL, (json.dumps({"command": command}) + "\n").encode())
         except InputError as error:
@@ -266,7 +270,7 @@ class _Page:
         return Response(status_code=204)
 
     def _render(self, template: str, request: Request) -> tuple[str, str]:
-        """The text and its digest; rendered anew only where a run has changed."""
+        """Return the text and its digest; the text is rendered again only if a run has changed."""
         run, view = (int(_number(request, name)) for name in ("run", "view"))
         with self._lock:
             snapshots = [monitor.snapshot() for monitor in self._monitors]
@@ -282,15 +286,15 @@ class _Page:
 
 
 def _number(request: Request, name: str) -> float:
-    """A number of the query, 0 where there is none."""
+    """Return a number of the query; 0 if it is missing."""
     text = request.query_params.get(name, "0")
     try:
-        found = float(text)
+        number = float(text)
     except ValueError as error:
         raise HTTPException(400, f"{name}: expected a number") from error
-    if not math.isfinite(found) or abs(found) > (_STOPS if name == "stops" else 1e6):
+    if not math.isfinite(number) or abs(number) > (_STOPS if name == "stops" else 1e6):
         raise HTTPException(400, f"{name}: out of range")
-    return found
+    return number
 
 
 _ASSETS = {"style.css": "text/css", "viewer.js": "text/javascript", "watch.js": "text/javascript"}
