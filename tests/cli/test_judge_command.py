@@ -163,7 +163,7 @@ def test_formats_stand_beside_one_another(unrender, run: Path, mitsuba_variant: 
         (["turntable", ".", "--out", "x.avi"], "--out x.avi: expected a name that ends in .mp4 or .gif"),
         (["turntable", ".", "--out", "photo.exr/x.gif"], "is not a folder that can be written to"),
         (["turntable", ".", "--out", "there.gif"], "--out there.gif: exists; give --overwrite"),
-        (["turntable", ".", "--out", "full"], "--out full: the folder holds other things"),
+        (["turntable", ".", "--out", "full"], "--out full: the folder contains other files"),
     ],
 )
 def test_mistakes_are_one_line(

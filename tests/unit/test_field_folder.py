@@ -51,5 +51,5 @@ def test_stages_double_the_voxels(voxels: int, names: list[int]) -> None:
 def test_a_field_has_no_mesh_and_unknowns_of_its_own(tmp_path) -> None:
     with pytest.raises(ur.InputError, match="no --mesh"):
         ur.app.ImportOptions(field=16, mesh=tmp_path / "a.ply")
-    with pytest.raises(ur.InputError, match="of a radiance field, expected some of light, exposure"):
+    with pytest.raises(ur.InputError, match="expected light, exposure or both for a radiance field"):
         ur.app.import_capture(tmp_path, tmp_path / "out", ur.app.ImportOptions(field=16, unknowns=("colour",)))

@@ -1,4 +1,4 @@
-"""From images to an estimate of the loss gradient."""
+"""Estimators of the loss gradient from images."""
 
 from typing import TYPE_CHECKING
 

@@ -77,7 +77,7 @@ class EmitterState:
 
     @property
     def known(self) -> bool:
-        """Whether the probabilities were updated at least once."""
+        """True if the probabilities were updated at least once."""
         return bool(self.moments.sum() > 0)
 
     @property

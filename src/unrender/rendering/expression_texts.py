@@ -42,11 +42,11 @@ _LONGEST, _DEEPEST = 1000, 50
 
 
 class ExpressionError(InputError):
-    """What is wrong with one expression.
+    """An error in one expression.
 
     Args:
         key: Parameter of the scene.
-        what: One line.
+        what: The error in one line.
     """
 
     def __init__(self, key: str, what: str):

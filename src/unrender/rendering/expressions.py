@@ -1,4 +1,4 @@
-"""Parameters of a scene as functions of unknowns that the scene does not have: a renderer around another one."""
+"""Parameters of a scene as functions of unknowns outside the scene: a renderer that wraps another one."""
 
 from __future__ import annotations
 
@@ -118,11 +118,11 @@ class ExpressionRenderer(RendererWrapper):
         self._targets = targets
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`. Parameters that are functions are none of their own."""
+        """Return the unknowns and the parameters of the scene that are no functions."""
         return self._info
 
     def values(self, keys: list[str]) -> Tree:
-        """See `Renderer.values`: of an unknown, its initial value."""
+        """Return the initial values of unknowns and the values of parameters of the scene."""
         scene = self.inner.values([key for key in keys if key not in self.unknowns])
         own = {key: self.array(self.unknowns[key]) for key in keys if key in self.unknowns}
         return {key: own[key] if key in own else scene[key] for key in keys}
@@ -130,7 +130,6 @@ class ExpressionRenderer(RendererWrapper):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        """See `Renderer.prepare`."""
         wanted = differentiated(keys, derivatives)
         inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(wanted)))
         return _ExpressionSession(self, inner, wanted)
@@ -276,7 +275,6 @@ class _ExpressionSession(SessionWrapper):
         self._known: list[tuple[Tree, Tree]] = []
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `RenderSession.image_batch`."""
         own, rest = self._split(parameters)
         if not own:
             return self._inner.image_batch(rest, request)

@@ -1,4 +1,4 @@
-"""Views of different worlds: some see the scene with other values of known parameters, or another scene. A renderer around several."""
+"""Views of different worlds: the same scene with other values of known parameters, or another scene. A renderer that combines several."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ __all__ = ["World", "WorldsRenderer", "with_worlds"]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """What one sensor of a `WorldsRenderer` sees.
+    """The scene and the known values that one sensor of a `WorldsRenderer` renders.
 
     Attributes:
         renderer: Renders the scene.
@@ -82,10 +82,10 @@ def with_worlds(renderer: Renderer, worlds: Sequence[World]) -> tuple[Renderer, 
 
 
 class WorldsRenderer(RendererWrapper):
-    """A renderer whose first sensors are those of a scene, and whose others each see a world of their own.
+    """A renderer that combines the sensors of a scene with further sensors, each of which renders a world.
 
-    Images, gradients and tangents are as unbiased as those of the renderers inside. A parameter that is known in a world has no gradient
-    there. A parameter that a world's scene does not have changes nothing there.
+    Images, gradients and tangents are as unbiased as those of the inner renderers. A known parameter of a world has no gradient there.
+    A parameter that is missing in the scene of a world has no effect there.
 
     Args:
         inner: Renders the scene that has all parameters.
@@ -123,13 +123,13 @@ class WorldsRenderer(RendererWrapper):
 
     def sensors_of(self, worlds: Sequence[World]) -> list[int] | None:
         """Return the index of each world's sensor; None where one is missing."""
-        found = [next((n for n, known in enumerate(self.worlds) if world.same(known)), None) for world in worlds]
-        return None if None in found else [self._count + n for n in found if n is not None]
+        indices = [next((n for n, known in enumerate(self.worlds) if world.same(known)), None) for world in worlds]
+        return None if None in indices else [self._count + n for n in indices if n is not None]
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """See `Renderer.parameters`. What one scene cannot differentiate, none can."""
+        """Return the parameters of the first scene, without the capabilities that another scene lacks."""
         others = [one.parameters() for one in self.renderers[1:]]
-        found = {}
+        combined = {}
         for key, info in self.inner.parameters().items():
             for other in (known[key] for known in others if key in known):
                 info = replace(
@@ -139,22 +139,19 @@ class WorldsRenderer(RendererWrapper):
                     perturbable=info.perturbable and other.perturbable,
                     reason=info.reason or other.reason,
                 )
-            found[key] = info if info.sensor is None else replace(info, sensor=self._only(info.sensor))
-        return found
+            combined[key] = info if info.sensor is None else replace(info, sensor=self._only(info.sensor))
+        return combined
 
     def resolutions(self) -> list[tuple[int, int]]:
-        """See `Renderer.resolutions`."""
         return [*self.inner.resolutions(), *(world.renderer.resolutions()[world.sensor] for world in self.worlds)]
 
     def formats(self) -> Sequence[PictureFormat]:
-        """See `WithFormats.formats`."""
         own = [format_of(self.inner, sensor) for sensor in range(self._count)]
         return [*own, *(format_of(world.renderer, world.sensor) for world in self.worlds)]
 
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        """See `Renderer.prepare`."""
         wanted, sessions = differentiated(keys, derivatives), {}
         for renderer in self.renderers:
             known = renderer.parameters()
@@ -164,29 +161,33 @@ class WorldsRenderer(RendererWrapper):
         return WorldsSession(self, sessions, wanted)
 
     def parts(self, request: SampleRequest) -> list[tuple[int, SampleRequest, np.ndarray | None]]:
-        """Return (number of the state, request for its renderer, positions in the request's pixels) for each state that a request sees.
+        """Return (index of the state, request for its renderer, positions in the request's pixels) for each state of the sensors of a
+        request.
 
-        Positions are None where the part is the whole.
+        Positions are None where the part contains all pixels.
         """
         if request.sensors is None:
             return [(int(self._state[request.sensor]), self._inner_request(request, request.sensor, None), None)]
-        asked = arrays.numpy(request.sensors).astype(np.int64)
-        numbers = self._state[asked]
-        found = []
+        sensors = arrays.numpy(request.sensors).astype(np.int64)
+        numbers = self._state[sensors]
+        parts = []
         for number in np.unique(numbers):
             (chosen,) = np.nonzero(numbers == number)
-            part = self._part(request, asked, chosen)
-            found.append((int(number), part, None if len(chosen) == len(asked) else chosen))
-        return found
+            part = self._part(request, sensors, chosen)
+            parts.append((int(number), part, None if len(chosen) == len(sensors) else chosen))
+        return parts
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
-        """See `Remeshable.with_meshes`. Raises `InputError` where there are several scenes."""
+        """Return the renderer with other meshes.
+
+        Raises:
+            InputError: there are several scenes.
+        """
         if len(self.renderers) > 1:
-            raise InputError(f"{', '.join(meshes)}: views of several scenes keep their triangles")
+            raise InputError(f"{', '.join(meshes)}: the triangles of views of several scenes cannot change")
         return super().with_meshes(meshes, keys)
 
     def with_differential_bsdf(self) -> Renderer:
-        """See `DifferentialBsdfRenderer`."""
         changed = {id(one): with_differential_bsdf(one) for one in self.renderers}
         return self._changed(lambda one: changed[id(one)])
 
@@ -199,10 +200,12 @@ class WorldsRenderer(RendererWrapper):
         return WorldsRenderer(change(self.inner), worlds)
 
     def _only(self, sensor: int) -> int | None:
-        """Return the one sensor that looks through a sensor of the first scene; None where several do."""
+        """Return the only sensor that renders with a sensor of the first scene; None where several do."""
         inner = [False] * self._count + [world.renderer is self.inner for world in self.worlds]
-        found = [n for n in range(len(self._sensor)) if self._sensor[n] == sensor and (n < self._count or inner[n])]
-        return found[0] if len(found) == 1 else None
+        candidates = [
+            n for n in range(len(self._sensor)) if self._sensor[n] == sensor and (n < self._count or inner[n])
+        ]
+        return candidates[0] if len(candidates) == 1 else None
 
     def _part(self, request: SampleRequest, asked: np.ndarray, chosen: np.ndarray) -> SampleRequest:
         pixels, positions = request.pixels, request.positions
@@ -220,13 +223,13 @@ class WorldsRenderer(RendererWrapper):
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """The paths of one state of a rendering.
+    """The paths of one state in a rendering.
 
     Attributes:
-        state: Its number.
+        state: Its index.
         chosen: Positions of its pixels in the request; None for all.
         count: Number of pixels of the request; 0 where `chosen` is None.
-        paths: Those of the renderer inside.
+        paths: Paths of the inner renderer.
     """
 
     state: int
@@ -245,12 +248,9 @@ class WorldsSession:
         self._own = [self._scene_values(state.renderer) for state in renderer.states]
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
-        """See `RenderSession.image`."""
         return self._rendered(request, lambda n, part: self._session(n).image(self._at(n, parameters), part))
 
     def image_pair(self, current: Tree, previous: Tree, request: SampleRequest, space: Space) -> Rendering:
-        """See `RenderSession.image_pair`."""
-
         def pair(number: int, part: SampleRequest) -> Rendering:
             states = self._at(number, current), self._at(number, previous)
             return self._session(number).image_pair(*states, part, space)
@@ -258,7 +258,6 @@ class WorldsSession:
         return self._rendered(request, pair)
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `RenderSession.image_batch`."""
         ((number, part, _),) = self._renderer.parts(request)
         count = len(next(iter(parameters.values())))
         known, scene = (
@@ -269,60 +268,59 @@ class WorldsSession:
         return self._session(number).image_batch({**scene, **own, **known}, part)
 
     def adjoint(self, parameters: Tree, paths: Sequence[_Part], weights: Array) -> Tree:
-        """See `RenderSession.adjoint`."""
-        found = [
+        gradients = [
             self._session(part.state).adjoint(self._at(part.state, parameters), part.paths, _of_part(weights, part))
             for part in paths
         ]
-        return self._sum(parameters, paths, found)
+        return self._sum(parameters, paths, gradients)
 
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Sequence[_Part], weights: Array, weights_previous: Array
     ) -> tuple[Tree, Tree]:
-        """See `RenderSession.adjoint_pair`."""
-        found = []
+        gradients = []
         for part in paths:
             states = self._at(part.state, current), self._at(part.state, previous)
             both = _of_part(weights, part), _of_part(weights_previous, part)
-            found.append(self._session(part.state).adjoint_pair(*states, part.paths, *both))
-        ones, others = ([pair[n] for pair in found] for n in (0, 1))
+            gradients.append(self._session(part.state).adjoint_pair(*states, part.paths, *both))
+        ones, others = ([pair[n] for pair in gradients] for n in (0, 1))
         return self._sum(current, paths, ones), self._sum(previous, paths, others)
 
     def tangent_moment(self, parameters: Tree, paths: Sequence[_Part], tangents: Tree) -> Array:
-        """See `RenderSession.tangent_moment`."""
-        found = []
+        moments = []
         for part in paths:
             state = self._at(part.state, parameters)
             session = self._session(part.state)
-            found.append(session.tangent_moment(state, part.paths, self._tangents(part.state, state, tangents)))
-        return _joined(found, paths)
+            moments.append(session.tangent_moment(state, part.paths, self._tangents(part.state, state, tangents)))
+        return _joined(moments, paths)
 
     def vertices(self, parameters: Tree, request: SampleRequest) -> Array:
-        """See `CountingSession.vertices`."""
         parts = self._renderer.parts(request)
-        found = [counted_vertices(self._session(n), self._at(n, parameters), part) for n, part, _ in parts]
+        counts = [counted_vertices(self._session(n), self._at(n, parameters), part) for n, part, _ in parts]
         count = 0 if request.pixels is None else arrays.shape(request.pixels)[0]
         of = [_Part(n, chosen, count, None) for n, _, chosen in parts]
-        grouped = [arrays.add_first_axis(x) for x in found]
-        return _joined(grouped, of)[0] if of[0].chosen is not None else found[0]
+        grouped = [arrays.add_first_axis(x) for x in counts]
+        return _joined(grouped, of)[0] if of[0].chosen is not None else counts[0]
 
     def emitters(self) -> np.ndarray:
-        """See `EmitterSession.emitters`. Raises `InputError` where there are several scenes."""
+        """Return the emitters.
+
+        Raises:
+            InputError: there are several scenes.
+        """
         if len(self._sessions) > 1:
-            raise InputError("views of several scenes draw emitters in their own way alone")
+            raise InputError("views of several scenes do not support learned emitter sampling")
         return drawing_emitters(self._session(0)).emitters()
 
     def emitter_moments(
         self, parameters: Tree, paths: Sequence[_Part], tangents: Tree, weights: Array, noise: Array
     ) -> EmitterMoments:
-        """See `EmitterSession.emitter_moments`."""
-        found = []
+        moments = []
         for part in paths:
             state = self._at(part.state, parameters)
             own, both = self._tangents(part.state, state, tangents), (_of_part(weights, part), _of_part(noise, part))
             session = drawing_emitters(self._session(part.state))
-            found.append(session.emitter_moments(state, part.paths, own, *both))
-        return sum(found[1:], found[0])
+            moments.append(session.emitter_moments(state, part.paths, own, *both))
+        return sum(moments[1:], moments[0])
 
     def _scene_values(self, renderer: Renderer) -> Tree:
         """Return the scene's values of parameters that have other values in some of its worlds."""
@@ -366,7 +364,7 @@ class WorldsSession:
 
 
 def _of_part(images: Array, part: _Part) -> Array:
-    """Return the pixels (groups, n, 3) of a part, of those of a whole request (groups, N, 3)."""
+    """Return the pixels (groups, n, 3) of a part from those of the full request (groups, N, 3)."""
     if part.chosen is None:
         return images
     groups, _, channels = arrays.shape(images)
@@ -376,7 +374,7 @@ def _of_part(images: Array, part: _Part) -> Array:
 
 
 def _joined(parts: Sequence[Any], paths: Sequence[_Part]) -> Array:
-    """Return the images of a whole request from those of its parts."""
+    """Return the images of the full request from those of its parts."""
     if paths[0].chosen is None:
         return parts[0]
     total, groups, channels = None, *(arrays.shape(parts[0])[n] for n in (0, 2))

@@ -62,7 +62,7 @@ class Lens:
 
     @property
     def distorts(self) -> bool:
-        """Whether straight lines are curved in its picture."""
+        """True if straight lines are curved in the picture."""
         return self.model == FISHEYE or any(self.distortion)
 
     def scaled(self, width: int, height: int) -> Lens:

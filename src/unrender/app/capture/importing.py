@@ -1,4 +1,4 @@
-"""A folder of posed photographs becomes a problem folder."""
+"""Import of a folder of posed photographs as a problem folder."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ from unrender.io import files
 CHECK, SHEET = "check", "check.png"
 PROBLEM, STAGES = writing.PROBLEM, stages_file.FILE
 MOST_VOXELS = 256
-"""Along the longest side of the hull: memory grows with the cube."""
+"""Limit of the voxels along the longest side of the hull; memory is cubic in it."""
 TURNTABLE = (
-    "the background stands still: a turntable, so the light stands still before the camera, too (--no-turntable if not)"
+    "the background is static: assuming a turntable, with static light relative to the camera (--no-turntable if not)"
 )
 STILL_LIGHT = (
-    "response: the light stands still with the object, so a matt point has one radiance in all photographs, and any curve can be "
-    "its colour's; highlights and vignetting alone tell it"
+    "response: light and object are static, so a diffuse point has the same radiance in all photographs, and its colour explains any "
+    "curve; only highlights and vignetting determine the response"
 )
 LIT_DEFAULT = ("colour", "normal")
 _OF_CHECK = {CHECK, SHEET}
@@ -57,27 +57,27 @@ _OF_IMPORT = {*problem_folder.OWN, *field_folder.OWN, SHEET}
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """How a capture is read.
+    """Options of an import.
 
     Attributes:
-        mesh: a PLY or OBJ file in the cameras' world; None for a hull of the masks.
-        masks: a folder of masks named like the photographs; None for those that the capture has.
-        kind: a key of `formats.FORMATS`; None for what is found.
-        axes: a key of `conventions.AXES`, where the files have others than their format; None for the format's.
-        world_to_camera: whether matrices are inverse poses; None for as the format has them.
-        resolution: pixels along the longer side of a view, at most.
-        scale: in place of `resolution`, a factor of the photograph's own; None for `resolution`.
-        hold_out: every so many photographs one is held out; 0 for none; None for the capture's own split, or 8.
-        voxels: along the longest side of the hull, at most `MOST_VOXELS`.
-        faces: of the hull, about.
-        texture: texels along the sides of the textures.
-        unknowns: of the asset, of `unknowns.NAMES`; None for `unknowns.DEFAULT` of a mesh that is given, `unknowns.OF_HULL` of a hull,
+        mesh: a PLY or OBJ file in the world space of the cameras; None for a hull of the masks.
+        masks: a folder of masks with the names of the photographs; None for the masks of the capture.
+        kind: a key of `formats.FORMATS`; None to detect it.
+        axes: a key of `conventions.AXES`, if the files differ from their format; None for the convention of the format.
+        world_to_camera: whether matrices are inverse poses; None for the convention of the format.
+        resolution: maximum pixels along the longer side of a view.
+        scale: a scale factor of the photographs, instead of `resolution`; None for `resolution`.
+        hold_out: interval of the held-out photographs; 0 for none; None for the split of the capture, or 8.
+        voxels: voxels along the longest side of the hull, at most `MOST_VOXELS`.
+        faces: approximate number of faces of the hull.
+        texture: width and height of the textures in texels.
+        unknowns: unknowns of the asset, of `unknowns.NAMES`; None for `unknowns.DEFAULT` with a mesh, `unknowns.OF_HULL` with a hull,
             colour and normals under known lights, radiance and light of a field.
-        band: pixels along the border of masks that count little.
-        turntable: whether the object turned before a camera and a light that stood still; None for as the background shows.
-        response: of files of 8 or 16 bits: "srgb", "linear", an exponent such as "2.2", or "fit", which is sRGB with `response` among the
-            unknowns.
-        field: voxels along a side of a radiance field, which needs neither masks nor a mesh; None for an asset.
+        band: width in pixels of the border of masks that has a small weight.
+        turntable: whether the object rotated in front of a static camera and light; None to detect it from the background.
+        response: response of 8- and 16-bit files: "srgb", "linear", an exponent such as "2.2", or "fit", which is sRGB with `response`
+            among the unknowns.
+        field: voxels along each side of a radiance field, which needs neither masks nor a mesh; None for an asset.
     """
 
     mesh: Path | None = None
@@ -99,8 +99,8 @@ class ImportOptions:
 
     def __post_init__(self) -> None:
         for name in ("mesh", "masks"):
-            given = getattr(self, name)
-            object.__setattr__(self, name, None if given is None else Path(given))
+            value = getattr(self, name)
+            object.__setattr__(self, name, None if value is None else Path(value))
         decoding.check(self.response)
         if self.unknowns is not None:
             object.__setattr__(self, "unknowns", self.chosen(()))
@@ -114,24 +114,24 @@ class ImportOptions:
             raise InputError(f"--voxels {self.voxels}: expected 1 to {MOST_VOXELS}")
 
     def chosen(self, default: tuple[str, ...]) -> tuple[str, ...]:
-        """The unknowns: those given, else these, and `response` where it is to be fitted."""
+        """Return the selected unknowns, or `default` without a selection, and `response` if it is fitted."""
         fitted = ("response",) if self.response == decoding.FIT else ()
         return parse(",".join((*(default if self.unknowns is None else self.unknowns), *fitted)))
 
 
 @dataclass(frozen=True)
 class Imported:
-    """What an import found.
+    """The result of an import.
 
     Attributes:
-        folder: what was written.
-        kind: the capture's format.
-        views: count of training views.
-        held_out: count of held-out views.
+        folder: the new folder.
+        kind: format of the capture.
+        views: number of training views.
+        held_out: number of held-out views.
         size: width and height of the largest view.
-        faces: of the mesh; 0 where there is none to look at.
-        overlaps: of the mesh's silhouettes with the masks, in order of the views; none where there are no masks.
-        notices: one line for each thing that was left out or changed.
+        faces: number of faces of the mesh; 0 without a mesh.
+        overlaps: overlaps of the silhouettes of the mesh with the masks, in order of the views; empty without masks.
+        notices: one line for each omission or change.
     """
 
     folder: Path
@@ -162,19 +162,19 @@ def import_capture(
 ) -> Imported:
     """Write the problem of a folder of photographs: scene, problem files, stages, references, masks, mesh, check.png.
 
-    Of one camera under known lights, there are neither stages nor a mesh.
+    An import of one camera under known lights has neither stages nor a mesh.
 
     Args:
-        folder: with photographs and their cameras, or lights.
-        out: a folder to be made.
+        folder: a folder with photographs and their cameras, or lights.
+        out: the new folder.
         options: None for the defaults.
-        overwrite: whether an earlier import or check may be replaced: in one instant, and only when all is written.
+        overwrite: whether an earlier import or check may be replaced. The replacement is atomic, after all files are written.
 
     Returns:
-        what was found.
+        The result.
 
     Raises:
-        InputError: which file, and what was expected; nothing is written then.
+        InputError: a malformed file, with the expected content; nothing is written then.
     """
     folder, out = Path(folder), Path(out)
     options = options or ImportOptions()
@@ -185,10 +185,10 @@ def import_capture(
         return _import_lit(folder, out, options)
     if options.field is not None:
         return _import_field(folder, out, options)
-    found = _read(folder, options, unwrapped=True)
-    if found.refusal:
-        raise InputError(f"{folder}: {found.refusal}")
-    mesh = found.mesh
+    data = _read(folder, options, unwrapped=True)
+    if data.refusal:
+        raise InputError(f"{folder}: {data.refusal}")
+    mesh = data.mesh
     if mesh.uv is None:
         with phases.phase("atlas"):
             mesh = atlas.unwrap(mesh, options.texture)
@@ -199,29 +199,27 @@ def import_capture(
             problem_folder.write(
                 place,
                 name,
-                found.views,
+                data.views,
                 mesh,
-                found.silhouettes,
+                data.silhouettes,
                 options.texture,
                 options.chosen(OF_HULL if options.mesh is None else DEFAULT),
                 options.band,
-                found.turntable,
+                data.turntable,
             )
             (place / SHEET).write_bytes(
-                _sheet(
-                    found, [overlays.thumbnail(_overlay(found, index)) for index in overlays.chosen(len(found.views))]
-                )
+                _sheet(data, [overlays.thumbnail(_overlay(data, index)) for index in overlays.chosen(len(data.views))])
             )
 
     _write_folder(out, fill)
-    return _imported(found, out, mesh)
+    return _imported(data, out, mesh)
 
 
 def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
-    """One camera under known lights."""
+    """Import a capture of one camera under known lights."""
     if options.response != decoding.SRGB:
         raise InputError(
-            "--response: of one camera under known lights, sRGB or linear is chosen by what explains the photographs"
+            "--response: with one camera under known lights, the better fit of sRGB and linear is selected automatically"
         )
     variant.ensure()
     capture = lights.read(folder, options.masks)
@@ -231,23 +229,23 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     chosen = options.unknowns or LIT_DEFAULT
     _write_folder(out, lambda place: photometric_folder.write(place, name, views, chosen))
     held_out = sum(views.held_out)
-    notices = ["one camera under known lights: normals and colours of a plate, without shadows that it casts"]
+    notices = ["one camera under known lights: recovering normals and colours of a flat plate, without cast shadows"]
     if views.linear:
-        notices.append("values are taken as linear: a matt surface explains them better than as sRGB")
+        notices.append("values are interpreted as linear: a diffuse surface fits them better than sRGB values")
     size = views.mask.shape[1], views.mask.shape[0]
     return Imported(out, formats.LIGHTS, len(views.names) - held_out, held_out, size, 0, (), tuple(notices))
 
 
 def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
-    """What has no surface."""
+    """Import a capture as a radiance field."""
     assert options.field is not None
     if options.response == decoding.FIT:
         raise InputError(
-            "--response fit: of a radiance field, any curve can be its own; expected srgb, linear or an exponent"
+            "--response fit: a radiance field can represent any curve; expected srgb, linear or an exponent"
         )
     voxels, chosen = options.field, options.unknowns or field_folder.NAMES[:2]
     if others := [one for one in chosen if one not in field_folder.NAMES]:
-        raise InputError(f"--unknowns {others[0]}: of a radiance field, expected some of light, exposure")
+        raise InputError(f"--unknowns {others[0]}: expected light, exposure or both for a radiance field")
     variant.ensure()
     capture = _capture(folder, options)
     with phases.phase("photographs") as advance:
@@ -267,7 +265,7 @@ def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
 
 
 def _capture(folder: Path, options: ImportOptions) -> Capture:
-    """What the folder holds, in the conventions that were asked for."""
+    """Read the capture of the folder, in the selected conventions."""
     capture = formats.read(folder, options.kind, options.masks)
     if options.axes is not None or options.world_to_camera is not None:
         inverse = capture.world_to_camera if options.world_to_camera is None else options.world_to_camera
@@ -276,59 +274,60 @@ def _capture(folder: Path, options: ImportOptions) -> Capture:
 
 
 def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:
-    """Draw the mesh, its edges and the mask over each photograph: a PNG file for each, and one of them all.
+    """Draw the mesh, its edges and the mask over each photograph: a PNG file for each, and one contact sheet.
 
-    Returns what was found, and in one line which convention looks wrong, "" where none does.
+    Returns:
+        The result, and one line about the convention that seems wrong; "" if none does.
 
     Raises:
-        InputError: which file, and what was expected; nothing is written then.
+        InputError: a malformed file, with the expected content; nothing is written then.
     """
     _check_place(out, folder, options, _OF_CHECK)
     if formats.is_lit(folder, options.kind):
         raise InputError(f"{folder}: one camera under known lights has no poses to check")
-    found = _read(folder, options, unwrapped=False)
+    data = _read(folder, options, unwrapped=False)
 
     def fill(place: Path) -> None:
         with phases.phase("pictures"):
             (place / CHECK).mkdir()
-            shown, thumbnails = set(overlays.chosen(len(found.views))), []
-            for index, view in enumerate(found.views):
-                picture = _overlay(found, index)
+            shown, thumbnails = set(overlays.chosen(len(data.views))), []
+            for index, view in enumerate(data.views):
+                picture = _overlay(data, index)
                 name = f"{index:04d}-{file_name(Path(view.name).stem)}.png"
                 (place / CHECK / name).write_bytes(overlays.png(picture))
                 thumbnails += [overlays.thumbnail(picture)] if index in shown else []
-            (place / SHEET).write_bytes(_sheet(found, thumbnails))
+            (place / SHEET).write_bytes(_sheet(data, thumbnails))
 
     _write_folder(out, fill)
-    return _imported(found, out, found.mesh), found.refusal
+    return _imported(data, out, data.mesh), data.refusal
 
 
 def _check_place(out: Path, folder: Path, options: ImportOptions, own: set[str]) -> None:
-    """Raise `InputError` where replacing `out` would remove more than an earlier import's or check's files, `own`."""
+    """Raise `InputError` if replacing `out` would remove other files than `own`, those of an earlier import or check."""
     place = out.resolve()
     if out.name in ("", "..") or Path.cwd().is_relative_to(place):
         raise InputError(f"--out {out}: the current directory or one above it; expected a folder to be made")
     for what, needed in (("FOLDER", folder), ("--masks", options.masks)):
         if needed is not None and needed.resolve().is_relative_to(place):
-            raise InputError(f"--out {out}: {what} {needed} lies in it and would be removed; give a new one")
+            raise InputError(f"--out {out}: {what} {needed} is inside it and would be removed; give a new folder")
     try:
         others = sorted({path.name for path in out.iterdir()} - own) if out.is_dir() else []
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror or error}") from error
     if others:
-        raise InputError(f"--out {out}: holds other things, such as {printable(others[0])}; give a new one")
+        raise InputError(f"--out {out}: contains other files, such as {printable(others[0])}; give a new folder")
 
 
 def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
-    """What the folder holds, its shape and how they fit; `unwrapped`: whether texture coordinates will be needed."""
+    """Read the capture, its shape and their overlap; `unwrapped`: whether texture coordinates will be needed."""
     variant.ensure()
     capture = _capture(folder, options)
-    given = None if options.mesh is None else meshes.read(options.mesh)
-    if given is None:
+    own_mesh = None if options.mesh is None else meshes.read(options.mesh)
+    if own_mesh is None:
         meshes.check_installed()
-    if unwrapped and (given is None or given.uv is None):
+    if unwrapped and (own_mesh is None or own_mesh.uv is None):
         atlas.check_installed()
-    if given is None and not _has_masks(capture):
+    if own_mesh is None and not _has_masks(capture):
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
     with phases.phase("photographs") as advance:
         views, notices = prepare(
@@ -340,12 +339,12 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
             options.response,
         )
     masked = all(views.masked)
-    if given is None and not masked:
+    if own_mesh is None and not masked:
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
     training = views.of(held_out=False)
     with phases.phase("shape"):
         try:
-            mesh = given or hull.shape(training, options.voxels, options.faces)
+            mesh = own_mesh or hull.shape(training, options.voxels, options.faces)
             silhouettes = Silhouettes(mesh)
             overlaps = overlap(silhouettes, views) if masked else []
         except InputError as error:
@@ -353,7 +352,7 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
                 raise
             raise InputError(f"{folder}: {hull.explain(capture, training, None, 0.0)}") from error
         mean = float(np.mean(overlaps)) if masked else 1.0
-        refusal = "" if mean >= hull.SUFFICIENT else hull.explain(capture, training, given, mean)
+        refusal = "" if mean >= hull.SUFFICIENT else hull.explain(capture, training, own_mesh, mean)
     turned = turntable.stands_still(views) if options.turntable is None else options.turntable
     if turned and options.turntable is None:
         notices.append(TURNTABLE)
@@ -363,29 +362,29 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
 
 
 def _has_masks(capture: Capture) -> bool:
-    """Whether there are masks as files, or may be some in alpha channels."""
+    """Return whether the capture has mask files, or files that can have an alpha channel."""
     return any(
         p.mask is not None or p.file.suffix.lower() in (".png", ".tif", ".tiff", ".webp") for p in capture.photographs
     )
 
 
-def _overlay(found: _Read, index: int) -> np.ndarray:
-    return overlays.overlay(found.views[index], found.silhouettes)
+def _overlay(data: _Read, index: int) -> np.ndarray:
+    return overlays.overlay(data.views[index], data.silhouettes)
 
 
-def _sheet(found: _Read, thumbnails: list[Image.Image]) -> bytes:
-    """Of those of `overlays.chosen`."""
-    overlaps = [f"IoU {value:.3f}  " for value in found.overlaps] or [""] * len(found.views)
-    names = [view.name for view in found.views.bare()]
+def _sheet(data: _Read, thumbnails: list[Image.Image]) -> bytes:
+    """Return the contact sheet of the views of `overlays.chosen`."""
+    overlaps = [f"IoU {value:.3f}  " for value in data.overlaps] or [""] * len(data.views)
+    names = [view.name for view in data.views.bare()]
     labels = [f"{overlaps[index]}{printable(names[index])}" for index in overlays.chosen(len(names))]
     return overlays.contact_sheet(thumbnails, labels)
 
 
-def _imported(found: _Read, out: Path, mesh: Mesh) -> Imported:
-    held_out = sum(view.held_out for view in found.views.bare())
-    size = max((view.lens.width, view.lens.height) for view in found.views.bare())
-    counts = len(found.views) - held_out, held_out
-    return Imported(out, found.capture.kind, *counts, size, len(mesh.faces), tuple(found.overlaps), found.notices)
+def _imported(data: _Read, out: Path, mesh: Mesh) -> Imported:
+    held_out = sum(view.held_out for view in data.views.bare())
+    size = max((view.lens.width, view.lens.height) for view in data.views.bare())
+    counts = len(data.views) - held_out, held_out
+    return Imported(out, data.capture.kind, *counts, size, len(mesh.faces), tuple(data.overlaps), data.notices)
 
 
 def _write_folder(out: Path, fill: Callable[[Path], None]) -> None:

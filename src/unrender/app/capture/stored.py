@@ -82,7 +82,7 @@ class StoredViews:
 
     @property
     def masked(self) -> list[bool]:
-        """Whether each has a mask."""
+        """Booleans of the views: whether each has a mask."""
         return [self._views[index][1] for index in self._indices]
 
     def __len__(self) -> int:

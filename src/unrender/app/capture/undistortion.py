@@ -41,7 +41,7 @@ def pinhole(lens: Lens, scale: float) -> Lens:
 
 @dataclass(frozen=True)
 class Resampling:
-    """From a lens's picture to a pinhole's.
+    """A resampling of the picture of a lens to that of a pinhole camera.
 
     Attributes:
         source: of the photograph.
@@ -53,14 +53,14 @@ class Resampling:
 
     @property
     def parts(self) -> int:
-        """n: into n x n parts each pixel of the result is divided."""
+        """The number n of sub-pixels along each side of a pixel of the result."""
         return max(
             1, math.ceil(self.source.fx / self.target.fx - 1e-6), math.ceil(self.source.fy / self.target.fy - 1e-6)
         )
 
     @property
     def _is_whole(self) -> bool:
-        """Whether each pixel of the result is n x n of the photograph's."""
+        """True if each pixel of the result consists of n x n pixels of the photograph."""
         focal = self.parts * self.target.fx
         same = math.isclose(self.source.fx, focal, rel_tol=1e-9) and math.isclose(self.source.fy, focal, rel_tol=1e-9)
         return same and not self.source.distorts

@@ -71,7 +71,7 @@ def execution(
     progress: Progress,
     callbacks: Sequence[Callback] = (),
 ) -> Iterator[dict[str, Any]]:
-    """Say what is about to run, and yield the arguments of `optimize` for it. Its live page ends with the block.
+    """Print the run that starts, and yield its arguments of `optimize`. Its live page ends with the block.
 
     The run leaves a run folder; an interrupted one is saved as far as it came. `callbacks` listen besides.
     """

@@ -53,7 +53,7 @@ class StagesRun:
 
     @property
     def options(self) -> RunOptions:
-        """How it was begun."""
+        """The options at the start of the run."""
         assert self.stages.run is not None
         return self.stages.run
 

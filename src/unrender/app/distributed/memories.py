@@ -74,12 +74,12 @@ class Memory:
 
     @property
     def number(self) -> int:
-        """By which workers know it."""
+        """The number by which workers identify the memory."""
         return self.recipe.number
 
 
 class Memories:
-    """All that are alive."""
+    """The memories that are in use."""
 
     def __init__(self) -> None:
         self._numbers: Iterator[int] = itertools.count()

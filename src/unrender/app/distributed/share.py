@@ -180,7 +180,7 @@ class Hosts(Protocol):
 
     @property
     def count(self) -> int:
-        """How many shares."""
+        """The number of shares."""
         ...
 
     def room(self) -> list[tuple[str, int]]:

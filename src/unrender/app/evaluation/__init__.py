@@ -1,1 +1,1 @@
-"""A result judged by photographs that it was not made from, under other light, and from all around."""
+"""Evaluation of a result: held-out photographs, another light, and turntable videos."""

@@ -1,4 +1,4 @@
-"""A run's result against photographs that were held out."""
+"""Evaluation of the result of a run on held-out photographs."""
 
 from __future__ import annotations
 
@@ -48,14 +48,15 @@ _ALBEDO = ("base_color", "reflectance")
 
 @dataclass(frozen=True)
 class Judgement:
-    """What was found.
+    """The result of an evaluation.
 
     Attributes:
-        folder: with judge.json, sheet.png, pictures/ and, where the scene has light from all around, environment.png and environment.exr.
-        names: of the photographs.
-        measures: of each; none under another light, which the photographs do not show.
-        albedo: where the true base colour is known.
-        notices: one line for each thing that its user should know of.
+        folder: the folder of judge.json, sheet.png, pictures/ and, for a scene with an environment map, environment.png and
+            environment.exr.
+        names: names of the photographs.
+        measures: measures of the photographs; empty under another light than that of the photographs.
+        albedo: errors of the base colour; None if the truth is unknown.
+        notices: notices for the user, one line each.
     """
 
     folder: Path
@@ -66,7 +67,7 @@ class Judgement:
 
     @property
     def mean(self) -> dict[str, float | None]:
-        """Over the photographs: psnr, ssim, lpips."""
+        """Means of psnr, ssim and lpips over the photographs."""
         return mean(list(self.measures)) if self.measures else {}
 
 
@@ -79,20 +80,21 @@ def judge(
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> Judgement:
-    """Render a run's result for photographs that it was not made from, and measure how near it is.
+    """Render the result of a run for held-out photographs and measure the differences.
 
     Args:
         run: a run folder.
-        held_out: a problem file whose views are the photographs; None for held-out.toml beside the run's own problem file, or
-            that of its stages.
-        environment: a picture of light from all around, to render the result under. Nothing is measured then, unless `held_out` is given:
-            its photographs must have been taken under this light, which is then in the axes of the scene's world.
+        held_out: a problem file whose views are the photographs; None for held-out.toml in the folder of the problem file of the run,
+            or of its stages.
+        environment: an environment map that replaces the light. Nothing is measured then, unless `held_out` is given: its photographs
+            must have been taken under this light, which has the axes of the world of the scene.
         spp: samples per pixel.
         out: the new folder; None for the folder judge in the run folder.
-        overwrite: whether an earlier judgement may be replaced.
+        overwrite: whether an earlier evaluation may be replaced.
 
     Raises:
-        InputError: no result, no held-out problem, a scene without the run's parameters, or `out` cannot be written; nothing is left then.
+        InputError: no result, no held-out problem, a scene without the parameters of the run, or `out` cannot be written. No files remain
+            after an error.
     """
     variant.ensure()
     if not isinstance(spp, int) or spp < 1:
@@ -100,11 +102,11 @@ def judge(
     place = Path(run) / "judge" if out is None else Path(out)
     files.check_replaceable(place, _OWN, RECORD, overwrite, f"--out {place}", "an earlier judgement")
     light = None if environment is None else scenes.read_light(Path(environment))
-    problem, found = reopen.problem_of(run), folders.read(run)
-    given = scenes.find(Path(run), problem) if held_out is None else Path(held_out)
-    values, truth = _found(Path(run), problem, found)
+    problem, result = reopen.problem_of(run), folders.read(run)
+    held_out_file = scenes.find(Path(run), problem) if held_out is None else Path(held_out)
+    values, truth = _recovered(Path(run), problem, result)
     of_camera = {key: values[key] for key in (VIGNETTING, RESPONSE) if key in values}
-    judged, values, notices = _problem(problem, given, values, found)
+    judged, values, notices = _problem(problem, held_out_file, values, result)
     measured = light is None or held_out is not None
     exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
     notices += _unknown_of_photographs(problem) if measured else []
@@ -118,7 +120,7 @@ def judge(
             images = _photographed(judged, images, of_camera, exposed)
         measures = _measure(judged, images) if measured else []
         pictures.write(folder, judged, images, relit, measures)
-        record = _record(judged, measures, albedo, given, environment, spp, notices)
+        record = _record(judged, measures, albedo, held_out_file, environment, spp, notices)
         (folder / RECORD).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         return measures, albedo
 
@@ -129,17 +131,19 @@ def judge(
     if measured and not metrics.available():
         notices.append(metrics.MISSING)
     if not measured:
-        notices.append("nothing is measured: the photographs show another light; --held-out names ones that show this")
+        notices.append(
+            "nothing is measured: the photographs show another light; --held-out names photographs under this light"
+        )
     return Judgement(place, tuple(names_of(judged)), tuple(measures), albedo, tuple(notices))
 
 
-def _found(run: Path, problem: Problem, found: RunFolder) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """What a run found, and the truth where it is known, of ties as their members.
+def _recovered(run: Path, problem: Problem, result: RunFolder) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return the recovered values of a run, and the known true values; ties are expanded to their members.
 
-    Of a stage, with what it took over from those before it, as part of its scene.
+    For a stage, the values include those of earlier stages, which are part of its scene.
     """
-    full = problem.full(found.parameters)
-    values, truth = (member_values(problem.renderer, each) for each in (full, found.truth))
+    full = problem.full(result.parameters)
+    values, truth = (member_values(problem.renderer, each) for each in (full, result.truth))
     staged = run_folders.stage_of(run)
     if staged is None:
         return values, truth
@@ -147,16 +151,16 @@ def _found(run: Path, problem: Problem, found: RunFolder) -> tuple[dict[str, np.
     unknowns = [key for stage in stages.stages[:last] for key in stage.unknowns if key not in full]
     if not unknowns:
         return values, truth
-    whole = Problem.from_file(stages.problem).renderer
-    earlier = list(member_values(whole, dict.fromkeys(unknowns, np.zeros(()))))
+    renderer = Problem.from_file(stages.problem).renderer
+    earlier = list(member_values(renderer, dict.fromkeys(unknowns, np.zeros(()))))
     there = problem.renderer.parameters()
     for key in earlier:
         if key not in there:
-            raise InputError(f"{run}: the scene of this stage has no {key}, which an earlier one found")
+            raise InputError(f"{run}: the scene of this stage has no {key}, which an earlier stage recovered")
     for index in range(last):
         folder = stages_file.folder_of(stages, index, run.resolve().parent)
         if (folder / schema.RECORD).is_file():
-            known = member_values(whole, folders.read(folder).truth)
+            known = member_values(renderer, folders.read(folder).truth)
             truth = {key: value for key, value in known.items() if key in earlier} | truth
     own = problem.renderer.values(earlier)
     return {key: arrays.numpy(value) for key, value in own.items()} | values, truth
@@ -165,21 +169,21 @@ def _found(run: Path, problem: Problem, found: RunFolder) -> tuple[dict[str, np.
 def _problem(
     problem: Problem, held_out: Path, parameters: Mapping[str, np.ndarray], run: RunFolder
 ) -> tuple[Problem, dict[str, np.ndarray], list[str]]:
-    """What was found with the held-out views, and its values."""
+    """Return the problem with the held-out views, the values of its parameters, and the notices."""
     other = Problem.from_file(held_out)
     known = scene_renderer(other.renderer).parameters()
-    kept = [key for key in parameters if key in known]
-    if not kept:
+    shared = [key for key in parameters if key in known]
+    if not shared:
         raise InputError(f"{held_out}: its scene has none of the run's parameters, such as {problem.parameters[0].key}")
     left_out = [key for key in parameters if key not in known and key not in OF_PHOTOGRAPHS]
     notices = [f"{', '.join(left_out)}: not in the scene of {held_out.name}, left out"] if left_out else []
     bounds = {parameter.key: parameter.bounds for parameter in problem.parameters if parameter.keys is None}
-    plain = [Parameter(key, bounds=bounds.get(key)) for key in kept]
+    plain = [Parameter(key, bounds=bounds.get(key)) for key in shared]
     judged = Problem(other.origin["scene"], plain, other.given_views, max_depth=problem.max_depth, name=other.name)
     if not isinstance(judged.renderer, MitsubaRenderer):
         raise InputError(f"{held_out}: it is not rendered by Mitsuba")
     judged = reopen.with_meshes(judged, run)
-    values = {key: parameters[key] for key in kept}
+    values = {key: parameters[key] for key in shared}
     for key, shape in judged.shapes().items():
         if shape != np.shape(values[key]):
             raise InputError(f"{held_out}: {key} has shape {shape}, the run's {np.shape(values[key])}")
@@ -196,9 +200,9 @@ def _render(
     scratch: Path,
     folder: Path,
 ) -> tuple[list[np.ndarray], list[np.ndarray], Albedo | None]:
-    """Pictures of all views, those under another light, and how near the base colour is; the light's pictures are written.
+    """Return the pictures of all views, those under another light, and the errors of the base colour; write the pictures of the light.
 
-    `upright`: whether that light is turned so that its sky is where the cameras' up axes point.
+    `upright`: whether the other light is rotated so that its sky is in the direction of the cameras' up axes.
     """
     with phases.phase("pictures") as advance:
         images = []
@@ -247,11 +251,11 @@ def _albedo(
 
 
 def _unknown_of_photographs(problem: Problem) -> list[str]:
-    """A line for each unknown that photographs held out have values of their own of."""
+    """Return a line for each kind of unknown that has separate values for each photograph."""
     moved = {parameter.key for parameter in problem.parameters}
     lines = {
-        EXPOSURE: "exposures of photographs were unknown: each rendering is measured after its best factors",
-        POSES: "poses of photographs were corrected; those that are held out have the ones that they were given",
+        EXPOSURE: "exposures of photographs were unknown: each rendering is measured after multiplication by its best factors",
+        POSES: "poses of photographs were corrected; held-out photographs have uncorrected poses",
     }
     return [line for key, line in lines.items() if key in moved]
 
@@ -259,7 +263,7 @@ def _unknown_of_photographs(problem: Problem) -> list[str]:
 def _photographed(
     problem: Problem, images: list[np.ndarray], of_camera: Mapping[str, np.ndarray], exposed: bool
 ) -> list[np.ndarray]:
-    """Renderings as the photographs' lens, exposures and response would have them."""
+    """Apply vignetting, exposure and response of the camera to the renderings."""
     if VIGNETTING in of_camera:
         images = [image * falloff(of_camera[VIGNETTING], *image.shape[:2]) for image in images]
     if exposed:
@@ -271,19 +275,19 @@ def _photographed(
 
 
 def _exposed(image: np.ndarray, view: Any) -> np.ndarray:
-    """A rendering times the factors of its channels that bring it nearest to the photograph inside the mask."""
+    """Multiply the channels of a rendering by the factors that bring it closest to the photograph inside the mask."""
     mask = mask_of(view) > 0
     return image * best_factors(image[mask], np.asarray(view.reference)[mask])
 
 
 def _measure(problem: Problem, images: list[np.ndarray]) -> list[Measures]:
-    found = []
+    measures = []
     for name, view, image in zip(names_of(problem), problem.views, images, strict=True):
         try:
-            found.append(measure(image, np.asarray(view.reference), mask_of(view)))
+            measures.append(measure(image, np.asarray(view.reference), mask_of(view)))
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
-    return found
+    return measures
 
 
 def _record(
@@ -295,8 +299,8 @@ def _record(
     spp: int,
     notices: list[str],
 ) -> dict[str, Any]:
-    def plain(found: dict[str, Any]) -> dict[str, Any]:
-        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in found.items()}
+    def plain(fields: dict[str, Any]) -> dict[str, Any]:
+        return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in fields.items()}
 
     return {
         "held_out": str(held_out),

@@ -1,4 +1,4 @@
-"""How near a rendering is to a photograph where a mask says that the object is."""
+"""Error measures between a rendering and a photograph inside a mask of the object."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _WINDOW = 7
 
 @dataclass(frozen=True)
 class Measures:
-    """Of one photograph.
+    """The measures of one photograph.
 
     Attributes:
-        psnr: in dB, over the pixels of the mask, as displayed; infinite for equal ones.
-        ssim: mean over the mask of the map of structural similarity, windows of 7 pixels, black outside the mask; None for pictures that
-            are smaller than a window.
-        lpips: of the mask's bounding box, black outside the mask; None where the network is missing or the box is too small.
-        exposure: factor before the sRGB curve: 1 for photographs within [0, 1], else that of `metrics.exposure`.
+        psnr: peak signal-to-noise ratio in dB over the pixels of the mask, as displayed; infinite for equal pictures.
+        ssim: mean over the mask of the structural similarity with windows of 7 pixels, black outside the mask; None for pictures smaller
+            than a window.
+        lpips: LPIPS of the bounding box of the mask, black outside the mask; None if the network is missing or the box is too small.
+        exposure: factor before the sRGB curve: 1 for photographs within [0, 1], otherwise that of `metrics.exposure`.
     """
 
     psnr: float
@@ -34,14 +34,15 @@ class Measures:
 
 @dataclass(frozen=True)
 class Albedo:
-    """A recovered base colour against the true one, over all pixels of the mask of all views.
+    """The errors of a recovered base colour against the true one, over all pixels of the masks of all views.
 
-    Light and base colour are known up to a factor for each channel, so the error is given as it is and after the best factors.
+    Light and base colour are determined only up to a factor for each channel. Therefore there are two errors: without and with the best
+    factors.
 
     Attributes:
         rmse: root mean square error.
-        scaled_rmse: after the factors.
-        factors: of the channels, those of least squares.
+        scaled_rmse: root mean square error after multiplication by the factors.
+        factors: factors of the channels by least squares.
     """
 
     rmse: float
@@ -50,7 +51,7 @@ class Albedo:
 
 
 def shown(image: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Both (H, W, 3) as a screen shows them, in [0, 1] and black outside the mask; and the exposure."""
+    """Return both (H, W, 3) pictures as displayed, in [0, 1] and black outside the mask; and the exposure."""
     inside = mask[..., None] > 0
     counted = photograph[mask > 0]
     factor = 1.0 if counted.max(initial=0.0) <= 1 else metrics.exposure(counted)
@@ -60,7 +61,11 @@ def shown(image: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> tuple[
 
 
 def measure(image: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> Measures:
-    """Of a rendering against a photograph, linear (H, W, 3); mask (H, W), above 0 inside. Raises `InputError` for an empty mask."""
+    """Return the measures of a rendering against a photograph, both linear (H, W, 3), with a mask (H, W) that is positive inside.
+
+    Raises:
+        InputError: the mask is empty.
+    """
     if not (mask > 0).any():
         raise InputError("a mask without a pixel")
     one, two, factor = shown(image, photograph, mask)
@@ -76,24 +81,24 @@ def _ssim(one: np.ndarray, two: np.ndarray, mask: np.ndarray) -> float | None:
 
     if min(mask.shape) < _WINDOW:
         return None
-    found: Any = structural_similarity(two, one, data_range=1.0, channel_axis=2, win_size=_WINDOW, full=True)
-    return float(found[1][mask > 0].mean())
+    similarity: Any = structural_similarity(two, one, data_range=1.0, channel_axis=2, win_size=_WINDOW, full=True)
+    return float(similarity[1][mask > 0].mean())
 
 
-def mean(found: list[Measures]) -> dict[str, float | None]:
-    """Means over photographs, by name; None where one is not known."""
-    columns = {name: [asdict(each)[name] for each in found] for name in ("psnr", "ssim", "lpips")}
+def mean(measures: list[Measures]) -> dict[str, float | None]:
+    """Return {name: mean over photographs}; None where a value is missing."""
+    columns = {name: [asdict(each)[name] for each in measures] for name in ("psnr", "ssim", "lpips")}
     return {name: None if None in values else float(np.mean(values)) for name, values in columns.items()}
 
 
-def best_factors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Of least squares: what each channel of `found` (N, 3) is to be multiplied by, (3,); 1 of a black one."""
-    squares = (found**2).sum(0)
-    return np.where(squares > 0, (found * truth).sum(0) / np.maximum(squares, 1e-30), 1.0)
+def best_factors(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the least squares factors (3,) of the channels that bring `values` (N, 3) closest to `truth`; 1 for a black channel."""
+    squares = (values**2).sum(0)
+    return np.where(squares > 0, (values * truth).sum(0) / np.maximum(squares, 1e-30), 1.0)
 
 
-def compare_albedo(found: np.ndarray, truth: np.ndarray) -> Albedo:
-    """Of pixels (N, 3) in [0, 1]."""
-    factors = best_factors(found, truth)
-    rmse, scaled = (float(np.sqrt(np.mean((x - truth) ** 2))) for x in (found, found * factors))
+def compare_albedo(values: np.ndarray, truth: np.ndarray) -> Albedo:
+    """Return the errors of the base colour of N pixels, (N, 3) in [0, 1]."""
+    factors = best_factors(values, truth)
+    rmse, scaled = (float(np.sqrt(np.mean((x - truth) ** 2))) for x in (values, values * factors))
     return Albedo(rmse, scaled, tuple(float(x) for x in factors))

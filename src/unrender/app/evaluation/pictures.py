@@ -1,4 +1,4 @@
-"""The pictures of a judgement: photographs beside renderings."""
+"""The pictures of an evaluation: photographs next to renderings."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WIDE = 1024
 
 
 def sheet(rows: Sequence[tuple[str, Sequence[np.ndarray]]], headings: Sequence[str]) -> bytes:
-    """PNG: a row of pictures, (H, W, 3) in [0, 1], for each label; two rows side by side where there are many."""
+    """Return a PNG with a row of pictures, (H, W, 3) in [0, 1], for each label; more than four rows form two columns."""
     groups = 2 if len(rows) > 4 else 1
     count = len(headings)
     lines = -(-len(rows) // groups)
@@ -47,14 +47,14 @@ def sheet(rows: Sequence[tuple[str, Sequence[np.ndarray]]], headings: Sequence[s
 
 
 def environment_picture(values: np.ndarray) -> bytes:
-    """PNG of an environment map (H, W, 3), exposed so that all but its brightest twentieth is seen; small ones enlarged."""
+    """Return a PNG of an environment map (H, W, 3), exposed for all but the brightest 5 % of its texels; small maps are enlarged."""
     picture = Image.fromarray(_bytes(srgb(values * exposure(values))))
     factor = max(1, _WIDE // picture.width)
     return _encoded(picture.resize((picture.width * factor, picture.height * factor), Image.Resampling.NEAREST))
 
 
 def plain(picture: np.ndarray) -> bytes:
-    """PNG of a picture (H, W, 3) in [0, 1]."""
+    """Return a PNG of a picture (H, W, 3) in [0, 1]."""
     return _encoded(Image.fromarray(_bytes(picture)))
 
 
@@ -65,11 +65,11 @@ def _encoded(picture: Image.Image) -> bytes:
 
 
 def _fitted(picture: np.ndarray) -> Image.Image:
-    """As wide as a cell, pixels as squares where it is enlarged."""
-    found = Image.fromarray(_bytes(picture))
-    scale = _CELL / max(found.size)
-    size = (max(1, round(found.width * scale)), max(1, round(found.height * scale)))
-    return found.resize(size, Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX)
+    """Resize a picture to the width of a cell; enlarged pixels remain squares."""
+    image = Image.fromarray(_bytes(picture))
+    scale = _CELL / max(image.size)
+    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+    return image.resize(size, Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX)
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:
@@ -82,12 +82,12 @@ _BORDER = 4
 
 
 def mask_of(view: View) -> np.ndarray:
-    """(H, W), above 0 where pixels count, of a view that was read."""
+    """Return the mask (H, W) of a loaded view, positive where pixels count."""
     return np.ones(np.asarray(view.reference).shape[:2], np.float32) if view.mask is None else np.asarray(view.mask)
 
 
 def names_of(problem: Problem) -> list[str]:
-    """Of the photographs: their files' without endings."""
+    """Return the names of the photographs: file names without extension."""
     return [
         Path(view.reference).stem if isinstance(view.reference, (str, Path)) else f"view {index}"
         for index, view in enumerate(problem.given_views)
@@ -101,14 +101,14 @@ def write(
     relit: Sequence[np.ndarray],
     measures: Sequence[Measures],
 ) -> None:
-    """Write sheet.png, cropped to the masks, and pictures/ with whole pictures, as displayed and black outside the masks.
+    """Write sheet.png, cropped to the masks, and pictures/ with full pictures, as displayed and black outside the masks.
 
     Args:
-        folder: exists.
-        problem: whose views the pictures are of.
-        images: to stand beside the photographs, linear (H, W, 3).
-        relit: under another light, shown at one exposure of their own; none for differences in their place.
-        measures: of `images`, for the labels; none where they were not measured.
+        folder: an existing folder.
+        problem: the problem of the views.
+        images: renderings, linear (H, W, 3).
+        relit: renderings under another light, with one exposure of their own; empty to show differences instead.
+        measures: measures of `images` for the labels; empty if they were not measured.
     """
     (folder / FOLDER).mkdir()
     masks = [mask_of(view) for view in problem.views]
@@ -141,10 +141,10 @@ def _label(name: str, measures: Measures) -> str:
 
 
 def _box(mask: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns about a mask."""
-    found = []
+    """Return the rows and columns of the bounding box of a mask, with a border."""
+    slices = []
     for axis in (1, 0):
         inside = np.flatnonzero((mask > 0).any(axis))
         first, last = (inside[0], inside[-1] + 1) if len(inside) else (0, mask.shape[1 - axis])
-        found.append(slice(max(int(first) - _BORDER, 0), int(last) + _BORDER))
-    return found[0], found[1]
+        slices.append(slice(max(int(first) - _BORDER, 0), int(last) + _BORDER))
+    return slices[0], slices[1]

@@ -1,4 +1,4 @@
-"""A result as a scene of plain Mitsuba, under its own light or another."""
+"""The result of a run as a scene of plain Mitsuba, under its own light or another."""
 
 from __future__ import annotations
 
@@ -22,14 +22,18 @@ HELD_OUT = "held-out.toml"
 
 
 def find(run: Path, problem: Problem) -> Path:
-    """held-out.toml beside the problem file of a run, or beside that of the stages that it is one of. Raises `InputError`."""
+    """Return held-out.toml in the folder of the problem file of a run, or in that of its stages.
+
+    Raises:
+        InputError: no such file exists.
+    """
     staged = run_folders.stage_of(run)
     origin = problem.origin.get("file", problem.origin.get("scene")) if staged is None else staged[0].problem
-    beside = None if origin is None else Path(origin).parent / HELD_OUT
-    if beside is None or not beside.is_file():
-        where = "" if beside is None else f", and there is none at {beside}"
+    candidate = None if origin is None else Path(origin).parent / HELD_OUT
+    if candidate is None or not candidate.is_file():
+        where = "" if candidate is None else f", and there is none at {candidate}"
         raise InputError(f"{run}: give --held-out FILE, a problem file with other views{where}")
-    return beside
+    return candidate
 
 
 LIGHT = "light"
@@ -37,15 +41,25 @@ _LEVEL = 0.3
 
 
 def export_scene(problem: Problem, parameters: Mapping[str, np.ndarray], folder: Path) -> Path:
-    """The scene file of a result, in a new folder. Raises `InputError` where plain Mitsuba has no such scene."""
+    """Export a result to a new folder and return its scene file.
+
+    Raises:
+        InputError: plain Mitsuba cannot represent the scene.
+    """
     scene = export((problem, parameters), folder).scene
     if scene is None:
-        raise InputError(f"{problem.name}: an emissive medium cannot be lit otherwise; expected a scene of surfaces")
+        raise InputError(
+            f"{problem.name}: the light of an emissive medium cannot be replaced; expected a scene of surfaces"
+        )
     return scene
 
 
 def read_light(path: Path) -> np.ndarray:
-    """An environment map, (H, W, 3) linear. Raises `InputError`."""
+    """Read an environment map, (H, W, 3) linear.
+
+    Raises:
+        InputError: a malformed or too small picture, or negative values.
+    """
     try:
         values = images.read(path).values
     except InputError as error:
@@ -56,12 +70,13 @@ def read_light(path: Path) -> np.ndarray:
 
 
 def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray | None = None) -> Any:
-    """The scene of a file, live. Under another light, the sensors' shutters are as if never set: their times are the turntable's, and
-    Mitsuba compiles a kernel for each.
+    """Load a scene file, optionally with another light.
+
+    Another light removes the shutter times of the sensors: these are the times of a turntable, and Mitsuba compiles a kernel for each.
 
     Args:
-        path: of a scene that `export_scene` wrote.
-        light: an environment map (H, W, 3) in place of all its lights but shapes that shine; None for its own.
+        path: a scene file of `export_scene`.
+        light: an environment map (H, W, 3) that replaces all lights except emissive shapes; None for the lights of the scene.
         to_world: (3, 3) rotation of that map.
     """
     if light is None:
@@ -88,21 +103,21 @@ def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray
 
 
 def sensors(problem: Problem) -> list[Any]:
-    """The live sensors of a problem's scene."""
+    """Return the live sensors of the scene of a problem."""
     renderer: Any = problem.renderer
     return list(renderer.pair.current.sensors())
 
 
-def up_axis(given: list[Any]) -> np.ndarray:
-    """Upwards in the world: the mean of several cameras' own up axes where they agree roughly, else y. (3,) unit."""
-    axes = [np.array(sensor.world_transform().matrix, float).reshape(4, 4)[:3, 1] for sensor in given]
+def up_axis(cameras: list[Any]) -> np.ndarray:
+    """Return the up axis of the world, (3,) unit: the mean of the up axes of several cameras if they agree roughly, otherwise y."""
+    axes = [np.array(sensor.world_transform().matrix, float).reshape(4, 4)[:3, 1] for sensor in cameras]
     mean = np.mean([axis / np.linalg.norm(axis) for axis in axes], 0)
     length = float(np.linalg.norm(mean))
     return mean / length if len(axes) > 1 and length > _LEVEL else np.array([0.0, 1.0, 0.0])
 
 
 def turned_up(up: np.ndarray) -> np.ndarray:
-    """The shortest rotation that takes y to an axis, (3, 3): environment maps have their sky at y."""
+    """Return the shortest rotation (3, 3) from y to an axis; the sky of environment maps is at y."""
     y = np.array([0.0, 1.0, 0.0])
     axis, cosine = np.cross(y, up), float(up[1])
     if cosine < -1 + 1e-9:
@@ -112,6 +127,6 @@ def turned_up(up: np.ndarray) -> np.ndarray:
 
 
 def render(scene: Any, sensor: Any, spp: int, max_depth: int, seed: int = 0, hide: bool = False) -> np.ndarray:
-    """(H, W, C) float32 by Mitsuba's path tracer, unbiased up to `max_depth`; `hide`: without lights seen directly."""
+    """Render (H, W, C) float32 by Mitsuba's path tracer, unbiased up to `max_depth`; `hide` removes directly visible lights."""
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth, "hide_emitters": hide})
     return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed)), np.float32)

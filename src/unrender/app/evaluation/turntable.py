@@ -1,4 +1,4 @@
-"""A result turned around before a camera, under a light of the user's choice."""
+"""A turntable video of a result, under a selected light."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 
 BACKGROUNDS = {"light": None, "black": 0.0, "grey": 0.18, "white": 1.0}
-"""Behind the object: what lights it, or a linear value."""
+"""Backgrounds of the object: the light itself (None), or a linear value."""
 _ANGLE = 35.0
 _MARGIN = 1.05
 _MOST_FRAMES, _LARGEST = 10_000, 4096
@@ -31,7 +31,8 @@ _MOST_FRAMES, _LARGEST = 10_000, 4096
 
 @dataclass(frozen=True)
 class _Table:
-    """Where the camera stands: `middle` and `radius` of a ball around the object, `up`, and a horizontal direction to `front`."""
+    """The placement of the camera: centre `middle` and `radius` of a bounding sphere, the axis `up`, and the horizontal direction
+    `front`."""
 
     middle: np.ndarray
     radius: float
@@ -39,7 +40,7 @@ class _Table:
     front: np.ndarray
 
     def camera(self, elevation: float) -> np.ndarray:
-        """(4, 4), Mitsuba's `to_world`, at an elevation in degrees."""
+        """Return Mitsuba's `to_world`, (4, 4), of the camera at an elevation in degrees."""
         angle = np.radians(elevation)
         direction = np.cos(angle) * self.front + np.sin(angle) * self.up
         distance = _MARGIN * self.radius / np.sin(np.radians(_ANGLE / 2))
@@ -48,13 +49,13 @@ class _Table:
         return np.array(look.matrix, float).reshape(4, 4)
 
     def turned(self, angle: float) -> np.ndarray:
-        """(4, 4), the world turned by an angle in radians about the axis through the middle."""
-        found = np.eye(4)
+        """Return the rotation of the world, (4, 4), by an angle in radians about the axis through the centre."""
+        transform = np.eye(4)
         axis = np.array(self.up)
         k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        found[:3, :3] = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
-        found[:3, 3] = self.middle - found[:3, :3] @ self.middle
-        return found
+        transform[:3, :3] = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+        transform[:3, 3] = self.middle - transform[:3, :3] @ self.middle
+        return transform
 
 
 @exclusive("turntable")
@@ -71,28 +72,28 @@ def turntable(
     background: str = "light",
     overwrite: bool = False,
 ) -> Path:
-    """A video of a run's result that turns once, before a camera and a light that stand still.
+    """Render a video of one rotation of the result of a run in front of a fixed camera under a fixed light.
 
-    All frames have one exposure, that of the first: of all of it, or of the object alone before a plain background.
+    All frames have the exposure of the first frame; with a plain background, that of the object alone.
 
     Args:
         run: a run folder.
         out: a name that ends in .mp4 (needs imageio-ffmpeg) or .gif, or a folder for PNG files.
-        environment: a picture of light from all around, in place of the scene's lights; its upper edge is `up`.
-        frames: >= 1.
-        rate: frames a second, > 0.
-        size: pixels a side, even.
+        environment: an environment map that replaces the lights of the scene; its upper edge is `up`.
+        frames: number of frames, >= 1.
+        rate: frames per second, > 0.
+        size: width and height in pixels, even.
         spp: samples per pixel.
-        elevation: of the camera, in degrees above the horizon, in (-90, 90).
-        up: the axis, (3,); None for the mean of the cameras' own, or y where there is one.
+        elevation: elevation of the camera in degrees above the horizon, in (-90, 90).
+        up: the axis, (3,); None for the mean of the cameras' up axes, or y for a single camera.
         background: "light", "black", "grey", "white".
-        overwrite: whether what stands at `out` may be replaced.
+        overwrite: whether existing files at `out` may be replaced.
 
     Returns:
-        where it was written.
+        The path of the video.
 
     Raises:
-        InputError: no result, no surface, an option out of range, or `out` cannot be written; nothing is left then.
+        InputError: no result, no surface, an option out of range, or `out` cannot be written. No files remain after an error.
     """
     variant.ensure()
     place = Path(out)
@@ -100,10 +101,10 @@ def turntable(
     axis = None if up is None else _axis(up)
     videos.check(place, overwrite)
     light = None if environment is None else scenes.read_light(Path(environment))
-    found = folders.read(run)
-    problem = reopen.with_meshes(reopen.problem_of(run), found)
+    result = folders.read(run)
+    problem = reopen.with_meshes(reopen.problem_of(run), result)
     with tempfile.TemporaryDirectory() as scratch:
-        path = scenes.export_scene(problem, problem.full(found.parameters), Path(scratch) / "scene")
+        path = scenes.export_scene(problem, problem.full(result.parameters), Path(scratch) / "scene")
         scene = scenes.load_scene(path)
         axis = scenes.up_axis(list(scene.sensors())) if axis is None else axis
         table = _table(scene, axis, problem.name)
@@ -146,7 +147,7 @@ def _table(scene: Any, up: np.ndarray, name: str) -> _Table:
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     camera = np.array(scene.sensors()[0].world_transform().matrix, float).reshape(4, 4)[:3, 3]
     front = camera - middle
-    for other in (front, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]):  # the first that is not along the axis
+    for other in (front, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]):  # the first direction that is not parallel to the axis
         level = np.array(other) - np.dot(other, up) * up
         if np.linalg.norm(level) > 1e-3 * max(np.linalg.norm(other), 1e-9):
             return _Table(middle, radius, up, level / np.linalg.norm(level))
@@ -156,7 +157,7 @@ def _table(scene: Any, up: np.ndarray, name: str) -> _Table:
 def _frames(
     scene: Any, table: _Table, count: int, size: int, spp: int, elevation: float, max_depth: int, behind: float | None
 ) -> Iterator[np.ndarray]:
-    """The camera and the light go around the object, which is the object turning before them."""
+    """Yield the frames: camera and light move around the object, which is equivalent to a rotation of the object."""
     film = {"type": "hdrfilm", "width": size, "height": size, "pixel_format": "rgba", "rfilter": {"type": "box"}}
     lights = [each for each in scene.emitters() if each.class_name() == "EnvironmentMapEmitter"]
     parameters: list[Any] = [mi.traverse(light) for light in lights]

@@ -1,4 +1,4 @@
-"""Frames as a video: .mp4, .gif, or a folder of PNG files."""
+"""Videos of frames: .mp4, .gif, or a folder of PNG files."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from unrender.core.errors import InputError
 from unrender.io import files
 
 ENDINGS = (".mp4", ".gif", "")
-"""The last is a folder."""
+"""Supported file name extensions; "" is a folder."""
 _QUALITY = 8
 
 
 def has_ffmpeg() -> bool:
-    """Whether .mp4 files can be written."""
+    """Return whether .mp4 files can be written."""
     return importlib.util.find_spec("imageio_ffmpeg") is not None
 
 
 def check(path: Path, overwrite: bool) -> None:
-    """Raise `InputError` where frames cannot become `path`."""
+    """Raise `InputError` if a video cannot be written to `path`."""
     if path.suffix.lower() not in ENDINGS:
-        raise InputError(f"--out {path}: expected a name that ends in .mp4 or .gif, or a folder's")
+        raise InputError(f"--out {path}: expected a name that ends in .mp4 or .gif, or the name of a folder")
     if path.suffix.lower() == ".mp4" and not has_ffmpeg():
         raise InputError(f"--out {path}: .mp4 needs imageio-ffmpeg: pip install 'unrender[capture]'; .gif does not")
     try:
         if path.is_dir() and path.suffix:
             raise InputError(f"--out {path}: a folder, expected a file's name")
         if path.is_dir() and any(not _is_frame(each) for each in path.iterdir()):
-            raise InputError(f"--out {path}: the folder holds other things; give a new one")
+            raise InputError(f"--out {path}: the folder contains other files; give a new folder")
         if path.is_file() and not path.suffix:
             raise InputError(f"--out {path}: a file, expected a folder's name")
         if (path.is_file() or (path.is_dir() and any(path.iterdir()))) and not overwrite:
@@ -48,7 +48,11 @@ def check(path: Path, overwrite: bool) -> None:
 
 
 def write(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    """Write frames (H, W, 3), bytes, at so many a second, as they come; heights and widths must be even. Raises `InputError`."""
+    """Write frames (H, W, 3), bytes, of even width and height, at `rate` frames per second, in the order of their arrival.
+
+    Raises:
+        InputError: the video cannot be written.
+    """
     ending = path.suffix.lower()
     try:
         if not ending:

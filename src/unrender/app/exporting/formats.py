@@ -161,7 +161,7 @@ def check(formats: Sequence[str]) -> tuple[str, ...]:
 
 
 def write(asset: Asset, folder: Path, formats: Sequence[str]) -> list[str]:
-    """Write the asset in these formats, but for Mitsuba's. Returns a line for each thing that is not carried over."""
+    """Write the asset in these formats, except that of Mitsuba; return a line for each part that is not exported."""
     notices = list(asset.notices)
     for name in formats:
         if name in FORMATS:

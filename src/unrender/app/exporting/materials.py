@@ -48,7 +48,7 @@ class Material:
 
     @property
     def textured(self) -> bool:
-        """Whether it has a map."""
+        """True if the material has a map."""
         return (
             self.base_colour.ndim > 1
             or self.roughness.ndim > 0

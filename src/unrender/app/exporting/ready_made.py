@@ -153,7 +153,7 @@ def as_bitmap(values: np.ndarray) -> Any:
 
 
 def write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
-    """Write a picture in the format of its file's ending."""
+    """Write a picture in the format of the file name extension."""
     with variant.two_threads():
         bitmap.write(str(path))
 

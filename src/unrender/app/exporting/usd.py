@@ -29,7 +29,7 @@ def _module(name: str) -> Any:
 
 
 def write(asset: Asset, folder: Path) -> None:
-    """Write asset.usdz. +Y is up, v grows upwards, roughness is perceptual, as UsdPreviewSurface has them; light is not in it."""
+    """Write asset.usdz without light. As in UsdPreviewSurface, +Y and v point upwards and roughness is perceptual."""
     check_installed()
     Usd, UsdGeom, UsdUtils = map(_module, ("Usd", "UsdGeom", "UsdUtils"))
 

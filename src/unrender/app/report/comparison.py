@@ -52,7 +52,11 @@ def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list
 
 
 def write_comparison(comparison: Comparison, notices: list[str], out: str | Path) -> Path:
-    """Write the page, its picture and its numbers; returns the page's path. Raises `InputError`."""
+    """Write the page, its picture and its numbers; return the path of the page.
+
+    Raises:
+        InputError: `out` cannot be written to.
+    """
     from unrender.app.report.overview_figure import overview_figure  # matplotlib takes a second to import
 
     folder = Path(out)

@@ -73,7 +73,7 @@ class TimeToTarget:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method by one metric.
+    """The results of one method by one metric.
 
     Attributes:
         moments: errors at `SHARES` of the time that all runs have.

@@ -34,7 +34,7 @@ _TENS = -3.0
 
 @dataclass(frozen=True)
 class Slider:
-    """Two pictures on one place, and a handle between them."""
+    """Two superimposed pictures, with a handle that moves the boundary between them."""
 
     left: Picture
     right: Picture

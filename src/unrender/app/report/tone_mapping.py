@@ -59,7 +59,7 @@ class Picture:
 
     @property
     def pixelated(self) -> bool:
-        """Whether the browser should show pixels as squares rather than blur them."""
+        """True if the browser should show pixels as squares instead of interpolating them."""
         return max(self.width, self.height) < _PIXELATED_BELOW
 
 

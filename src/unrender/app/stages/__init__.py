@@ -1,1 +1,1 @@
-"""A descent in stages: which parameters move in each, and what it begins with."""
+"""Optimisation in stages: the parameters that each stage optimises, and their initial values."""

@@ -1,4 +1,4 @@
-"""The run folders of a descent in stages: which there are, which of them has the result, and which stage one is of."""
+"""The run folders of a run in stages: their list, the folder of the result, and the stage of a folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from unrender.runs.folder import schema
 
 
 def listed(directory: Path) -> list[Path]:
-    """The run folders of a folder of stages, also of those that have not begun; of any other, itself. Raises `InputError`."""
+    """Return the run folders of a folder of stages, including stages that have not started; any other folder is returned alone.
+
+    Raises:
+        InputError: the file of stages is malformed.
+    """
     if not (directory / stages_file.FILE).is_file():
         return [directory]
     stages = stages_file.read(directory / stages_file.FILE)
@@ -20,14 +24,22 @@ def listed(directory: Path) -> list[Path]:
 
 
 def last_result(directory: Path) -> Path:
-    """Of a folder of stages, the run folder of the last that has begun; any other, as it is. Raises `InputError`."""
+    """Return the run folder of the last started stage of a folder of stages; any other folder is returned as it is.
+
+    Raises:
+        InputError: the file of stages is malformed.
+    """
     if (directory / schema.RECORD).is_file():
         return directory
     return next((run for run in reversed(listed(directory)) if (run / schema.RECORD).is_file()), directory)
 
 
 def stage_of(run: Path) -> tuple[Stages, int] | None:
-    """The stages that a run folder is one of, and its place among them; None where it is of none. Raises `InputError`."""
+    """Return the stages of a run folder and its index among them; None for a folder without stages.
+
+    Raises:
+        InputError: the file of stages is malformed.
+    """
     out, name = run.resolve().parent, run.resolve().name
     if not stages_file.is_of_run(out / stages_file.FILE):
         return None

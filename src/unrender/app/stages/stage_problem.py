@@ -1,4 +1,4 @@
-"""The problem of a stage: its unknowns start where earlier stages left them, and what does not move is part of the scene."""
+"""The problem of a stage: its unknowns start at the values of earlier stages, and its scene contains the fixed values."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ __all__ = ["Whole"]
 
 @dataclass(frozen=True)
 class Whole:
-    """A problem with the unknowns of all stages, without its scene in memory: kernels are compiled for all scenes that are loaded.
+    """A problem with the unknowns of all stages, without its scene in memory: Mitsuba compiles kernels for all loaded scenes.
 
     Attributes:
         scene: an XML file.
-        parameters, views, loss, max_depth, truth, name: of `Problem`, as given.
-        known: what the renderer says of each unknown.
+        parameters, views, loss, max_depth, truth, name: attributes of `Problem`.
+        known: the renderer's description of each unknown.
     """
 
     scene: Path
@@ -45,11 +45,11 @@ class Whole:
 
     @classmethod
     def read(cls, stages: Stages) -> Whole:
-        """Of the stages' problem file.
+        """Read the problem file of the stages.
 
         Raises:
-            InputError: it is malformed, a stage names what is no parameter of it, leaves out what no scene can hold, or remeshes a mesh
-                that later stages know by its first triangles.
+            InputError: the file is malformed, a stage names an unknown that is no parameter of it, leaves out an unknown that no scene
+                can hold, or remeshes a mesh whose first triangles later stages need.
         """
         problem = Problem.from_file(stages.problem)
         known = problem.renderer.parameters()
@@ -67,15 +67,15 @@ class Whole:
         )
 
     def of_stage(self, stage: Stage, values: Mapping[str, np.ndarray], folder: Path) -> Problem:
-        """The problem of a stage.
+        """Return the problem of a stage.
 
         Args:
-            stage: its keys are among the unknowns.
-            values: {key: array} of what earlier stages found; those that the stage does not move become part of its scene.
-            folder: of that scene, where one has to be written; what is there already is taken.
+            stage: the stage; its keys are among the unknowns.
+            values: {key: array} of the results of earlier stages; those that the stage does not optimise become part of its scene.
+            folder: folder of that scene, if one is needed; an existing scene is reused.
 
         Raises:
-            InputError: the folder cannot be written, or one of the stage's keys has another name in the scene that is written.
+            InputError: the folder cannot be written, or a key of the stage has another name in the exported scene.
         """
         scene = self.scene
         fixed = {key: value for key, value in values.items() if key not in stage.unknowns}
@@ -98,10 +98,10 @@ class Whole:
     def _check_names(self, stage: Stage, written: scene_folder.Exported) -> None:
         for key in stage.unknowns:
             if key in written.renamed:
-                shutil.rmtree(written.folder)  # else it would be taken the next time
+                shutil.rmtree(written.folder)  # otherwise the next call would reuse it
                 raise InputError(
-                    f"stage {stage.name}: {key} is called {written.renamed[key]} in the scene that holds what earlier stages found; "
-                    f"give what it belongs to an id of its own in {self.scene}"
+                    f"stage {stage.name}: {key} is called {written.renamed[key]} in the scene with the results of earlier stages; "
+                    f"give the object that it belongs to an id in {self.scene}"
                 )
 
     def _parameter(self, key: str, stage: Stage, value: np.ndarray | None) -> Parameter:

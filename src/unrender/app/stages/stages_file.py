@@ -1,23 +1,23 @@
 """Stages as TOML files.
 
     problem = "problem.toml"                   # all unknowns, views and the loss
-    method = "auto"                            # of the stages that name none
-    settings = { pixels = 16384 }              # of the method, likewise
-    steps = 600                                # of all stages together; or seconds
+    method = "auto"                            # default method of the stages
+    settings = { pixels = 16384 }              # default settings of the method
+    steps = 600                                # total of all stages; or seconds
     seed = 0
 
     [[stages]]
     name = "light-and-colour"
     unknowns = ["asset.bsdf.base_color.data", "light.data"]
-    share = 2.0                                # of the steps or seconds, against the other stages'
-    coarser = 4                                # textures have so many times fewer texels a side
+    share = 2.0                                # of the steps or seconds, relative to the other stages
+    coarser = 4                                # factor by which textures have fewer texels per side
 
     [[stages]]
     name = "all"
     unknowns = ["asset.bsdf.base_color.data", "asset.bsdf.roughness.data", "light.data"]
 
-Paths are relative to the file. Only `problem`, `name` and `unknowns` are required. In a run's folder, the file has a table [run], too:
-how it was begun, so that it goes on likewise.
+Paths are relative to the file. Only `problem`, `name` and `unknowns` are required. In the folder of a run, the file also has
+a table [run] with the options of the run, which `unrender resume` uses.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from unrender.io.toml_lines import Place
 from unrender.io.toml_models import Table
 
 FILE = "stages.toml"
-"""In an import's folder, and in that of a run in stages."""
+"""Name of the file in the folder of an import, and in that of a run in stages."""
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,39}")
 _MOST = 99
 
@@ -46,12 +46,12 @@ class Stage:
     """One run of several.
 
     Attributes:
-        name: of its folder.
-        unknowns: keys of the problem's parameters that move; the others stay as earlier stages left them.
-        share: of the budget, in proportion to the other stages', > 0.
-        coarser: how many times fewer texels its textures and grids have along each side, >= 1. They are interpolated at its end.
-        method: as on the command line; None for that of all stages.
-        settings: of the method, beside those of all stages.
+        name: name of its folder.
+        unknowns: keys of the parameters that it optimises; the others keep the values of earlier stages.
+        share: its share of the budget, relative to the other stages, > 0.
+        coarser: factor by which its textures and grids have fewer texels along each side, >= 1. They are interpolated at its end.
+        method: as on the command line; None for the default method.
+        settings: settings of the method, in addition to those of all stages.
     """
 
     name: str
@@ -64,11 +64,11 @@ class Stage:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a run in stages, which are no part of what is run.
+    """Options of a run in stages that do not affect its results.
 
     Attributes:
-        variant: of Mitsuba.
-        threads: of the processor; None for one per core.
+        variant: variant of Mitsuba.
+        threads: number of threads; None for one per core.
         checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
     """
 
@@ -80,15 +80,15 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Stages:
-    """Runs of one problem, each from where the one before it ended.
+    """Consecutive runs of one problem, each of which starts at the result of the previous one.
 
     Attributes:
         problem: a problem file.
-        stages: at least one.
-        method, settings: of the stages that name none.
-        steps, seconds: of all stages together; None where there is no such budget.
-        seed: of the first stage; the next have the next numbers.
-        run: how it was begun; None outside of a run's folder.
+        stages: the stages, at least one.
+        method, settings: defaults of the stages.
+        steps, seconds: total budget of all stages; None without such a budget.
+        seed: seed of the first stage; later stages have consecutive seeds.
+        run: options of the run; None outside of the folder of a run.
     """
 
     problem: Path
@@ -101,7 +101,7 @@ class Stages:
     run: RunOptions | None = None
 
     def settings_of(self, stage: Stage) -> dict[str, str]:
-        """The method's settings in a stage, as on the command line."""
+        """Return the settings of the method in a stage, as on the command line."""
         both = {**(self.settings or {}), **(stage.settings or {})}
         return {key: str(value).lower() if isinstance(value, bool) else str(value) for key, value in both.items()}
 
@@ -143,13 +143,14 @@ class _Stages(Table):
 
 
 def is_stages(path: Path) -> bool:
-    """Whether a TOML file describes stages and no problem. False for what cannot be read: whoever reads it will say why."""
-    found = _parsed(path)
-    return "stages" in found and "scene" not in found
+    """Return whether a TOML file describes stages, not a problem; False for a file that cannot be read, whose error a later reader
+    reports."""
+    content = _parsed(path)
+    return "stages" in content and "scene" not in content
 
 
 def is_of_run(path: Path) -> bool:
-    """Whether a file of stages is that of a run, which `write` wrote, and none that a user or an import did. False as above."""
+    """Return whether a file of stages is one that `write` wrote to the folder of a run; False for a file that cannot be read."""
     problem = _parsed(path).get("problem")
     return is_stages(path) and isinstance(problem, str) and Path(problem).is_absolute()
 
@@ -162,10 +163,10 @@ def _parsed(path: Path) -> dict[str, Any]:
 
 
 def read(path: str | Path) -> Stages:
-    """The stages that a TOML file describes.
+    """Read the stages of a TOML file.
 
     Raises:
-        InputError: "stages.toml:12: stages[0].share: ...": the file, the line, the field, what was expected.
+        InputError: "stages.toml:12: stages[0].share: ...": the file, the line, the field, the expected value.
     """
     file = Path(path)
     model, content = toml_models.read(file, _Stages, {"stages": _Stage, "run": _Run})
@@ -191,13 +192,13 @@ def read(path: str | Path) -> Stages:
 
 
 def text(stages: Stages, note: str) -> str:
-    """The file's content, under a comment."""
+    """Return the content of the file, after a comment."""
     head: dict[str, Any] = {"problem": str(stages.problem), "method": stages.method, "settings": stages.settings}
     head |= {"steps": stages.steps, "seconds": stages.seconds, "seed": stages.seed}
     parts = [f"# {note}\n", tomli_w.dumps({key: value for key, value in head.items() if value not in (None, {})})]
     if stages.run is not None:
-        given = {key: value for key, value in asdict(stages.run).items() if value is not None}
-        parts.append(tomli_w.dumps({"run": given}))
+        options = {key: value for key, value in asdict(stages.run).items() if value is not None}
+        parts.append(tomli_w.dumps({"run": options}))
     for stage in stages.stages:
         table = {"name": stage.name, "unknowns": list(stage.unknowns), "share": stage.share}
         table |= {"coarser": stage.coarser} if stage.coarser > 1 else {}
@@ -207,27 +208,31 @@ def text(stages: Stages, note: str) -> str:
 
 
 def write(stages: Stages, folder: Path) -> None:
-    """The file of a run in stages, with the problem's path in full. Raises `OSError`."""
-    whole = replace(stages, problem=stages.problem.resolve())
-    note = "Stages under way: `unrender resume` goes on with those that are left"
-    files.write(folder / FILE, toml_lines.encode(text(whole, note), str(folder / FILE)))
+    """Write the file of a run in stages, with the absolute path of the problem.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    absolute = replace(stages, problem=stages.problem.resolve())
+    note = "Stages of a run: `unrender resume` continues with the unfinished ones"
+    files.write(folder / FILE, toml_lines.encode(text(absolute, note), str(folder / FILE)))
 
 
 def split(stages: Stages) -> list[tuple[int | None, float | None]]:
-    """Steps and seconds of each stage, in proportion to the shares; every stage has one step at least."""
-    whole = sum(stage.share for stage in stages.stages)
-    ends, found = 0.0, []
-    given = 0
+    """Return steps and seconds of each stage, in proportion to the shares; every stage has at least one step."""
+    total = sum(stage.share for stage in stages.stages)
+    ends, budgets = 0.0, []
+    assigned = 0
     for stage in stages.stages:
         ends += stage.share
         steps = None
         if stages.steps is not None:
-            steps = max(1, round(stages.steps * ends / whole) - given)
-            given += steps
-        found.append((steps, None if stages.seconds is None else stages.seconds * stage.share / whole))
-    return found
+            steps = max(1, round(stages.steps * ends / total) - assigned)
+            assigned += steps
+        budgets.append((steps, None if stages.seconds is None else stages.seconds * stage.share / total))
+    return budgets
 
 
 def folder_of(stages: Stages, index: int, out: Path) -> Path:
-    """The run folder of a stage."""
+    """Return the run folder of a stage."""
     return out / f"{index + 1}-{stages.stages[index].name}"

@@ -105,7 +105,7 @@ def parse_axes(
 
 
 def as_text(value: Any) -> str:
-    """Return a value of an option as sweep.json and the command line hold it."""
+    """Return a value of an option as text, as in sweep.json and on the command line."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -177,7 +177,7 @@ def _range(name: str, values: str, method: Method) -> Axis | None:
 
 
 def _is_whole(name: str, method: Method) -> bool:
-    """Whether the option accepts integers only.
+    """Return whether the option accepts integers only.
 
     Raises:
         InputError: an option that is not a number, or an unknown option.

@@ -50,7 +50,7 @@ def medians(finished: Iterable[Mapping[float, float]]) -> dict[float, float]:
 
 
 def is_hopeless(errors: Mapping[float, float], limits: Mapping[float, float]) -> bool:
-    """Whether a run should be stopped: its last error exceeds the median there, and its predicted final error exceeds the final median.
+    """Return whether to stop a run: its last error exceeds the median there, and its predicted final error exceeds the final median.
 
     The prediction assumes that the error continues to fall by the factor per fraction of the budget between its last two measurements.
     The second condition spares runs that converge slowly at first and end best, as small learning rates do.

@@ -113,7 +113,7 @@ class TrialRecord(BaseModel):
 
     @property
     def line(self) -> str:
-        """Its settings as `unrender run` takes them."""
+        """The settings, as options of `unrender run`."""
         from shlex import quote
 
         return " ".join(f"-s {quote(f'{name}={value}')}" for name, value in self.settings.items())

@@ -35,12 +35,12 @@ class Search(Protocol):
 
     @property
     def trials(self) -> int:
-        """How many there are to be."""
+        """The number of trials."""
         ...
 
     @property
     def learns(self) -> bool:
-        """Whether proposals depend on the outcomes of earlier trials."""
+        """True if proposals depend on the outcomes of earlier trials."""
         ...
 
     def ask(self, number: int) -> dict[str, str]:
@@ -54,7 +54,7 @@ class Search(Protocol):
 
 @dataclass(frozen=True)
 class Grid:
-    """Every combination of the axes' points, the last axis fastest.
+    """All combinations of the points of the axes; the last axis varies fastest.
 
     Raises:
         InputError: a range without a number of points, or more combinations than 100 000.
@@ -83,12 +83,12 @@ class Grid:
         return {axis.name: values[axis.name] for axis in self.axes}
 
     def tell(self, number: int, outcome: TrialOutcome) -> None:
-        """See `Search.tell`."""
+        """Do nothing: the settings do not depend on outcomes."""
 
 
 @dataclass(frozen=True)
 class Random:
-    """Independent settings, each a function of the seed and the number: a longer sweep begins with the trials of a shorter one."""
+    """Independent random settings, each a function of the seed and the number: a longer sweep begins with the trials of a shorter one."""
 
     axes: Sequence[Axis]
     trials: int
@@ -103,7 +103,7 @@ class Random:
         return {axis.name: axis.at(key.fold(i).uint32() / 2**32) for i, axis in enumerate(self.axes)}
 
     def tell(self, number: int, outcome: TrialOutcome) -> None:
-        """See `Search.tell`."""
+        """Do nothing: the settings do not depend on outcomes."""
 
 
 @dataclass

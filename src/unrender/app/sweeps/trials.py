@@ -15,12 +15,12 @@ from unrender.core.errors import InputError
 
 @dataclass(frozen=True)
 class Started:
-    """A trial that may begin.
+    """A trial to start.
 
     Attributes:
         number: from 0.
         settings: {option: value as text}.
-        limits: by which its first run is pruned, see `pruning.is_hopeless`; {} prunes none.
+        limits: limits of the pruning of its first run, see `pruning.is_hopeless`; {} disables pruning.
     """
 
     number: int
@@ -51,12 +51,12 @@ class Trials:
 
     @property
     def dependent(self) -> bool:
-        """Whether trials depend on earlier ones."""
+        """True if trials depend on earlier ones."""
         return self.prune or self.search.learns
 
     @property
     def done(self) -> bool:
-        """Whether all trials have ended."""
+        """True if all trials have ended."""
         return len(self.ended) >= self.search.trials
 
     def next(self) -> Started | None:

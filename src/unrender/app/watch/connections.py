@@ -51,7 +51,7 @@ class Connection(H11Protocol):
 
     @property
     def admitted(self) -> bool:
-        """Whether the last request showed the token."""
+        """True if the last request showed the token."""
         return bool(self.scope) and _ADMITTED in self.scope.get("state", {})
 
     def _is_stranger(self) -> bool:

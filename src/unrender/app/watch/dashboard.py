@@ -60,24 +60,24 @@ class RunRow:
 
     @property
     def colour(self) -> int:
-        """Of its curves."""
+        """The index of the colour of its curves."""
         return self.number % _COLOURS
 
 
 class PictureCache:
-    """The pictures that a page may ask for, by names that this class gives; of the last few pages."""
+    """A cache of the pictures of the last few pages, by names that it assigns."""
 
     def __init__(self) -> None:
         self._entries: dict[str, tuple[int, PictureData]] = {}
         self.pages = 0
 
     def start_page(self) -> None:
-        """Start a page: drop the pictures that only pages before the last few show."""
+        """Start a page: remove the pictures that none of the last few pages shows."""
         self.pages += 1
         self._entries = {name: of for name, of in self._entries.items() if self.has_page(of[0])}
 
     def has_page(self, page: int) -> bool:
-        """Whether the pictures of the page with number `page` (the value of `pages` at that time) are still cached."""
+        """Return whether the pictures of the page with number `page` (the value of `pages` at that time) are still cached."""
         return page > self.pages - _CACHED_PAGES
 
     def add(self, picture: PictureData) -> str:

@@ -55,7 +55,7 @@ class Snapshot:
 
     @property
     def accepts_commands(self) -> bool:
-        """Whether the run reads commands."""
+        """True if the run reads commands."""
         return self.state in (RUNNING, PAUSED)
 
 
@@ -190,7 +190,7 @@ def _views(start: dict[str, np.ndarray], now: dict[str, np.ndarray], where: Path
 
 
 def _alive(status: LiveStatus) -> bool:
-    """Whether the process of the run is alive; True if this machine cannot tell."""
+    """Return whether the process of the run is alive; True if this machine cannot tell."""
     if status.process is None or status.host != platform.node():
         return True
     try:

@@ -195,7 +195,7 @@ class _AccessControl:
 
 @dataclass(frozen=True)
 class _RenderedPage:
-    """A page as rendered: from which revisions of the runs, and its number in the cache of pictures."""
+    """A rendered page, with the revisions of the runs and its number in the cache of pictures."""
 
     revisions: tuple[int, ...]
     page: int

@@ -78,12 +78,12 @@ class ParameterTraits:
 
     @property
     def shares_paths(self) -> bool:
-        """Whether two values of the parameter can share one path."""
+        """True if two values of the parameter can share one path."""
         return not self.reason
 
     @property
     def changes_delta(self) -> bool:
-        """Whether perfectly specular lobes depend on the parameter."""
+        """True if perfectly specular lobes depend on the parameter."""
         return bool(self.delta_lobes)
 
 

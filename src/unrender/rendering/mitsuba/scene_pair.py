@@ -296,12 +296,12 @@ class ScenePair:
 
     @property
     def emissive(self) -> bool:
-        """Whether there is a medium that emits."""
+        """True if a medium emits."""
         return any(emissive.emits(medium) for medium in media(self.current))
 
     @property
     def radiance_field(self) -> bool:
-        """Whether all media emit in every direction."""
+        """True if all media emit in every direction."""
         return all(emissive.is_positive(medium) for medium in media(self.current))
 
     def parameter_traits(self, key: str) -> ParameterTraits:

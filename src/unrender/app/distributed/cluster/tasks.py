@@ -44,7 +44,7 @@ class Executor(Protocol):
 
     @property
     def pending(self) -> int:
-        """How many are begun and have not been returned by `wait`."""
+        """The number of tasks that are started and have not been returned by `wait`."""
         ...
 
     def start(self, key: Any, *arguments: Any) -> None:
@@ -54,7 +54,7 @@ class Executor(Protocol):
     def wait(self, seconds: float) -> list[Ended]:
         """Return completed tasks in the order of their start; [] if none completes within `seconds`.
 
-        An interrupt (`KeyboardInterrupt`) propagates after the running tasks were told to stop.
+        An interrupt (`KeyboardInterrupt`) propagates after the running tasks were cancelled.
         """
         ...
 

@@ -284,7 +284,7 @@ class MovedPair:
 
     @property
     def _reconnects(self) -> bool:
-        """Whether there are any reconnections."""
+        """True if there are any reconnections."""
         return self.max_depth > 2 and self.share > 0
 
     def _may_add(self, tables: Mapping[str, Any], path: PairState, ray: Any) -> Bool:
