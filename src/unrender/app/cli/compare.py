@@ -102,9 +102,7 @@ def compare(
         try:
             command = arguments.command_line(context)
             job = _job(what[0], options, not no_cache, command, folder)
-            turns = itertools.product(
-                range(seed, seed + seeds), chosen
-            )  # interleaved, so that a slower machine affects all methods
+            turns = itertools.product(range(seed, seed + seeds), chosen)  # a slow machine affects all methods
             runs = [_run_task(method.name, given[method.name], seconds, n, final_spp) for n, method in turns]
             with _prepared(console, job, runs, variant, where) as comparison:
                 directories, status = _run_all(console, comparison, progress)

@@ -83,9 +83,7 @@ def execution(
     settings = {name: value for name, value in settings.items() if value}
     for line in advice.remarks(problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
-    earlier = {
-        name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES
-    }  # time of earlier runs
+    earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # earlier runs
     spent = 0.0 if order.began is None else time.perf_counter() - order.began
     annotations = RunAnnotations(
         order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, order.within_seconds, spent

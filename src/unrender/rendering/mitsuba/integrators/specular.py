@@ -84,7 +84,7 @@ class DeltaLobes:
 
 
 def on_its_side(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> Bool:
-    """Whether a sampled direction is on the side of the surface that its lobe has, reflection or transmission.
+    """Return whether a sampled direction is on the side of the surface that its lobe has, reflection or transmission.
 
     A microfacet's reflection may point into the surface. Mitsuba rejects such a direction by a weight of 0, and no density counts it.
     Other lobes may still have a value there, which their own samples bring in.
