@@ -84,8 +84,7 @@ def judge(
 
     Args:
         run: a run folder.
-        held_out: a problem file whose views are the photographs; None for held-out.toml in the folder of the problem file of the run,
-            or of its stages.
+        held_out: a problem file whose views are the photographs; None for held-out.toml next to the problem file of the run.
         environment: an environment map that replaces the light. Nothing is measured then, unless `held_out` is given: its photographs
             must have been taken under this light, which has the axes of the world of the scene.
         spp: samples per pixel.
@@ -93,8 +92,7 @@ def judge(
         overwrite: whether an earlier evaluation may be replaced.
 
     Raises:
-        InputError: no result, no held-out problem, a scene without the parameters of the run, or `out` cannot be written. No files remain
-            after an error.
+        InputError: no result, no held-out problem, a scene without the parameters of the run, or `out` cannot be written.
     """
     variant.ensure()
     if not isinstance(spp, int) or spp < 1:
@@ -132,7 +130,7 @@ def judge(
         notices.append(metrics.MISSING)
     if not measured:
         notices.append(
-            "nothing is measured: the photographs show another light; --held-out names photographs under this light"
+            "nothing is measured: the photographs show another light; --held-out names others under this light"
         )
     return Judgement(place, tuple(names_of(judged)), tuple(measures), albedo, tuple(notices))
 
