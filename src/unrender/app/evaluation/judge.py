@@ -84,7 +84,7 @@ def judge(
 
     Args:
         run: a run folder.
-        held_out: a problem file whose views are the photographs; None for held-out.toml next to the problem file of the run.
+        held_out: a problem file with the photographs; None for held-out.toml next to the problem file of the run or its stages.
         environment: an environment map that replaces the light. Nothing is measured then, unless `held_out` is given: its photographs
             must have been taken under this light, which has the axes of the world of the scene.
         spp: samples per pixel.
@@ -129,9 +129,7 @@ def judge(
     if measured and not metrics.available():
         notices.append(metrics.MISSING)
     if not measured:
-        notices.append(
-            "nothing is measured: the photographs show another light; --held-out names others under this light"
-        )
+        notices.append("nothing is measured: the photographs show another light; see --held-out")
     return Judgement(place, tuple(names_of(judged)), tuple(measures), albedo, tuple(notices))
 
 
