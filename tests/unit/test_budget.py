@@ -104,3 +104,9 @@ def test_a_resumed_run_has_what_is_left_of_its_budget(tmp_path: Path, monkeypatc
 
 def test_slowdown_is_at_least_one() -> None:
     assert 1.0 <= budget.slowdown() < 1e3
+
+
+def test_a_run_that_its_budget_ends_before_a_third_step_is_told() -> None:
+    found = ur.optimize(problem(), slow(0.5), ur.optimizers.Adam(0.01), seconds=0.6)
+    assert found.steps < 3
+    assert sum("allows about" in line for line in found.warnings) == 1

@@ -55,7 +55,8 @@ class Budget(Hook):
             run.stop("seconds")
         if run.last_step is not None and run.step and time.perf_counter() + 0.5 * run.clock / run.step >= run.last_step:
             run.stop("seconds")
-        if run.step == _MEASURED and not run.stopped:
+        early = run.stopped == "seconds" and 0 < run.step <= _MEASURED
+        if early or (run.step == _MEASURED and not run.stopped):
             _warn_of_few_steps(run)
         if descent.state.skipped_in_a_row >= _MOST_SKIPPED:
             run.stop(NON_FINITE)

@@ -66,8 +66,8 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
     xyz = form.colour == "xyz"
     if xyz and not (image.notice or image.labelled_xyz or _is_of_film(source)):
         raise InputError(
-            "the file names its channels R, G and B, but the film's pixel_format is xyz, so either may be meant; write XYZ values to a .npy "
-            "file, or use the pixel_format rgb"
+            "the file names its channels R, G and B, but the film's pixel_format is xyz, so either may be meant; "
+            "write XYZ values to a .npy file, or use the pixel_format rgb"
         )
     if not form.signed:
         _check_not_negative(values)

@@ -26,7 +26,8 @@ __all__ = ["beside", "cameras", "cameras_by_paths", "few_numbers"]
 def cameras(traits: Traits) -> Plan | None:
     """Return Gauss-Newton steps where poses of sensors alone are unknown; else None."""
     constants, problem = traits.constants, traits.problem
-    if not traits.only_cameras or not traits.newton_suits or traits.elements > constants.most_elements:
+    of_cameras = traits.only_cameras or traits.cameras_and_lenses
+    if not of_cameras or not traits.newton_suits or traits.elements > constants.most_elements:
         return None
     spp = traits.options.spp or sampling.within(constants.image_spp, constants.image_paths // problem.pixels)
     spp, derivative_spp = max(spp, 2), max(spp // constants.per_derivative, constants.fewest_derivative)

@@ -64,6 +64,12 @@ class Traits:
         return all(info.viewpoint and info.rigid for info in self.infos.values())
 
     @property
+    def cameras_and_lenses(self) -> bool:
+        """Whether all unknowns are poses and lenses of sensors, both among them."""
+        rigid = {info.rigid for info in self.infos.values() if info.perturbable}
+        return rigid == {True, False} and all(info.viewpoint for info in self.infos.values())
+
+    @property
     def newton_suits(self) -> bool:
         """Whether nothing rules out Gauss-Newton steps: no image or pixels asked for, a loss of pixels, no preconditioners."""
         asked = self.options.image is not None or self.options.pixels is not None

@@ -32,6 +32,11 @@ def moved_sensor(scene: LoadedScene, key: str) -> str:
     return owner if any(sensor.id() == owner for sensor in scene.scene.sensors()) else ""
 
 
+def is_of_sensor(scene: LoadedScene, key: str) -> bool:
+    """Return whether a parameter is one of a sensor itself, such as the aperture radius of a thin lens."""
+    return key.rpartition(".")[0] in {sensor.id() for sensor in scene.scene.sensors()}
+
+
 def sensor_obstacle(pair: ScenePair, target: str) -> str:
     """Return the reason why there is no derivative by a sensor's parameters; "" if there is one."""
     if pair.volumetric:

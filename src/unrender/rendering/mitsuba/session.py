@@ -16,7 +16,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
-from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor, no_tangents
+from unrender.rendering.mitsuba.camera_term import CameraTerm, is_of_sensor, moved_sensor, no_tangents
 from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
@@ -86,8 +86,10 @@ class MitsubaSession:
         traits = {key: pair.parameter_traits(key) for key in keys}
         scene = pair.loaded()
         cameras = [key for key in (*keys, *poses) if moved_sensor(scene, key)]
+        lenses = {key for key in traits if key not in derivatives and is_of_sensor(scene, key)}
+        apart = {*cameras, *lenses}
         moving = next(
-            (key for key, trait in traits.items() if trait.geometric and not trait.light and key not in cameras), None
+            (k for k, trait in traits.items() if trait.geometric and not trait.light and k not in apart), None
         )
         if poses and moving is not None:
             raise InputError(
