@@ -139,3 +139,18 @@ def test_on_a_plateau_poses_take_steps_by_a_smoothed_loss() -> None:
         plan = method("auto").plan(ur.Problem(scene, unknown, [ur.View(reference)]))
         chosen[name] = type(plan.estimator).__name__
     assert chosen == {"near": "GaussNewton", "far": "SmoothedDerivatives"}
+
+
+def test_the_pose_and_the_lens_of_a_camera_take_gauss_newton_steps_together() -> None:
+    made, _, _, _ = lens()
+    reference = np.array(mi.render(mi.load_dict(made | {"integrator": {"type": "path", "max_depth": 2}}), spp=128))
+    start = [
+        ur.Parameter("cam.translation", initial=[0.05, 0.05, 0.0]),
+        ur.Parameter("cam.aperture_radius", initial=0.2),
+    ]
+    problem = ur.Problem(made, start, [ur.View(reference)], max_depth=2)
+    plan = method("auto").plan(problem)
+    assert isinstance(plan.estimator, ur.GaussNewton)
+    result = ur.optimize(problem, ur.GaussNewton(64, 8), ur.optimizers.AveragedNewton(), steps=12)
+    np.testing.assert_allclose(result.parameters["cam.translation"], 0.0, atol=0.02)
+    np.testing.assert_allclose(result.parameters["cam.aperture_radius"], 0.3, atol=0.05)

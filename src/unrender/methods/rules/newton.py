@@ -24,9 +24,9 @@ __all__ = ["beside", "cameras", "cameras_by_paths", "few_numbers"]
 
 
 def cameras(traits: Traits) -> Plan | None:
-    """Return Gauss-Newton steps where poses of sensors alone are unknown; else None."""
+    """Return Gauss-Newton steps if poses of sensors are unknown, alone or beside lenses; else None."""
     constants, problem = traits.constants, traits.problem
-    of_cameras = traits.only_cameras or traits.cameras_and_lenses
+    of_cameras = traits.only_cameras or traits.cameras_beside_lenses
     if not of_cameras or not traits.newton_suits or traits.elements > constants.most_elements:
         return None
     spp = traits.options.spp or sampling.within(constants.image_spp, constants.image_paths // problem.pixels)

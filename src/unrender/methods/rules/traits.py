@@ -64,10 +64,11 @@ class Traits:
         return all(info.viewpoint and info.rigid for info in self.infos.values())
 
     @property
-    def cameras_and_lenses(self) -> bool:
-        """Whether all unknowns are poses and lenses of sensors, both among them."""
-        rigid = {info.rigid for info in self.infos.values() if info.perturbable}
-        return rigid == {True, False} and all(info.viewpoint for info in self.infos.values())
+    def cameras_beside_lenses(self) -> bool:
+        """Whether all unknowns are poses of sensors and other numbers that change the form of the picture, such as lenses."""
+        infos = self.infos.values()
+        suit = all(info.perturbable and (info.viewpoint or (info.nonlinear and not info.rigid)) for info in infos)
+        return suit and {info.rigid for info in infos} == {True, False}
 
     @property
     def newton_suits(self) -> bool:
