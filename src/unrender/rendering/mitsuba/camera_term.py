@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from collections.abc import Set as AbstractSet
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.camera_motion import CameraMotion
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
+from unrender.rendering.mitsuba.parameters import ParameterTraits
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import views_of
@@ -32,9 +34,19 @@ def moved_sensor(scene: LoadedScene, key: str) -> str:
     return owner if any(sensor.id() == owner for sensor in scene.scene.sensors()) else ""
 
 
-def is_of_sensor(scene: LoadedScene, key: str) -> bool:
-    """Return whether a parameter is one of a sensor itself, such as the aperture radius of a thin lens."""
-    return key.rpartition(".")[0] in {sensor.id() for sensor in scene.scene.sensors()}
+def moving_geometry(
+    scene: LoadedScene, traits: Mapping[str, ParameterTraits], derivatives: AbstractSet[str]
+) -> str | None:
+    """Return the first parameter that moves geometry other than lights and sensors; None if there is none.
+
+    A lens parameter without derivatives moves nothing, such as the aperture radius of a thin lens.
+    """
+    sensors = {sensor.id() for sensor in scene.scene.sensors()}
+    for key, trait in traits.items():
+        lens = key not in derivatives and key.rpartition(".")[0] in sensors
+        if trait.geometric and not (trait.light or lens or moved_sensor(scene, key)):
+            return key
+    return None
 
 
 def sensor_obstacle(pair: ScenePair, target: str) -> str:

@@ -16,7 +16,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
-from unrender.rendering.mitsuba.camera_term import CameraTerm, is_of_sensor, moved_sensor, no_tangents
+from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor, moving_geometry, no_tangents
 from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
@@ -86,11 +86,7 @@ class MitsubaSession:
         traits = {key: pair.parameter_traits(key) for key in keys}
         scene = pair.loaded()
         cameras = [key for key in (*keys, *poses) if moved_sensor(scene, key)]
-        lenses = {key for key in traits if key not in derivatives and is_of_sensor(scene, key)}
-        apart = {*cameras, *lenses}
-        moving = next(
-            (k for k, trait in traits.items() if trait.geometric and not trait.light and k not in apart), None
-        )
+        moving = moving_geometry(scene, traits, derivatives)
         if poses and moving is not None:
             raise InputError(
                 f"parameter {moving}: it moves geometry, which cannot be combined with the pose {next(iter(poses))}"
