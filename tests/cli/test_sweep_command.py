@@ -167,7 +167,13 @@ def started(tmp_path: Path) -> Iterator[Any]:
     def start(*arguments: object) -> subprocess.Popen:
         command = [sys.executable, "-m", "unrender", *map(str, arguments)]
         process = subprocess.Popen(
-            command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+            command,
+            cwd=tmp_path,
+            env=os.environ | {"RAY_worker_niceness": "0"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
         )
         begun.append(process)
         return process
