@@ -27,6 +27,14 @@ print(*sorted(sys.modules))
 """
 
 
+COMPLAINT = """
+import sys
+from unrender.app.cli.main import main
+assert main(["run", {file!r}]) == 2
+print(*sorted(sys.modules))
+"""
+
+
 def imported(code: str) -> set[str]:
     environment = {**os.environ, "PYTHONPATH": str(Path(unrender.__file__).parents[1])}
     done = subprocess.run(
@@ -72,3 +80,12 @@ def test_a_run_imports_what_its_end_needs_at_its_end() -> None:
         "unrender.app.report",
     }
     assert not needed & late
+
+
+@pytest.mark.parametrize("text", [None, "max_depth = 1.5\n", 'scene = "none.xml"\n[[parameters]]\n[[views]]\n'])
+def test_a_bad_problem_file_is_told_before_what_takes_long_to_import(text: str | None, tmp_path: Path) -> None:
+    file = tmp_path / "problem.toml"
+    if text is not None:
+        file.write_text(text)
+    late = {"unrender.methods", "unrender.runs.optimize", "unrender.gallery", "mitsuba", "scipy.special"}
+    assert not imported(COMPLAINT.format(file=str(file))) & late

@@ -31,11 +31,14 @@ class Progress(Callback):
 
     Args:
         console: where to; None for standard output.
+
+    Attributes:
+        budget_began: when this was made, or a stage began, on the clock of `time.perf_counter`.
     """
 
     def __init__(self, console: Console | None = None):
         self._console = console or Console()
-        self._began = time.perf_counter()
+        self.budget_began = self._began = time.perf_counter()
         self._stopwatch = phases.Stopwatch()
         self._listening: AbstractContextManager[None] | None = None
         self._within: list[str] = []

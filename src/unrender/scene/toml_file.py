@@ -39,7 +39,7 @@ from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
 from unrender.core import tables
 from unrender.core.errors import InputError
-from unrender.io import confinement, toml_models
+from unrender.io import bounded_files, confinement, toml_models
 from unrender.io.toml_models import Table
 from unrender.scene import coarse_to_fine
 from unrender.scene.errors import FieldError
@@ -126,7 +126,7 @@ def read(path: str | Path) -> Problem:
         InputError: "problem.toml:12: parameters[0].bounds: ...": file, line, field and the expected value.
     """
     file = Path(path)
-    model, text = toml_models.read(file, _Problem, {"parameters": _Parameter, "views": _View})
+    model, text = _read_model(file)
     try:
         with confinement.within(file.parent):
             problem = _build(model, file)
@@ -137,6 +137,19 @@ def read(path: str | Path) -> Problem:
             keys = [parameter.key or next(iter(parameter.keys or [""])) for parameter in model.parameters]
             place = ("parameters", keys.index(str(place[1])), "truth")
         raise toml_models.error_at(file, text, place, error.what) from error
+
+
+def check(path: str | Path) -> None:
+    """Raise the `InputError` of `read` for fields that are not as expected, or a scene that is not there, without opening the scene."""
+    file = Path(path)
+    model, text = _read_model(file)
+    scene = file.parent / model.scene
+    if not scene.exists():
+        raise toml_models.error_at(file, text, ("scene",), f"{scene}: {bounded_files.no_file(scene)}")
+
+
+def _read_model(file: Path) -> tuple[_Problem, str]:
+    return toml_models.read(file, _Problem, {"parameters": _Parameter, "views": _View})
 
 
 def _build(model: _Problem, file: Path) -> Problem:

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 _TILES, _ROBUST = 48, 1.8
 """Maximum number of tiles of an image; maximum ratio of the sharp score to the robust one."""
@@ -32,6 +31,8 @@ class Difference:
             return False
         if math.isinf(self.value):
             return self.value > 0
+        from scipy.special import stdtrit  # takes long to import
+
         return self.value > -float(stdtrit(max(self.degrees, 1.0), level)) * self.standard_error
 
 

@@ -165,6 +165,23 @@ def use_variant(name: str, threads: int | None = None) -> str:
     return chosen
 
 
+def check_file(name: str) -> None:
+    """Raise `InputError` for a problem file that is not there, or whose fields are not as expected, before what takes long to import."""
+    file = Path(name)
+    if file.suffix.lower() != ".toml":
+        return
+    if not file.exists():
+        from unrender.io import bounded_files  # NumPy with it
+
+        raise InputError(f"{name}: {bounded_files.no_file(file)}")
+    from unrender.app.stages import stages_file
+
+    if not stages_file.is_stages(file):
+        from unrender.scene import toml_file
+
+        toml_file.check(file)
+
+
 def check_problem(name: str, options: Mapping[str, str]) -> None:
     """Raise `InputError` if `open_problem` would fail for reasons that can be checked without Mitsuba."""
     from unrender import gallery

@@ -59,7 +59,6 @@ class RunOrder:
     problem_settings: Mapping[str, Any]
     checkpoint_every: int | None = None
     within_seconds: bool = False
-    began: float | None = None
 
 
 @contextmanager
@@ -84,7 +83,7 @@ def execution(
     for line in advice.remarks(problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # earlier runs
-    spent = 0.0 if order.began is None else time.perf_counter() - order.began
+    spent = time.perf_counter() - progress.budget_began
     annotations = RunAnnotations(
         order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, order.within_seconds, spent
     )

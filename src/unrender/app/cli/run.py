@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,6 +77,7 @@ def run(
     PROBLEM may also be a file of stages: each stage has a run folder and starts from the result of the previous stage. Ctrl-C and
     SIGTERM stop after the current step and save the state; `unrender resume` continues from there.
     """
+    arguments.check_file(problem)
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
@@ -103,9 +103,8 @@ def run(
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
-                began = time.perf_counter() - progress.elapsed
                 task = RunOrder(
-                    chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every, True, began
+                    chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every, True
                 )
                 with execution(dealt, task, folder, console, progress) as order:
                     result = optimize(**order)

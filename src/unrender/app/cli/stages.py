@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -230,6 +231,7 @@ def _run_stage(
 
     stages, stage = run.stages, run.stages.stages[index]
     folder = stages_file.folder_of(stages, index, run.out)
+    progress.budget_began = time.perf_counter()
     if (folder / schema.RECORD).is_file():
         stored = load_run(folder, *stages_file.split(stages)[index])
         problem = runs.problem_of(folder)
