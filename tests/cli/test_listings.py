@@ -86,7 +86,7 @@ def test_a_plan_is_printed_and_its_file_makes_the_same_run(unrender, tmp_path):
 
     answer = unrender("run", "indirect-room", *tiny, *common, "--method", str(plan), "--set", "spp=2")
     assert answer.status == 2
-    assert "which has all settings already" in answer.error
+    assert "which contains all settings" in answer.error
     answer = unrender("run", "indirect-room", *tiny, *common, "--method", str(tmp_path / "none.toml"))
     assert answer.status == 2
     assert "none.toml" in answer.error

@@ -301,7 +301,7 @@ def test_a_part_that_no_file_can_say_is_to_be_handed_in(tmp_path: Path) -> None:
     parts = ur.PathGradient(spp=2), adam
     whole = ur.optimize(ur.gallery.problem("exponential"), *parts, 8)
     ur.optimize(ur.gallery.problem("exponential"), *parts, 4, run_directory=folder)
-    with pytest.raises(InputError, match=r"optimizer: it cannot be made again .*schedule is function.*hand it in"):
+    with pytest.raises(InputError, match=r"optimizer: it cannot be stored in a file .*schedule is function.*pass it"):
         ur.resume(folder, steps=8)
     assert ur.resume(folder, steps=8, optimizer=adam).parameters == whole.parameters
 

@@ -128,7 +128,7 @@ def test_none_is_none():
         ("rcv", {"space": "paths"}, "method rcv: option space: expected path or primary, got 'paths'"),
         ("smoothed", {"sigma": "-1"}, "method smoothed: sigma: expected a number above 0, got '-1'"),
         ("smoothed", {"sigma": -1}, "option sigma: expected a number above 0 or text, got -1"),
-        ("smoothed", {"sigma": "a.b=1"}, "method smoothed: sigma: expected a number for all others too"),
+        ("smoothed", {"sigma": "a.b=1"}, "method smoothed: sigma: expected a number for the other parameters too"),
         ("smoothed", {"sigma": "0.1, a.b=wide"}, "method smoothed: sigma: expected a number above 0, got 'wide'"),
         ("smoothed", {"joint": "maybe"}, "option joint: expected true or false, got 'maybe'"),
         ("smoothed", {"samples": 3}, "option samples: expected a whole number of at least 4, got 3"),

@@ -1,6 +1,6 @@
-"""Methods by name: an estimator and an optimizer that go together, with the options that people set.
+"""Methods by name: a matching estimator and optimizer, with user options.
 
-One file per method; each registers a class of documented options whose `build` makes the two parts.
+Each file registers one method: a class of documented options whose `build` returns both parts.
 """
 
 from unrender.methods.base import Method, Options, method, methods

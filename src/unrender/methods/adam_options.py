@@ -1,4 +1,4 @@
-"""Options that several methods have: those of Adam, and of path gradients."""
+"""Options that several methods share: those of Adam and of path gradients."""
 
 from __future__ import annotations
 
@@ -19,49 +19,52 @@ from unrender.pixels.all import All
 
 
 class AdamOptions(Options):
-    """Options of every method that descends with Adam."""
+    """Options of methods that use Adam."""
 
-    learning_rate: PositiveFloat = Field(0.01, description="step size of the parameters that have none of their own")
-    beta_1: FiniteFloat = Field(0.9, ge=0, lt=1, description="Adam's decay of the mean gradient")
-    beta_2: FiniteFloat = Field(0.999, ge=0, lt=1, description="Adam's decay of the mean squared gradient")
+    learning_rate: PositiveFloat = Field(0.01, description="learning rate of parameters without their own")
+    beta_1: FiniteFloat = Field(0.9, ge=0, lt=1, description="decay of Adam's mean gradient")
+    beta_2: FiniteFloat = Field(0.999, ge=0, lt=1, description="decay of Adam's mean squared gradient")
     schedule: str | None = Field(None, description=SCHEDULE_HELP)
-    one_rate: bool = Field(False, description="whether all elements of a parameter share one rate, as suits vertices")
+    one_rate: bool = Field(
+        False, description="whether all elements of a parameter share one step scale, for mesh vertices"
+    )
 
     def optimizer(self) -> Optimizer:
-        """Adam with these options."""
+        """Return Adam with these options."""
         schedule = parse_schedule(self.schedule)
         return Adam(self.learning_rate, self.beta_1, self.beta_2, schedule=schedule, uniform=self.one_rate)
 
 
 class SamplingOptions(AdamOptions):
-    """Options of `PathGradient` on how its paths are sampled."""
+    """Options of the path sampling of `PathGradient`."""
 
     emitters: EmitterSelection = Field(
         "scene",
-        description="which of several lights a connection takes: by the scene's weights, or by the gradient's variance",
+        description="how a path selects one of several emitters: by the scene's weights, or by the gradient's variance",
     )
     differential_bsdf: bool = Field(
         False,
-        description="whether derivatives by the alpha of rough conductors are sampled apart, in antithetic pairs of paths",
+        description="whether derivatives with respect to the alpha of rough conductors use separate antithetic pairs of paths",
     )
 
     def sampling(self) -> dict[str, Any]:
-        """The arguments of `PathGradient` that these are."""
+        """Return these options as arguments of `PathGradient`."""
         return {"emitters": self.emitters, "differential_bsdf": self.differential_bsdf}
 
 
 class PathOptions(SamplingOptions):
-    """Options of every method that follows path gradients."""
+    """Options of methods that use path gradients."""
 
     spp: PositiveInt = Field(8, description="samples per pixel; from 2 on, the adjoint shares their paths")
-    adjoint_spp: PositiveInt | None = Field(None, description="samples per pixel of an adjoint on paths of its own")
+    adjoint_spp: PositiveInt | None = Field(None, description="samples per pixel of an adjoint with separate paths")
     counts: Literal["equal", "adaptive"] = Field(
-        "equal", description="samples in each pixel: spp, or spp on average and more where the gradient's variance is"
+        "equal",
+        description="samples of each pixel: spp, or spp on average with more where the gradient's variance is high",
     )
-    denoise: bool = Field(False, description="whether the loss sees denoised images (biased; extra unrender[denoise])")
+    denoise: bool = Field(False, description="whether the loss uses denoised images (biased; extra unrender[denoise])")
 
     def estimator(self, image: ImageEstimator) -> Estimator:
-        """The path gradient of what the loss sees in `image`."""
+        """Return the path gradient of the loss at this image estimator's images."""
         sampler = AdaptiveCounts() if self.counts == "adaptive" else All()
         seen = Denoised(image) if self.denoise else image
         return PathGradient(seen, sampler, self.spp, self.adjoint_spp, **self.sampling())

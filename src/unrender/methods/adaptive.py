@@ -1,4 +1,4 @@
-"""`adaptive`: pixel mini-batches."""
+"""Method `adaptive`: pixel mini-batches."""
 
 from __future__ import annotations
 
@@ -19,25 +19,27 @@ from unrender.pixels.base import PixelSampler
 
 @register(name="adaptive", position=5)
 class AdaptiveMethod(SamplingOptions):
-    """mini-batches of pixels drawn where the gradient's variance is, from all views at once, Adam"""
+    """pixel mini-batches from all views, sampled where the gradient's variance is high, Adam"""
 
-    pixels: PositiveInt = Field(4096, description="pixels a step, drawn from all pixels of all views")
+    pixels: PositiveInt = Field(4096, description="pixels per step, sampled from all pixels of all views")
     scheme: Literal["adaptive", "loss", "uniform"] = Field(
         "adaptive",
-        description="pixels where the gradient's variance is, or in proportion to the loss derivative, or all alike",
+        description="pixel probabilities: by the gradient's variance, in proportion to the loss derivative, or uniform",
     )
-    spp: PositiveInt = Field(2, description="samples per drawn pixel; from 2 on, the adjoint shares their paths")
-    levels: NonNegativeInt = Field(0, description="coarser resolutions that the probabilities look at, of adaptive")
+    spp: PositiveInt = Field(
+        2, description="samples per pixel of the mini-batch; from 2 on, the adjoint shares their paths"
+    )
+    levels: NonNegativeInt = Field(0, description="coarser resolutions in the probabilities of the scheme adaptive")
     refresh: PositiveInt = Field(20, description="steps between estimates of the probabilities")
     uniform: PositiveFloat | None = Field(
         None,
         le=1,
-        description="share of the draws that all pixels have equally; left out, as much as the samples ask for",
+        description="fraction of uniform samples; by default it is chosen from the samples",
     )
     image: Literal["plain", "rcv"] = Field(
-        "plain", description="what the loss sees: a fresh rendering, or rcv's, with a step of whole views now and then"
+        "plain", description="image estimator: a new rendering, or rcv's control variate, with some steps of full views"
     )
-    whole_views: PositiveInt = Field(20, description="steps between those of whole views, where image is rcv")
+    whole_views: PositiveInt = Field(20, description="steps between two steps of full views, with the image rcv")
 
     def build(self) -> tuple[Estimator, Optimizer]:
         image = Plain() if self.image == "plain" else RecursiveControlVariate(whole_views=self.whole_views)

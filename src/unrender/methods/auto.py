@@ -24,57 +24,57 @@ from unrender.scene.problem import Problem
 
 @register(name="auto", position=0)
 class AutoMethod(Options):
-    """what suits the problem: images with a memory or without, smoothing for textures and grids, schedule-free Adam
+    """chooses estimator, optimizer and preconditioner from the problem: control variates, Sobolev gradients, schedule-free Adam
 
-    The loss sees recursive control variates, which use earlier samples again: less noise, and less of the bias that noise gives to losses
-    other than L2. Its errors are forgotten after some 20 steps, of L1 and such 33, lest steps follow them. Where the scene cannot be
-    loaded twice, or a mesh moves and the loss is unbiased without a memory, each step has its own rendering. Textures, grids and values at
-    the vertices of meshes move along Sobolev gradients, vertices of meshes along large steps at one rate for all, other parameters by
-    steps in proportion to their range. A parameter that path gradients do not reach, such as a pose, takes Gauss-Newton steps by perturbed
-    renders beside path gradients of the others, or steps by a smoothed loss where these do not suit (`hybrid`, `smoothed`). Cameras alone
-    take Gauss-Newton steps, and so do poses of shapes alone from a start that overlaps enough. Grids of
-    volumes are coarse in the first steps. Every choice can be set.
+    The image estimator is a recursive control variate, which reuses earlier samples. It reduces noise, and the bias that noise causes for
+    losses other than L2. Its errors are forgotten after about 20 steps (33 for losses such as L1), so that the optimizer does not follow
+    them. If the scene cannot be loaded twice, or a mesh moves and the loss is unbiased anyway, each step has a new rendering.
+
+    Textures, grids and values at mesh vertices use Sobolev gradients. Vertex positions use large steps with one step scale. Other
+    parameters take steps in proportion to their range. Parameters without path gradients, such as poses, take Gauss-Newton steps from
+    perturbed renders, together with path gradients of the others, or steps of a smoothed loss where these are unsuitable (`hybrid`,
+    `smoothed`). Cameras alone take Gauss-Newton steps, and so do poses of shapes alone if the initial images overlap enough. Grids of
+    volumes have a coarse resolution in the first steps. Options override every choice.
     """
 
     image: Literal["plain", "rcv"] | None = Field(
-        None, description="what the loss sees: a fresh rendering, or rcv's; none for the latter where it can be had"
+        None, description="image estimator: a new rendering, or rcv's control variate; none takes rcv where possible"
     )
     spp: PositiveInt | None = Field(
         None,
-        description="samples per pixel; none for some 32768 paths a step, 131072 of drawn pixels, from 2 to 16 per pixel",
+        description="samples per pixel; none for about 32768 paths per step, 131072 in mini-batches, 2 to 16 per pixel",
     )
     pixels: PositiveInt | None = Field(
         None,
-        description="pixels a step, drawn from all views; none for all pixels, or 32768 where there are more than 524288",
+        description="pixels per step, sampled from all views; none for all pixels, or 32768 of more than 524288",
     )
     tolerance: NonNegativeFloat = Field(
         CONSTANTS.tolerance,
-        description="times its noise, within which L1 and Huber count a residual by its size, not its sign",
+        description="multiple of its noise within which L1 and Huber weight a residual by its size instead of its sign",
     )
     parameterise: bool = Field(
-        True, description="whether positive numbers, colours and textures without an upper bound move as logarithms"
+        True,
+        description="whether positive numbers, colours and textures without an upper bound are optimised as logarithms",
     )
     sigma: PositiveFloat | str = Field(
         CONSTANTS.sigma,
-        description="width of the smoothing of what path gradients do not reach, in its units: 0.2, mug.rotation.y=0.6",
+        description="smoothing width of parameters without path gradients, in their units: 0.2, mug.rotation.y=0.6",
     )
-    smooth: bool = Field(
-        True, description="whether textures, grids and values at vertices move along Sobolev gradients"
-    )
+    smooth: bool = Field(True, description="whether textures, grids and values at vertices use Sobolev gradients")
     correlation: PositiveFloat = Field(
         CONSTANTS.correlation,
         le=1,
-        description="length over which Sobolev gradients smooth, at most, as a share of a texture's side",
+        description="maximum smoothing length of Sobolev gradients, relative to a texture's side",
     )
-    coarse: bool = Field(True, description="whether grids of volumes are coarse in the first steps")
+    coarse: bool = Field(True, description="whether grids of volumes have a coarse resolution in the first steps")
     learning_rate: PositiveFloat = Field(
         CONSTANTS.learning_rate,
         le=1,
-        description="first steps, as a share of a parameter's range, or of its size where the range is open",
+        description="first learning rate relative to a parameter's range, or to its size if the range is unbounded",
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`: what is chosen where nothing is known of the problem."""
+        """Return the choices without knowledge of the problem."""
         image = Plain() if self.image == "plain" else RecursiveControlVariate(max_weight=CONSTANTS.linear_memory)
         sampler = pixels.Uniform(self.pixels) if self.pixels else pixels.All()
         return PathGradient(image, sampler, self.spp or CONSTANTS.spp[0]), ScheduleFree(self.learning_rate)

@@ -1,4 +1,4 @@
-"""What a method is, and the methods there are."""
+"""Methods and their options."""
 
 from __future__ import annotations
 
@@ -20,35 +20,35 @@ from unrender.optimizers.base import Optimizer
 from unrender.scene.problem import Problem
 from unrender.schedules.functions import Schedule
 
-SCHEDULE_HELP = "learning rate over the steps: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
+SCHEDULE_HELP = "schedule of the learning rate: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
 _TOO_LARGE = 1 << 31
-"""Whole numbers from which on no array of so many samples or steps can be made."""
+"""Lower bound of integers for which no array of so many samples or steps can be allocated."""
 
 
 class Options(BaseModel):
-    """The options of a method: each field has a description, a default and a range; `build` makes the two parts.
+    """Options of a method: each field has a description, a default and a range; `build` returns estimator and optimizer.
 
-    The first line of a subclass's docstring is its summary. `@unrender.register(name=...)` makes it a method.
+    The first line of a subclass's docstring is its summary. `@unrender.register(name=...)` registers it as a method.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """Estimator and optimizer with these options. Raises `InputError` for options that do not go together."""
+        """Return estimator and optimizer with these options. Raises `InputError` for incompatible options."""
         raise NotImplementedError(f"{type(self).__name__} has no build")
 
     def plan(self, problem: Problem) -> Plan:
-        """Return the plan for a problem: what `build` makes, unless a method looks at the problem."""
+        """Return the plan for a problem: the result of `build`, unless the method depends on the problem."""
         return Plan(problem, *self.build(), reasons=parameterised(problem))
 
 
 @dataclass(frozen=True)
 class Method:
-    """A named way to recover a problem's parameters.
+    """A named method to recover a problem's parameters.
 
     Attributes:
-        name: as on the command line.
-        options: the class of its options.
+        name: name on the command line.
+        options: class of its options.
     """
 
     name: str
@@ -56,11 +56,11 @@ class Method:
 
     @property
     def summary(self) -> str:
-        """One line: what the estimator and the optimizer are."""
+        """Description of the estimator and the optimizer, in one line."""
         return (self.options.__doc__ or "").strip().split("\n")[0]
 
     def configure(self, settings: Mapping[str, Any]) -> Options:
-        """The options with `settings` in place of defaults; text is converted ("4" to 4, "none" to None).
+        """Return the options with `settings` in place of defaults; text is converted ("4" to 4, "none" to None).
 
         Raises:
             InputError: an unknown option (with the nearest known one), or a value of the wrong type or out of range.
@@ -89,13 +89,13 @@ class Method:
         return self.configure(settings).model_dump()
 
     def expected(self, name: str) -> str:
-        """What values an option takes, in words: "a whole number above 0"."""
+        """Return a description of an option's values: "a whole number above 0"."""
         schema = self.options.model_json_schema()["properties"][name]
         choices = [_in_words(choice) for choice in schema.get("anyOf", [schema])]
         return " or ".join(choices)
 
     def start(self, settings: Mapping[str, Any] | None = None) -> tuple[Estimator, Optimizer]:
-        """Estimator and optimizer with `settings` in place of defaults. Raises `InputError`."""
+        """Return estimator and optimizer with `settings` in place of defaults. Raises `InputError`."""
         options = self.configure(settings or {})
         with self._named():
             return options.build()
@@ -108,7 +108,7 @@ class Method:
 
     @contextmanager
     def _named(self) -> Iterator[None]:
-        """Errors begin with the method's name."""
+        """Prefix errors with the method's name."""
         try:
             yield
         except InputError as error:
@@ -116,33 +116,33 @@ class Method:
 
 
 def parameterised(problem: Problem) -> tuple[str, ...]:
-    """A line on which parameterisations parameters have: "moved as log (lamp.radiance)"; none where none has one."""
+    """Return a line with the parameterisations of parameters, such as "moved as log (lamp.radiance)"; empty if there are none."""
     given = {key: u.parameterisation for key, u in problem.unknowns.items() if u.parameterisation is not None}
     named = {key: type(own).__name__.lower() for key, own in given.items()}
     return (f"moved as {grouped(named)}",) if named else ()
 
 
 def methods() -> dict[str, Method]:
-    """Every registered method by name."""
+    """Return every registered method by name."""
     return {name: Method(name, options) for name, options in registry.components("method").items()}
 
 
 def method(name: str) -> Method:
-    """The method of that name. Raises `InputError` with the nearest known name."""
+    """Return the method of this name. Raises `InputError` with the nearest known name."""
     return Method(name, registry.find("method", name))
 
 
 def parse_schedule(text: str | None) -> Schedule | None:
-    """The schedule that `text` describes: "cosine(300)", "warmup(20) then exponential(100)"; None for none.
+    """Return the schedule that `text` describes: "cosine(300)", "warmup(20) then exponential(100)"; None for None.
 
     Raises:
-        InputError: an unknown name, or arguments that do not fit.
+        InputError: an unknown name, or invalid arguments.
     """
     return None if text is None else tables.parse(text, "schedule")
 
 
 def _in_words(schema: Mapping[str, Any]) -> str:
-    """A part of a JSON schema."""
+    """Describe a part of a JSON schema in words."""
     if "enum" in schema:
         return " or ".join(schema["enum"])
     words = {"integer": "a whole number", "number": "a number", "null": "none", "boolean": "true or false"}.get(

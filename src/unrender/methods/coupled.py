@@ -1,4 +1,4 @@
-"""`coupled`: meta-estimation whose samples serve both of its terms."""
+"""Method `coupled`: meta-estimation whose samples contribute to both of its terms."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ class CoupledMethod(MetaCommonOptions):
 
     spp: PositiveInt = Field(3, description="samples per pixel, each for the gradient and for its change")
     image: Literal["plain", "rcv"] = Field(
-        "plain", description="what the loss sees: a fresh rendering, or rcv's (in path space, unless space is primary)"
+        "plain",
+        description="image estimator: a new rendering, or rcv's control variate (in path space, unless space is primary)",
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:

@@ -1,4 +1,4 @@
-"""`hybrid`: path gradients beside perturbed renders, with what the other methods have."""
+"""Method `hybrid`: path gradients together with perturbed renders."""
 
 from __future__ import annotations
 
@@ -29,39 +29,41 @@ from unrender.pixels.base import PixelSampler
 from unrender.scene.problem import Problem
 
 _IMAGE_MEMORY, _GRADIENT_MEMORY = 0.95, 0.8
-"""Greatest weights of the past, of images and gradients: what is remembered for longer is noise that no optimizer averages."""
+"""Largest weights of the past for images and gradients. Larger weights retain noise that no optimizer averages."""
 
 
 @register(name="hybrid", position=7)
 class HybridMethod(AdamOptions):
-    """path gradients, with memories and pixel mini-batches as asked for; perturbed renders of poses and the like; Adam"""
+    """path gradients, with optional control variates and pixel mini-batches; perturbed renders for poses and others; Adam"""
 
     spp: PositiveInt = Field(4, description="samples per pixel of path gradients")
-    image: Literal["plain", "rcv"] = Field("plain", description="what the loss sees: a fresh rendering, or rcv's")
+    image: Literal["plain", "rcv"] = Field(
+        "plain", description="image estimator: a new rendering, or rcv's control variate"
+    )
     gradient: Literal["plain", "coupled"] = Field(
-        "plain", description="a fresh gradient at each step, or coupled's, which remembers; that takes MetaAdam"
+        "plain", description="a new gradient at each step, or coupled's meta-estimate, which uses MetaAdam"
     )
     space: Literal["path", "primary"] | None = Field(
-        None, description="what two steps share: paths, or random numbers; none for paths where all parameters allow it"
+        None, description="what two steps share: paths, or random numbers; none for paths if all parameters allow it"
     )
-    pixels: NonNegativeInt = Field(0, description="pixels a step, drawn from all views where they tell most; 0 for all")
+    pixels: NonNegativeInt = Field(0, description="pixels per step, sampled by the gradient's variance; 0 for all")
     sigma: PositiveFloat | str = Field(
         0.2,
-        description="width of the smoothing at the start, in units of the parameters; some with their own: 0.2, mug.rotation.y=0.6",
+        description="initial smoothing width in units of the parameters, optionally per parameter: 0.2, mug.rotation.y=0.6",
     )
     sigma_schedule: str | None = Field(
         "exponential(25, 0.1)", description="factor of sigma by step, such as cosine(300)"
     )
-    step: PositiveFloat = Field(0.2, description="learning rate of what is perturbed, as a share of its sigma")
+    step: PositiveFloat = Field(0.2, description="learning rate of perturbed parameters, relative to their sigma")
     samples: int = Field(16, ge=4, description="perturbed renders per view and step")
     perturbed_spp: PositiveInt = Field(2, description="samples per pixel of a perturbed render")
     perturbed: str | None = Field(
         None,
-        description="the parameters to be perturbed, with commas between; none for poses, and all without path gradients",
+        description="perturbed parameters, separated by commas; none for poses and parameters without path gradients",
     )
 
     def build(self) -> tuple[Estimator, Optimizer]:
-        """See `Options.build`: without rates of its own for what is perturbed, which a problem has to tell."""
+        """Return both parts without learning rates of perturbed parameters, which depend on the problem."""
         return self._parts("path" if self.space is None else self.space, {})
 
     def plan(self, problem: Problem) -> Plan:
@@ -101,7 +103,7 @@ class HybridMethod(AdamOptions):
         return PathGradient(image, sampler, self.spp)
 
     def optimizer(self) -> Optimizer:
-        """Adam or, for a gradient that remembers, MetaAdam."""
+        """Return Adam, or MetaAdam for a meta-estimated gradient."""
         if self.gradient == "coupled":
             return MetaAdam(self.learning_rate, schedule=parse_schedule(self.schedule))
         return super().optimizer()

@@ -1,4 +1,4 @@
-"""`plain`: a fresh rendering each step."""
+"""Method `plain`: a new rendering at each step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from unrender.optimizers.base import Optimizer
 
 @register(name="plain", position=1)
 class PlainMethod(PathOptions):
-    """a fresh rendering each step, leave-one-out sample groups, Adam"""
+    """a new rendering at each step, leave-one-out sample groups, Adam"""
 
     def build(self) -> tuple[Estimator, Optimizer]:
         return self.estimator(Plain()), self.optimizer()

@@ -1,4 +1,4 @@
-"""A plan: all that a method decides for a problem."""
+"""Plans: everything that a method decides for a problem."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _COMPONENTS = ("estimator", "optimizer")
 
 @dataclass(frozen=True)
 class Plan:
-    """All that a method decides for a problem. `unrender.optimize` executes it as it is.
+    """Everything that a method decides for a problem. `unrender.optimize` executes it unchanged.
 
     Attributes:
-        problem: What to recover, as its author gave it.
-        estimator: Computes gradients.
-        optimizer: Computes steps from gradients.
-        settings: {key: settings of a parameter that has none of its own}.
-        reasons: What was chosen and why, one line each.
+        problem: Problem as passed.
+        estimator: Estimator of gradients.
+        optimizer: Optimizer.
+        settings: {key: settings of a parameter whose own are None}.
+        reasons: Choices and their reasons, one line each.
     """
 
     problem: Problem
@@ -40,12 +40,12 @@ class Plan:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """The reasons, and the priors of the problem, which the loss contains, one line each."""
+        """The reasons, and the problem's priors, which are part of the loss, one line each."""
         priors = {key: u.prior for key, u in self.problem.unknowns.items() if u.prior is not None}
         return (*self.reasons, *(f"prior of {key}: {prior.describe()}" for key, prior in priors.items()))
 
     def configured(self) -> Problem:
-        """Return the problem with the settings of this plan. Raises `InputError` for a setting that does not suit."""
+        """Return the problem with the settings of this plan. Raises `InputError` for an unsuitable setting."""
         return self.problem.configured(self.settings)
 
     def bound_optimizer(self, problem: Problem) -> Optimizer:
@@ -53,9 +53,9 @@ class Plan:
         return bind(self.optimizer, problem.topology, problem.coordinates.repeated)
 
     def table(self) -> dict[str, Any]:
-        """Return the plan as TOML has it: estimator, optimizer, settings by key.
+        """Return the plan as a TOML table: estimator, optimizer, settings by key.
 
-        A component that no table can describe becomes a text with the reason.
+        A component that cannot be described becomes a text with the reason.
         """
         parts: dict[str, Any] = {name: _table(getattr(self, name)) for name in _COMPONENTS}
         settings = {key: table for key, own in self.settings.items() if (table := _settings_table(own))}
@@ -70,22 +70,22 @@ class Plan:
         estimator: Estimator | None = None,
         optimizer: Optimizer | None = None,
     ) -> Plan:
-        """Return the plan that `table` describes.
+        """Return the plan of a table.
 
         Args:
-            problem: What to recover.
-            table: As `Plan.table` returns it.
-            where: What a message begins with.
-            estimator, optimizer: Used in place of the table's.
+            problem: Problem to recover.
+            table: Table as returned by `Plan.table`.
+            where: Beginning of messages.
+            estimator, optimizer: Components that replace the table's.
 
         Raises:
-            InputError: A component that the table does not describe, is of another kind, or does not suit the problem.
+            InputError: A component is not described, is of another kind, or does not suit the problem.
         """
         given = {"estimator": estimator, "optimizer": optimizer}
         made = {name: given[name] or _component(table.get(name), name, where) for name in _COMPONENTS}
         for name, asked in zip(_COMPONENTS, ("estimate", "update"), strict=True):
             if not callable(getattr(made[name], asked, None)):
-                raise InputError(f"{where}: {name}: {type(made[name]).__name__} is no {name}")
+                raise InputError(f"{where}: {name}: {type(made[name]).__name__} is not an {name}")
         settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in table.get("settings", {}).items()}
         return cls(problem, made["estimator"], made["optimizer"], settings)
 
@@ -121,30 +121,30 @@ def _table(component: Any) -> dict[str, Any] | str:
     try:
         return tables.table(component)
     except tables.NotStorable as error:
-        return f"it cannot be made again from a file ({error})"
+        return f"it cannot be stored in a file ({error})"
 
 
 def _component(table: Any, name: str, where: str) -> Any:
     if isinstance(table, str):
-        raise InputError(f"{where}: {name}: {table}; hand it in: unrender.resume(..., {name}=...)")
+        raise InputError(f"{where}: {name}: {table}; pass it: unrender.resume(..., {name}=...)")
     return tables.component(table, where=f"{where}: {name}")
 
 
 def _settings_table(own: ParameterSettings) -> dict[str, Any]:
     """Return the settings that are not None, as tables."""
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     if own.parameterisation is not None:
         named = isinstance(own.parameterisation, str)
-        found["parameterisation"] = own.parameterisation if named else _table(own.parameterisation)
+        settings["parameterisation"] = own.parameterisation if named else _table(own.parameterisation)
     if own.preconditioner is not None:
-        found["preconditioner"] = _table(own.preconditioner)
+        settings["preconditioner"] = _table(own.preconditioner)
     if own.coarse_to_fine is not None:
-        found["coarse_to_fine"] = tables.fields(own.coarse_to_fine)
-    return found
+        settings["coarse_to_fine"] = tables.fields(own.coarse_to_fine)
+    return settings
 
 
 def _settings(table: Any, where: str) -> ParameterSettings:
-    """Return the settings that a table describes. Raises `InputError`."""
+    """Return the settings of a table. Raises `InputError`."""
     if not isinstance(table, Mapping) or set(table) - set(vars(ParameterSettings())):
         raise InputError(f"{where}: expected {', '.join(vars(ParameterSettings()))}, got {repr(table)[:60]}")
     made: dict[str, Any] = dict(table)

@@ -1,4 +1,4 @@
-"""A plan in a file, to be run as a method is."""
+"""Plans in files, which run like methods."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ _LONGEST = 1 << 20
 
 @dataclass(frozen=True)
 class PlanFile:
-    """The plan in a TOML file, as `unrender methods --plan` prints it, with the members of `Method` that a run needs.
+    """Plan in a TOML file, as printed by `unrender methods --plan`, with the members of `Method` that a run needs.
 
     Attributes:
-        path: The file.
+        path: Path of the file.
     """
 
     path: Path
 
     @property
     def name(self) -> str:
-        """Name of the run's method: the file's, without its suffix."""
+        """Name of the run's method: the file's without its suffix."""
         return self.path.stem
 
     def options_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Return no options. Raises `InputError` for settings: a plan is complete."""
+        """Return no options. Raises `InputError` for settings, because a plan is complete."""
         for name in settings:
-            raise InputError(f"--set {name}: {self.path} is a plan, which has all settings already; edit the file")
+            raise InputError(f"--set {name}: {self.path} is a plan, which contains all settings; edit the file")
         return {}
 
     def start(self, settings: Mapping[str, Any]) -> None:
@@ -55,7 +55,7 @@ class PlanFile:
 
 
 def text(plan: Plan) -> str:
-    """Return a plan as a TOML file, its reasons as comments. Raises `InputError` for a component that no file can describe."""
+    """Return a plan as a TOML file with its reasons as comments. Raises `InputError` for a component that cannot be described."""
     table = plan.table()
     for name in ("estimator", "optimizer"):
         if isinstance(table[name], str):

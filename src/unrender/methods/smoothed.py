@@ -1,4 +1,4 @@
-"""`smoothed`: derivatives of a smoothed loss (Wang et al.)."""
+"""Method `smoothed`: derivatives of a smoothed loss (Wang et al.)."""
 
 from __future__ import annotations
 
@@ -22,30 +22,31 @@ _WIDTH = pydantic.TypeAdapter(PositiveFloat)
 
 @register(name="smoothed", position=6)
 class SmoothedMethod(Options):
-    """derivatives of a smoothed loss from perturbed renders alone, for poses and plateaus (Wang et al.), Newton-CG"""
+    """derivatives of a smoothed loss from perturbed renders, for poses and plateaus (Wang et al.), Newton-CG"""
 
     optimizer: Literal["newton-cg", "newton", "lbfgs", "adam", "cma-es"] = Field(
         "newton-cg",
-        description="what takes the steps; newton forms n x n matrices, adam and lbfgs ask for gradients alone, cma-es for none",
+        description="optimizer; newton forms n x n matrices, adam and lbfgs use gradients only, cma-es uses losses only",
     )
     sigma: PositiveFloat | str = Field(
         0.2,
-        description="width of the smoothing at the start, in units of the parameters; some with their own: 0.2, mug.rotation.y=0.6",
+        description="initial smoothing width in units of the parameters, optionally per parameter: 0.2, mug.rotation.y=0.6",
     )
     sigma_schedule: str | None = Field(
         "exponential(25, 0.1)",
-        description="factor of sigma by step, such as cosine(300); with adam, of its learning rate, too; cma-es has none",
+        description="factor of sigma by step, such as cosine(300); with adam, also of its learning rate; unused by cma-es",
     )
     step: PositiveFloat = Field(
         0.5,
-        description="as a share of sigma: the longest step; the learning rate, of adam; the first deviation, of cma-es",
+        description="relative to sigma: longest step; learning rate of adam; first standard deviation of cma-es",
     )
-    samples: int = Field(16, ge=4, description="renders per view and step, for each derivative that has its own")
+    samples: int = Field(16, ge=4, description="renders per view and step, for each separately estimated derivative")
     spp: PositiveInt = Field(2, description="samples per pixel of a render")
     joint: bool = Field(
-        True, description="gradient and curvature from the same renders; else each from its own, as in the paper"
+        True,
+        description="whether gradient and curvature use the same renders; otherwise separate ones, as in the paper",
     )
-    iterations: PositiveInt = Field(3, description="products with the Hessian a step, of newton-cg")
+    iterations: PositiveInt = Field(3, description="Hessian-vector products per step of newton-cg")
 
     def build(self) -> tuple[Estimator, Optimizer]:
         schedule, sigma = parse_schedule(self.sigma_schedule), parse_widths(self.sigma)
@@ -63,28 +64,30 @@ class SmoothedMethod(Options):
         return estimator, made[self.optimizer]()
 
 
-def parse_widths(given: float | str) -> float | dict[str, float]:
-    """A width for all parameters, or {key: width, "*": width of the others} from "0.2, mug.rotation.y=0.6".
+def parse_widths(sigma: float | str) -> float | dict[str, float]:
+    """Return a width for all parameters, or {key: width, "*": width of the others} from "0.2, mug.rotation.y=0.6".
 
     Raises:
-        InputError: no width for the others, or what is no number above 0.
+        InputError: the width of the others is missing, or a width is not a positive number.
     """
-    if not isinstance(given, str):
-        return given
+    if not isinstance(sigma, str):
+        return sigma
     widths: dict[str, float] = {}
-    for part in given.split(","):
+    for part in sigma.split(","):
         key, _, number = part.rpartition("=")
         try:
             widths[key.strip() or "*"] = _WIDTH.validate_python(number.strip())
         except pydantic.ValidationError as error:
             raise InputError(f"sigma: expected a number above 0, got {number.strip()!r}") from error
     if "*" not in widths:
-        raise InputError(f"sigma: expected a number for all others too, as in 0.2, mug.rotation.y=0.6, got {given!r}")
+        raise InputError(
+            f"sigma: expected a number for the other parameters too, as in 0.2, mug.rotation.y=0.6, got {sigma!r}"
+        )
     return widths if len(widths) > 1 else widths["*"]
 
 
-def widths_of(given: float | str, keys: Iterable[str]) -> dict[str, float]:
-    """The width of each of these parameters, see `parse_widths`."""
-    widths = parse_widths(given)
+def widths_of(sigma: float | str, keys: Iterable[str]) -> dict[str, float]:
+    """Return the width of each of these parameters, see `parse_widths`."""
+    widths = parse_widths(sigma)
     each = widths if isinstance(widths, dict) else {"*": widths}
     return {key: each.get(key, each["*"]) for key in keys}

@@ -1,4 +1,4 @@
-"""`stock`: the loop of Mitsuba's tutorials, to be compared with."""
+"""Method `stock`: the loop of Mitsuba's tutorials, for comparison."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from unrender.optimizers.base import Optimizer
 
 @register(name="stock", position=8)
 class StockMethod(AdamOptions):
-    """the loop of Mitsuba's tutorials, to compare with: mi.render with prb, dr.backward, Adam"""
+    """the loop of Mitsuba's tutorials, for comparison: mi.render with prb, dr.backward, Adam"""
 
     spp: PositiveInt = Field(16, description="samples per pixel of the image, and as many of the adjoint")
 

@@ -1,4 +1,4 @@
-"""First rates of parameters from their ranges and sizes, and which of them move as logarithms."""
+"""First learning rates of parameters from their ranges and sizes, and the choice of parameters to optimise as logarithms."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from unrender.scene.bounds import MARGIN, open_scale
 from unrender.scene.problem import Problem
 
 _ALBEDO, _EXTINCTION, _NORMALS = ".albedo.", ".sigma_t.", ".normalmap."
-"""Parts of keys: of a medium's grids, and of a normal map."""
+"""Parts of keys of a medium's grids, and of a normal map."""
 _TEXELS = ".data"
-"""End of the key of a texture's texels."""
+"""End of the key of a texture's data."""
 _TEXTURE = 3
 """Dimensions of a texture, (H, W, C)."""
 
 
 def logarithms(problem: Problem, constants: Constants = CONSTANTS) -> list[str]:
-    """Return the keys of single numbers, colours and textures that are positive, without an upper bound: radiances, environment maps.
+    """Return the keys of positive numbers, colours and textures without an upper bound: radiances, environment maps.
 
-    Not where a learning rate is given, which is in the parameter's units; nor of grids, parts of which may have to be 0.
+    Excluded are parameters with their own learning rate, which is in the parameter's units, and grids, parts of which may have to be 0.
     """
     return [
         key
@@ -38,10 +38,13 @@ def logarithms(problem: Problem, constants: Constants = CONSTANTS) -> list[str]:
 
 
 def first_rates(problem: Problem, share: float, constants: Constants = CONSTANTS) -> Mapping[str, float]:
-    """{key: first rate} of each parameter: the share of its range, where it has two ends, else of the root mean square of its initial
-    values, or the share itself where they are 0; over the root of the number of unknown textures of its material, which all answer the same
-    residuals and would together go too far; less for numbers with two ends. With a parameterisation, that of u for such a step."""
-    found: dict[str, float] = {}
+    """Return {key: first learning rate} of each parameter, `share` times its size.
+
+    The size is the range between two bounds, else the root mean square of the initial values, or 1 if they are 0. It is divided by the
+    root of the number of unknown textures of the same material, which share residuals and would together overshoot. It is smaller for
+    bounded numbers. With a parameterisation, it is the size in u.
+    """
+    rates: dict[str, float] = {}
     initial = {key: unknown.initial for key, unknown in problem.unknowns.items()}
     materials = {key: _owner(key) for key, x in initial.items() if key.endswith(_TEXELS) and x.ndim == _TEXTURE}
     textures = Counter(materials.values())
@@ -64,21 +67,21 @@ def first_rates(problem: Problem, share: float, constants: Constants = CONSTANTS
         if unknown.transform is not None:
             middle = (low + high) / 2 if low is not None and high is not None else (low or 0.0) + size
             size /= float(unknown.transform.slope(np.float64(middle)))
-        found[key] = share * size
-    return found
+        rates[key] = share * size
+    return rates
 
 
 def _owner(key: str) -> str:
-    """Of the texture that a parameter is the data of: its material."""
+    """Return the material of a texture from the key of its data."""
     return key.rsplit(".", 2)[0]
 
 
 def _is_number(value: np.ndarray, constants: Constants) -> bool:
-    """Whether it is a single number or a colour."""
+    """Return whether it is a single number or a colour."""
     return value.ndim <= 1 and value.size <= constants.number_size
 
 
 def _radius(positions: np.ndarray) -> float:
-    """The root mean square distance of vertices (3 V,) from their mean, 1 where it is 0."""
+    """Return the root mean square distance of vertices (3 V,) from their mean; 1 if it is 0."""
     vertices = positions.reshape(-1, 3).astype(np.float64)
     return float(np.sqrt(np.mean(np.sum(np.square(vertices - vertices.mean(axis=0)), axis=1)))) or 1.0

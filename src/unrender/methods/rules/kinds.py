@@ -1,4 +1,4 @@
-"""Rules by kind of unknown, among path gradients: textures, volumes, positive numbers, meshes."""
+"""Rules by kind of unknown for path gradients: textures, volumes, positive numbers, meshes."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _GRID = 4
 
 @dataclass(frozen=True)
 class Part:
-    """The part of a plan for the unknowns of one kind.
+    """Part of a plan for the unknowns of one kind.
 
     Attributes:
-        keys: Of the unknowns.
-        reason: What was chosen; "" where there is no such unknown.
+        keys: Keys of the unknowns.
+        reason: Description of the choice; "" if there is no such unknown.
         settings: Settings of unknowns by key.
-        smoothed: Whether they move along Sobolev gradients.
-        optimizer: Makes an optimizer of their own from the smallest of their first rates; None for that of all others.
+        smoothed: Whether they use Sobolev gradients.
+        optimizer: Function from the smallest of their first learning rates to a separate optimizer; None for the common one.
     """
 
     keys: tuple[str, ...] = ()
@@ -41,7 +41,7 @@ class Part:
 
 
 def textures(traits: Traits) -> Part:
-    """Textures, grids and values at vertices without a preconditioner of their own move along Sobolev gradients."""
+    """Use Sobolev gradients for textures, grids and values at vertices without their own preconditioner."""
     keys = tuple(
         key
         for key, unknown in traits.problem.unknowns.items()
@@ -53,36 +53,38 @@ def textures(traits: Traits) -> Part:
 
 
 def volumes(traits: Traits) -> Part:
-    """Grids without detail at the start are coarse in the first steps: a few cells show with less noise where there is something.
+    """Use coarse resolutions in the first steps for grids without detail at the start, because a few cells have less noise.
 
-    Textures are not, since smoothed gradients do the same; nor are grids beside a mesh.
+    Textures are excluded, because smoothed gradients have the same effect, and so are grids in problems with meshes.
     """
-    found, allowed = {}, traits.options.coarse and not traits.meshes
+    doubling, allowed = {}, traits.options.coarse and not traits.meshes
     for key, unknown in traits.problem.unknowns.items() if allowed else ():
         shape, start = unknown.shape(), unknown.initial
-        ways = [steps for cells, steps in traits.constants.coarse if len(shape) == _GRID and min(shape[:-1]) >= cells]
+        candidates = [
+            steps for cells, steps in traits.constants.coarse if len(shape) == _GRID and min(shape[:-1]) >= cells
+        ]
         own = unknown.coarse_to_fine is not None or unknown.preconditioner is not None
-        if ways and not own and traits.infos[key].resizable and not (start != start[:1, :1, :1]).any():
-            found[key] = ways[0]
-    steps = {key: f"resolution doubled by step {' and '.join(map(str, each))}" for key, each in found.items()}
+        if candidates and not own and traits.infos[key].resizable and not (start != start[:1, :1, :1]).any():
+            doubling[key] = candidates[0]
+    steps = {key: f"resolution doubled by step {' and '.join(map(str, each))}" for key, each in doubling.items()}
     settings = {
-        key: ParameterSettings(coarse_to_fine=CoarseToFine(each, states="carry")) for key, each in found.items()
+        key: ParameterSettings(coarse_to_fine=CoarseToFine(each, states="carry")) for key, each in doubling.items()
     }
-    return Part(tuple(found), f"coarse to fine: {grouped(steps)}", settings) if found else Part()
+    return Part(tuple(doubling), f"coarse to fine: {grouped(steps)}", settings) if doubling else Part()
 
 
 def positive_values(traits: Traits) -> Part:
-    """Positive numbers, colours and textures without an upper bound move as their logarithms."""
-    found, known = logarithms(traits.problem, traits.constants), traits.problem.unknowns
+    """Optimise positive numbers, colours and textures without an upper bound as their logarithms."""
+    positive, known = logarithms(traits.problem, traits.constants), traits.problem.unknowns
     given = {key: u.parameterisation for key, u in known.items() if u.parameterisation is not None}
-    moved = {key: "log" for key in found if traits.options.parameterise and key not in traits.rates}
+    moved = {key: "log" for key in positive if traits.options.parameterise and key not in traits.rates}
     named = {key: type(own).__name__.lower() for key, own in given.items()} | moved
     settings = {key: ParameterSettings(parameterisation=name) for key, name in moved.items()}
     return Part(tuple(named), f"moved as {grouped(named)}", settings) if named else Part()
 
 
 def meshes(traits: Traits) -> Part:
-    """Vertices move by large steps, at one rate for all, which falls with the root of the steps."""
+    """Use large steps for vertices, with one learning rate for all that decays with the root of the steps."""
     keys, constants = traits.meshes, traits.constants
     if not keys:
         return Part()
@@ -95,4 +97,4 @@ def meshes(traits: Traits) -> Part:
 
 
 KINDS: tuple[Callable[[Traits], Part], ...] = (textures, volumes, positive_values, meshes)
-"""In the order of their reasons."""
+"""Rules in the order of their reasons."""

@@ -1,4 +1,4 @@
-"""Rules for cameras and for a few numbers: Gauss-Newton steps by perturbed renders, and cameras by path gradients."""
+"""Rules for cameras and for a few numbers: Gauss-Newton steps from perturbed renders, and path gradients of cameras."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = ["beside", "cameras", "cameras_by_paths", "few_numbers"]
 
 
 def cameras(traits: Traits) -> Plan | None:
-    """Return Gauss-Newton steps if poses of sensors are unknown, alone or beside lenses; else None."""
+    """Return Gauss-Newton steps if poses of sensors are unknown, with or without lenses; else None."""
     constants, problem = traits.constants, traits.problem
     of_cameras = traits.only_cameras or traits.cameras_beside_lenses
     if not of_cameras or not traits.newton_suits or traits.elements > constants.most_elements:
@@ -40,7 +40,7 @@ def cameras(traits: Traits) -> Plan | None:
 
 
 def cameras_by_paths(traits: Traits) -> Plan | None:
-    """Return path gradients of sensors: where an image or pixels are asked for, and where there is no Gauss-Newton step."""
+    """Return path gradients of sensors if an image or pixels are requested, or Gauss-Newton steps are unsuitable; else None."""
     if not traits.only_cameras or not all(info.differentiable for info in traits.infos.values()):
         return None
     sampler, drawn = sampling.sampler(traits)
@@ -55,10 +55,10 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
 
 
 def few_numbers(traits: Traits) -> Plan | None:
-    """Return Gauss-Newton steps where few numbers are unknown and the image changes its form with one of them; else None.
+    """Return Gauss-Newton steps if few numbers are unknown and the image depends nonlinearly on one of them; else None.
 
-    Poses take them where derivative images at the start explain the residual: on a plateau a smoothed loss is needed. Poses of lights may
-    stand beside other numbers, such as intensities.
+    Poses take them if derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be
+    combined with other numbers, such as intensities.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear]
@@ -78,12 +78,12 @@ def few_numbers(traits: Traits) -> Plan | None:
 
 
 def beside(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
-    """Return a plan by path gradients with these unknowns as a block beside it; None where Gauss-Newton steps do not suit them.
+    """Return a path-gradient plan with a separate block of these unknowns; None if Gauss-Newton steps do not suit them.
 
     Args:
-        traits: Of the problem.
-        keys: Of the unknowns that become the block.
-        plan: Of the others.
+        traits: Traits of the problem.
+        keys: Keys of the unknowns of the block.
+        plan: Plan of the others.
     """
     constants, problem = traits.constants, traits.problem
     own = any(problem.unknowns[key].preconditioner is not None for key in keys)
@@ -106,7 +106,7 @@ def beside(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
 
 
 def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
-    """Return whether these unknowns are few numbers that can be perturbed at little cost."""
+    """Return whether these unknowns are few numbers that can be perturbed at low cost."""
     constants, shapes, elements = traits.constants, traits.problem.shapes(), _elements(traits, keys)
     small = all(len(shapes[key]) <= 1 and math.prod(shapes[key]) <= constants.number_size for key in keys)
     infos = [traits.infos[key] for key in keys]
@@ -116,7 +116,7 @@ def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
 
 
 def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNewton:
-    """Return the estimator of these unknowns; `images`: paths of the images of poses over those of the derivative images."""
+    """Return the estimator of these unknowns; `images` is the ratio of paths of the images of poses to those of the derivative images."""
     constants, problem, elements = traits.constants, traits.problem, _elements(traits, keys)
     moved = [key for key in keys if key in traits.poses]
     poses = [key for key in moved if not traits.infos[key].light]
@@ -157,6 +157,6 @@ def _reason(traits: Traits, keys: tuple[str, ...], estimator: GaussNewton) -> st
 
 
 def _damping(traits: Traits) -> float:
-    """Return κ of Gauss-Newton steps, which is above 0."""
-    asked = 0.0 if traits.problem.loss.linear else traits.options.tolerance
-    return asked or traits.constants.newton_tolerance
+    """Return κ of Gauss-Newton steps, which is positive."""
+    requested = 0.0 if traits.problem.loss.linear else traits.options.tolerance
+    return requested or traits.constants.newton_tolerance

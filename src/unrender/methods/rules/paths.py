@@ -1,4 +1,4 @@
-"""Rules for path gradients, for perturbed renders beside them, and for a smoothed loss where there are none."""
+"""Rules for path gradients, for perturbed renders in combination with them, and for a smoothed loss without them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from unrender.schedules import Exponential
 
 
 def paths_and_perturbed(traits: Traits) -> Plan | None:
-    """Return path gradients beside perturbed renders of what they do not reach; None where they reach all, or nothing."""
+    """Return path gradients combined with perturbed renders of unknowns without them; None if all or none have path gradients."""
     constants, problem, sigma = traits.constants, traits.problem, traits.options.sigma
     keys = beyond_paths(traits.infos, list(traits.infos))
     others = problem.with_parts(renderer=PartialDerivatives(problem.renderer, frozenset(keys)))
@@ -52,7 +52,7 @@ def paths_and_perturbed(traits: Traits) -> Plan | None:
 
 
 def perturbed(traits: Traits) -> Plan | None:
-    """Return derivatives of a smoothed loss where path gradients do not serve; else None."""
+    """Return derivatives of a smoothed loss if path gradients are unavailable; else None."""
     if not traits.unreachable:
         return None
     reason = f"derivatives of a smoothed loss (method smoothed): {traits.unreachable}"
@@ -60,7 +60,7 @@ def perturbed(traits: Traits) -> Plan | None:
 
 
 def paths(traits: Traits) -> Plan:
-    """Return path gradients with the parts of each kind of unknown."""
+    """Return path gradients with the parts for each kind of unknown."""
     problem, options = traits.problem, traits.options
     parts = [kind(traits) for kind in KINDS]
     settings = _merged(traits, [part.settings for part in parts])
@@ -83,7 +83,7 @@ def paths(traits: Traits) -> Plan:
     for part in own:
         if part.optimizer is not None:
             optimizer = Partitioned(part.keys, part.optimizer(min(rates[key] for key in part.keys)), optimizer)
-    plain, whole = isinstance(image, Plain), isinstance(sampler, pixels.All)
+    plain, renders_all = isinstance(image, Plain), isinstance(sampler, pixels.All)
     biased = problem.loss.pixelwise and not problem.loss.linear
     tolerance = options.tolerance if biased and isinstance(sampler, (pixels.All, pixels.Views)) else 0.0
     own_rates = {key: rate for key, rate in problem.learning_rates.items() if key not in traits.block}
@@ -95,7 +95,7 @@ def paths(traits: Traits) -> Plan:
         *(part.reason for part in parts),
         f"{'schedule-free Adam' if len(apart) < len(rates) else 'Adam'}, first rate {first}",
     )
-    fresh_from = traits.constants.fresh_from if smoothed and whole and not plain else 0
+    fresh_from = traits.constants.fresh_from if smoothed and renders_all and not plain else 0
     estimator = PathGradient(image, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
     return Plan(problem, estimator, optimizer, settings, tuple(filter(None, reasons)))
 

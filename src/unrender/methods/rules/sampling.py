@@ -1,4 +1,4 @@
-"""Rules for how a step renders: pixels, samples per pixel, and the image that the loss sees."""
+"""Rules for the rendering of a step: pixels, samples per pixel, and the image estimator."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from unrender.scene.problem import Problem
 
 
 def sampler(traits: Traits) -> tuple[PixelSampler, str]:
-    """Return the pixels of a step, and why they are not all."""
+    """Return the pixel sampler, and the reason if it does not take all pixels."""
     constants, problem = traits.constants, traits.problem
     if traits.options.pixels is not None:
         return pixels.Uniform(traits.options.pixels), ""
     count, views = problem.pixels, len(problem.views)
     few = count <= constants.most_pixels
     if traits.meshes and problem.loss.pixelwise and views >= constants.many_views and few:
-        taken = min(-(-views // 2), constants.most_views)
-        return pixels.Views(taken), f"{taken} of {views} views a step: moving borders cost each view alike"
+        batch = min(-(-views // 2), constants.most_views)
+        return pixels.Views(batch), f"{batch} of {views} views a step: moving borders cost each view alike"
     if few or not problem.loss.pixelwise:
         return pixels.All(), ""
     return pixels.Uniform(constants.drawn), f"{constants.drawn} of all {count} pixels a step"
 
 
 def samples_per_pixel(traits: Traits, sampler: PixelSampler) -> int:
-    """Return the power of two that comes nearest to the path budget from below."""
+    """Return the largest power of two within the path budget, clamped to the limits, unless it is set."""
     constants = traits.constants
     draws = isinstance(sampler, pixels.Uniform)
     count, paths = (sampler.count, constants.drawn_paths) if draws else (traits.problem.pixels, constants.paths)
@@ -39,35 +39,35 @@ def samples_per_pixel(traits: Traits, sampler: PixelSampler) -> int:
 
 
 def image(traits: Traits, sampler: PixelSampler) -> tuple[ImageEstimator, str]:
-    """Return the image that the loss sees, and why."""
-    asked, linear = traits.options.image, traits.problem.loss.linear
-    if asked == "plain":
+    """Return the image estimator, and the reason."""
+    requested, linear = traits.options.image, traits.problem.loss.linear
+    if requested == "plain":
         return Plain(), "as asked for"
-    if asked is None and traits.meshes and linear:
+    if requested is None and traits.meshes and linear:
         return Plain(), "a mesh moves, and the loss is unbiased without a memory"
-    if asked is None and not renders_half(traits.problem, sampler):
+    if requested is None and not renders_half(traits.problem, sampler):
         return Plain(), "control variates need whole views, half of them a step"
     space, obstacle = _shared_space(traits.problem)
-    if obstacle and asked is None:
+    if obstacle and requested is None:
         return Plain(), f"no control variates: {obstacle}"
     most = traits.constants.linear_memory if linear else traits.constants.memory
-    reason = "as asked for" if asked else "earlier samples are used again"
+    reason = "as asked for" if requested else "earlier samples are used again"
     return RecursiveControlVariate(space, max_weight=most), reason
 
 
 def renders_half(problem: Problem, sampler: PixelSampler) -> bool:
-    """Return whether a step renders at least half of the views. A memory of a view that is seldom rendered shows another mesh."""
+    """Return whether a step renders at least half of the views. The control variate of a rarely rendered view shows an outdated mesh."""
     half = isinstance(sampler, pixels.Views) and 2 * sampler.count >= len(problem.views)
     return half or isinstance(sampler, pixels.All)
 
 
 def within(limits: tuple[int, int], value: int) -> int:
-    """Return the value, moved into the limits."""
+    """Clamp a value to the limits."""
     return min(max(value, limits[0]), limits[1])
 
 
 def _shared_space(problem: Problem) -> tuple[Literal["path", "primary"], str]:
-    """Return where two states of the unknowns share samples, and why nowhere; "" where they do."""
+    """Return the space in which two states of the unknowns can share samples, and the obstacle, "" if there is none."""
     obstacle = ""
     for space in ("path", "primary"):
         try:

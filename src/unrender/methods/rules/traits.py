@@ -1,4 +1,4 @@
-"""The traits of a problem that the rules of `auto` look at."""
+"""Traits of a problem on which the rules of `auto` depend."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ __all__ = ["Traits", "refusal"]
 
 @dataclass(frozen=True)
 class Traits:
-    """What the rules of `auto` look at.
+    """Properties of a problem on which the rules of `auto` depend.
 
     Attributes:
-        problem: What to recover.
-        options: What was asked for.
-        constants: Numbers of the rules.
-        rates: First rates that are decided already, in units of the unknowns.
-        block: Keys of unknowns that have an optimizer of their own beside path gradients.
+        problem: Problem to recover.
+        options: Options of the user.
+        constants: Constants of the rules.
+        rates: First learning rates that are already decided, in units of the unknowns.
+        block: Keys of unknowns with a separate optimizer in addition to path gradients.
     """
 
     problem: Problem
@@ -39,7 +39,7 @@ class Traits:
 
     @cached_property
     def infos(self) -> dict[str, ParameterInfo]:
-        """The renderer's facts about each unknown."""
+        """The renderer's description of each unknown."""
         known = self.problem.renderer.parameters()
         return {key: known[key] for key in self.problem.shapes()}
 
@@ -55,12 +55,12 @@ class Traits:
 
     @property
     def poses(self) -> list[str]:
-        """Keys of rigid motions, of shapes, lights or sensors."""
+        """Keys of rigid motions of shapes, lights or sensors."""
         return [key for key, info in self.infos.items() if info.rigid]
 
     @property
     def only_cameras(self) -> bool:
-        """Whether all unknowns are poses of sensors. Lenses have other units."""
+        """Whether all unknowns are poses of sensors. Lens parameters have other units."""
         return all(info.viewpoint and info.rigid for info in self.infos.values())
 
     @property
@@ -72,13 +72,13 @@ class Traits:
 
     @property
     def newton_suits(self) -> bool:
-        """Whether nothing rules out Gauss-Newton steps: no image or pixels asked for, a loss of pixels, no preconditioners."""
-        asked = self.options.image is not None or self.options.pixels is not None
-        return not asked and self.problem.loss.pixelwise and not self.problem.coordinates.preconditioners
+        """Whether Gauss-Newton steps are possible: no requested image or pixels, a pixelwise loss, no preconditioners."""
+        requested = self.options.image is not None or self.options.pixels is not None
+        return not requested and self.problem.loss.pixelwise and not self.problem.coordinates.preconditioners
 
     @cached_property
     def unreachable(self) -> str:
-        """Why path gradients of the unknowns do not serve; "" where they do."""
+        """Reason why path gradients of the unknowns are unsuitable; "" if they are suitable."""
         if rigid := next(iter(self.poses), ""):
             other = "; --method plain has path gradients" if self.infos[rigid].differentiable else ""
             what = "a light" if self.infos[rigid].light else "a shape or sensor"
@@ -87,7 +87,7 @@ class Traits:
 
 
 def refusal(problem: Problem) -> str:
-    """Return why the renderer has no path gradients of the unknowns; "" where it has."""
+    """Return why the renderer has no path gradients of the unknowns; "" if it has them."""
     try:
         problem.renderer.prepare(list(problem.shapes()), None)
     except InputError as error:
