@@ -104,7 +104,7 @@ def _python(folder: Path) -> None:
         (_remove("result/problem.toml"), ["result"], "problem.toml"),
         (_remove("wall.xml"), ["result"], "wall.xml"),
         (_shape, ["result"], f"parameter {KEY}: expected shape (3,), got (2, 2)"),
-        (_python, ["result"], "the problem was made in Python; hand it in"),
+        (_python, ["result"], "the problem was made in Python; pass it"),
         (None, ["result", "--out", "photo.exr"], "photo.exr: a file, expected a folder"),
         (None, ["result", "--out", "result"], "holds other things"),
         (None, ["result", "--out", "photo.exr/home"], "photo.exr"),

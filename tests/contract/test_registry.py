@@ -369,7 +369,7 @@ def test_a_component_that_is_not_registered_is_resumed_where_it_is_handed_in(tmp
             ur.gallery.problem("exponential"), ur.PathGradient(spp=2), Halved(), 8, callbacks=[Stop()],
             run_directory=tmp_path / "run", checkpoint_every=2,
         )  # fmt: skip
-    with pytest.raises(InputError, match=r"Halved is not registered, see unrender\.register\).*hand it in"):
+    with pytest.raises(InputError, match=r"Halved is not registered, see unrender\.register\).*pass it"):
         ur.resume(tmp_path / "run")
     again = ur.resume(tmp_path / "run", optimizer=Halved())
     assert again.resumed == [4]

@@ -290,7 +290,7 @@ def test_a_problem_made_in_python_is_to_be_handed_in(tmp_path: Path) -> None:
         )
 
     interrupted(made(), folder)
-    with pytest.raises(InputError, match=r"made in Python; hand it in, as unrender\.resume"):
+    with pytest.raises(InputError, match=r"made in Python; pass it, as unrender\.resume"):
         ur.resume(folder)
     assert ur.resume(folder, made()).steps == 8
 

@@ -465,5 +465,5 @@ def test_what_result_save_wrote_says_what_it_lacks(tmp_path: Path) -> None:
     plain(2).save(tmp_path / "saved")
     with pytest.raises(InputError, match=r"method\.toml: no such file: Result\.save keeps no run to go on with"):
         ur.resume(tmp_path / "saved")
-    with pytest.raises(InputError, match=r"problem\.toml: no such file: Result\.save keeps no problem; hand it in"):
+    with pytest.raises(InputError, match=r"problem\.toml: no such file: Result\.save keeps no problem; pass it"):
         ur.app.export(tmp_path / "saved", tmp_path / "scene")

@@ -215,9 +215,9 @@ def test_it_is_stored_and_made_again() -> None:
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"estimator": "why not"}, "plan.toml: estimator: why not; hand it in"),
+        ({"estimator": "why not"}, "plan.toml: estimator: why not; pass it"),
         ({"estimator": {"type": "PathGradent"}}, 'plan.toml: estimator: unknown type "PathGradent"'),
-        ({"estimator": {"type": "Adam"}}, "plan.toml: estimator: Adam is no estimator"),
+        ({"estimator": {"type": "Adam"}}, "plan.toml: estimator: Adam is not an estimator"),
         ({"settings": {"map": {"colour": 1}}}, "plan.toml: settings: map: expected parameterisation"),
         ({"settings": {"map": {"preconditioner": {"type": "Adam"}}}}, "plan.toml: settings: map: "),
     ],

@@ -80,7 +80,7 @@ def problem_of(directory: str | Path) -> Problem:
     path = folder / serialization.FILE
     if not bounded_files.exists(path):
         raise InputError(
-            f"{path}: no such file: Result.save keeps no problem; hand it in, as unrender.app.export((problem, result.parameters), "
+            f"{path}: no such file: Result.save keeps no problem; pass it, as unrender.app.export((problem, result.parameters), "
             "out), or keep a whole run, with run_directory="
         )
     stored = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
@@ -91,7 +91,7 @@ def problem_of(directory: str | Path) -> Problem:
         return gallery.problem(name, **options)
     if "scene" not in stored:
         raise InputError(
-            f"{path}: the problem was made in Python; hand it in, as unrender.resume(folder, problem) or "
+            f"{path}: the problem was made in Python; pass it, as unrender.resume(folder, problem) or "
             "unrender.app.export((problem, result.parameters), out)"
         )
     file = origin.get("file")
