@@ -307,7 +307,7 @@ class CheckedToo(Checked):
 def test_states_of_registered_modules_come_back_and_no_others() -> None:
     packed = pack(Remembered(np.arange(3)))
     with pytest.raises(
-        InputError, match=r"Remembered' is no state .* nor of a registered component; install the package"
+        InputError, match=r"Remembered' is not a state .* nor of a registered component; install the package"
     ):
         unpack(packed)
     np.testing.assert_array_equal(unpack(packed, [{"estimator": (Remembered(1),)}]).numbers, np.arange(3))
@@ -315,7 +315,7 @@ def test_states_of_registered_modules_come_back_and_no_others() -> None:
     np.testing.assert_array_equal(unpack(packed).numbers, np.arange(3))
     for kind in ("Checked", "CheckedToo"):
         hostile = {"class": f"{__name__}.{kind}", "fields": {"number": 1}}
-        with pytest.raises(InputError, match="is no state"):
+        with pytest.raises(InputError, match="is not a state"):
             unpack(Packed(hostile, {}))
 
 
@@ -328,7 +328,7 @@ def test_states_may_live_in_another_module() -> None:
 def test_no_module_is_imported_because_a_file_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "trap.py").write_text("raise AssertionError('imported')\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError, match="is no state"):
+    with pytest.raises(InputError, match="is not a state"):
         unpack(Packed({"class": "trap.State", "fields": {}}, {}))
     with pytest.raises(InputError, match=r'unknown type "trap\.State"'):
         tables.component({"type": "trap.State"})

@@ -83,7 +83,7 @@ def test_a_run_tells_in_its_folder(tmp_path: Any):
     assert [line.partition(":")[0] for line in result.undetermined] == ["wall.bsdf.sheen_tint.value"]
     page = report.page(tmp_path / "run").read_text()
     assert "Not determined by the pictures" in page
-    assert "wall.bsdf.sheen_tint.value: over its whole range" in page
+    assert "wall.bsdf.sheen_tint.value: over its entire range" in page
 
 
 def test_a_run_that_ended_early_is_warned_in_its_folder(tmp_path: Any):

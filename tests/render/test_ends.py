@@ -106,7 +106,7 @@ def test_a_run_that_is_given_up_has_failed(tmp_path: Path) -> None:
     assert first == (
         "step 5: the optimizer's step for rate (from its own state, or the preconditioner) was not finite; such steps are not applied"
     )
-    assert last.startswith("20 steps in a row were not finite: the run was given up")
+    assert last.startswith("20 steps in a row were not finite: the run was stopped")
     assert reader.read(folder).record.status == "failed"
 
 

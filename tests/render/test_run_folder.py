@@ -230,7 +230,7 @@ def test_a_folder_deleted_on_the_way_is_made_again(tmp_path: Path, monkeypatch: 
     folder = tmp_path / "run"
     result = start(folder, every=4, callbacks=[At(5, lambda run: shutil.rmtree(folder))])
     assert result.warnings == [
-        f"run folder {folder}: deleted while the run goes; it was made again, without the earlier checkpoints"
+        f"run folder {folder}: deleted during the run; it was created again, without the earlier checkpoints"
     ]
     assert steps_of(folder) == list(range(12))
     assert names(folder) == ["00000006", "00000008", "00000012"]

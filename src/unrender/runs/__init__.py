@@ -1,4 +1,4 @@
-"""The descent, its callbacks, and how a run is resumed."""
+"""Optimisation runs: the loop, its callbacks, run folders and resuming."""
 
 from typing import TYPE_CHECKING
 

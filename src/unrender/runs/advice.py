@@ -1,4 +1,4 @@
-"""Remarks on settings that will hardly do what was meant, before the first step."""
+"""Warnings about implausible settings, before the first step."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from unrender.optimizers.meta_adam import MetaAdam
 from unrender.scene.problem import Problem
 
 _LARGEST_STEP = 0.5
-"""Of a bounded parameter's range: a first step that is longer leads from anywhere in it to a bound."""
+"""Fraction of a bounded parameter's range: a longer first step always ends at a bound."""
 
 
 def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:
-    """One line for each parameter whose first steps cross at least half of its range.
+    """Return one line for each parameter whose first step crosses at least half of its range.
 
-    The steps of Adam are about as long as the learning rate, in units of the parameter, whatever the scale of the loss.
+    Adam's steps are about as long as the learning rate, in units of the parameter, whatever the scale of the loss.
     """
     if not isinstance(optimizer, (Adam, MetaAdam)):
         return []
-    found = []
+    lines = []
     each = rates.per_parameter(
         type(optimizer).__name__, problem.unknowns, optimizer.learning_rate, problem.learning_rates
     )
     for key, unknown in problem.unknowns.items():
         rate, (low, high) = each[key], unknown.bounds
         if unknown.transform is None and low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):
-            found.append(
+            lines.append(
                 f"parameter {key}: a learning_rate of {rate:g} crosses its range, {low:g} to {high:g}, in "
                 f"{_steps((high - low) / rate)}; 0.005 to 0.05 of the range are usual"
             )
-    return found
+    return lines
 
 
 def _steps(number: float) -> str:

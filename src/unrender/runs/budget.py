@@ -1,4 +1,4 @@
-"""How long a run may go on."""
+"""Limits of a run's steps and seconds."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 
 _MOST_SKIPPED = 20
 _FEW_STEPS, _MEASURED = 20, 3
-"""Number of steps below which a warning says so, and the steps whose time tells it."""
+"""Number of steps below which a warning is given, and number of steps that are timed for it."""
 _END_SHARE, _END_SECONDS = 0.1, 1.0
-"""Time of verification and final pictures: a share of the budget, and seconds besides."""
+"""Time reserved for verification and final images: a fraction of the budget, plus seconds."""
 _LOOK_SECONDS, _MOST_SLOWDOWN = 0.5, 3.0
-"""Seconds between two looks at how busy the machine is, and the largest factor that is allowed for."""
+"""Seconds between two measurements of the load of the machine; the largest slowdown that is taken into account."""
 _LEAST_SHARE = 0.5
-"""Share of the budget that steps have, however long kernels take to compile."""
+"""Fraction of the budget that the steps always get, even if compiling takes long."""
 _MOST_STEPS = 1 << 63
-"""Exclusive: what the files of a run folder hold."""
+"""Exclusive limit that the files of a run folder can store."""
 
 
 class Budget(Hook):
-    """Stops a run that has used up its steps or seconds, or whose last twenty steps were not finite."""
+    """Hook that stops a run after its steps or seconds, or after twenty consecutive steps that are not finite."""
 
     def __init__(self) -> None:
         self._least = self._looked = -math.inf
@@ -60,7 +60,7 @@ class Budget(Hook):
             _warn_of_few_steps(run)
         if descent.state.skipped_in_a_row >= _MOST_SKIPPED:
             run.stop(NON_FINITE)
-            line = f"{_MOST_SKIPPED} steps in a row were not finite: the run was given up; kept are the last values that were finite"
+            line = f"{_MOST_SKIPPED} steps in a row were not finite: the run was stopped; the result holds the last finite values"
             if line not in run.warnings:
                 run.warnings.append(line)
 
@@ -75,8 +75,10 @@ class Budget(Hook):
 
 
 def slowdown() -> float:
-    """Return the time that this process takes over the time that it would take alone, >= 1, from how long its threads waited for a
-    processor; 1 where the system does not tell."""
+    """Return the slowdown of this process by others, >= 1: its elapsed time over its time on an idle machine.
+
+    It is measured by the time that its threads waited for a processor; 1 if the system does not provide it.
+    """
     running = waiting = 0
     for path in glob.glob("/proc/self/task/*/schedstat"):
         try:
@@ -89,21 +91,21 @@ def slowdown() -> float:
 
 
 def _warn_of_few_steps(run: Run) -> None:
-    """Warn where the time of the first steps tells that the budget allows few."""
+    """Warn if the time of the first steps shows that the budget allows few steps."""
     if run.seconds is None or run.clock <= 0.0:
         return
     steps = int(run.allowed_seconds() * run.step / run.clock)
     if steps < min(_FEW_STEPS, run.steps or _FEW_STEPS):
         run.warnings.append(
-            f"the budget of {run.seconds:g} s allows about {steps} steps; fewer pixels a step (--set pixels=4096), fewer samples "
-            "(--set spp=1), a smaller picture (resolution), or more seconds make them enough"
+            f"the budget of {run.seconds:g} s allows about {steps} steps; use fewer pixels a step (--set pixels=4096), fewer samples "
+            "(--set spp=1), a smaller picture (resolution), or more seconds"
         )
 
 
 def check_budget(steps: int | None, seconds: float | None) -> None:
-    """Raise `InputError` unless a run can have this budget."""
+    """Raise `InputError` for an invalid budget."""
     if steps is None and seconds is None:
-        raise InputError("optimize: give a budget, steps= or seconds=")
+        raise InputError("optimize: set a budget, steps= or seconds=")
     if isinstance(steps, int) and steps >= _MOST_STEPS:
         raise InputError(f"optimize: steps must be below 2**63, got an integer of {steps.bit_length()} bits")
     if steps is not None and (not isinstance(steps, int) or steps < 1):

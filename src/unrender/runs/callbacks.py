@@ -1,4 +1,4 @@
-"""The user's view of a run: what can listen to it."""
+"""Callbacks: user code that observes a run."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 
 class Callback:
-    """Listens to a run. Override what is of interest; time spent here is not counted as the run's.
+    """Base class of callbacks. Override the methods of interest; the run's time does not include them.
 
-    One that waits, to pause the run, should look at `run.stopped` meanwhile, which Ctrl-C sets. The history of the steps so far is on
-    the disk (`run.folder`, None for a run without a run folder).
+    A callback that blocks to pause the run should check `run.stopped`, which Ctrl-C sets. The history so far is on disk (`run.folder`,
+    None without a run folder).
     """
 
     def on_start(self, run: Run) -> None:
-        """Before the first step, or the first after the run was resumed (`run.step`)."""
+        """Called before the first step, or before the first step after resuming (`run.step`)."""
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """After each step, with its record of the history. `run.stop()` ends the run."""
+        """Called after each step with its record of the history. `run.stop()` ends the run."""
 
     def on_end(self, run: Run, result: Result) -> None:
-        """After the last step."""
+        """Called after the last step."""
 
 
 _LARGEST = 512
@@ -41,17 +41,18 @@ _VIEWS = 8
 
 
 class TensorBoard(Callback):
-    """Writes event files that TensorBoard shows: loss, gradient noise and parameter errors at every step, pictures now and then.
+    """Writes event files for TensorBoard: loss, gradient noise and parameter errors at every step, and images at intervals.
 
-    Scalars have the step on their horizontal axis: `loss`, `gradient_noise`, `samples`, `seconds` (of optimization), and
-    `parameter_error/KEY` where the truth is known. Pictures are those that the loss saw, `view/N`, in sRGB at their reference's exposure.
+    Scalars have the step on the horizontal axis: `loss`, `gradient_noise`, `samples`, `seconds` (of optimisation), and
+    `parameter_error/KEY` if the truth is known. Images are those at which the loss was evaluated, `view/N`, in sRGB at their reference's
+    exposure.
 
     Args:
-        directory: where the event files go; made where it is missing. One folder per run.
-        picture_seconds: the least time between pictures, > 0; None for no pictures.
+        directory: folder of the event files, which is created if missing. Use one folder per run.
+        picture_seconds: minimum time between images, > 0; None for no images.
 
     Raises:
-        InputError: the package tensorboardX is missing, or the folder cannot be written to.
+        InputError: the package tensorboardX is missing, or the folder is not writable.
     """
 
     def __init__(self, directory: str | Path, picture_seconds: float | None = 10.0):
@@ -62,7 +63,7 @@ class TensorBoard(Callback):
         try:
             from tensorboardX import SummaryWriter
         except ImportError as error:
-            raise InputError("TensorBoard needs a package of its own: pip install 'unrender[tensorboard]'") from error
+            raise InputError("TensorBoard needs another package: pip install 'unrender[tensorboard]'") from error
         try:
             self._writer = SummaryWriter(logdir=str(directory))
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Estimator and optimizer as a user gives them: components, or a method's name."""
+"""Resolution of the estimator and optimizer arguments: components, plans, or a method's name."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from unrender.scene.problem import Problem
 
 
 def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Plan:
-    """Return the plan of a method, of two components, or a plan as it is.
+    """Return the plan of a method's name, of two components, or a plan unchanged.
 
     Args:
-        problem: what methods choose their parts for.
-        estimator: an estimator, a `Plan`, or the name of a method, which brings its optimizer along.
+        problem: problem for which a method chooses its parts.
+        estimator: an estimator, a `Plan`, or the name of a method, which includes its optimizer.
         optimizer: an optimizer; None for the method's.
 
     Raises:
-        InputError: one of them is missing or something else, such as an optimizer of Mitsuba's or PyTorch's, or a class in place of an
+        InputError: an argument is missing or of another kind, such as an optimizer of Mitsuba or PyTorch, or a class instead of an
             object.
     """
     if optimizer is None and isinstance(estimator, Plan):
@@ -40,7 +40,7 @@ def resolve(problem: Problem, estimator: Any, optimizer: Any) -> Plan:
 
 
 def resolve_estimator(problem: Problem, estimator: Any, owner: str = "optimize") -> Estimator:
-    """An estimator, from itself or a method's name. Raises `InputError` for anything else."""
+    """Return an estimator, from itself or a method's name. Raises `InputError` for anything else."""
     if isinstance(estimator, str):
         return method(estimator).plan(problem).estimator
     if not _is_component(estimator, "provides", "init", "estimate"):
@@ -59,7 +59,7 @@ def _is_component(given: Any, *members: str) -> bool:
 
 
 def _instead_of_optimizer(given: Any) -> str:
-    """What is wrong with something that is no optimizer, and what would be right."""
+    """Return what is wrong with an invalid optimizer, and what is expected."""
     from unrender import optimizers
 
     kind = given if isinstance(given, type) else type(given)

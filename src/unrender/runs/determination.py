@@ -1,4 +1,4 @@
-"""What the pictures of a problem do not determine, in words."""
+"""Detection of parameters that the images do not determine."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import render
 
 _LEAST = 0.005
-"""Change of the pictures, relative to themselves, below which a parameter counts as undetermined over its whole range."""
+"""Relative change of the images below which a parameter counts as undetermined over its range."""
 _FACTOR = 1.25
-"""The factor by which lights become brighter and reflectances darker."""
+"""Factor by which emitters become brighter and reflectances darker."""
 _LEAST_OF_FACTOR = 0.1
-"""Share of the change by brighter lights that darker reflectances must leave, where the pictures tell the two apart."""
+"""Fraction of the change by brighter emitters that must remain with darker reflectances, if the images distinguish the two."""
 _ERRORS = 2.0
-"""Standard errors by which a change must be below its limit."""
+"""Number of standard errors by which a change must be below its limit."""
 _UNSEEN = 0.05
-"""Share of the cells of a texture or grid that are worth a line where no picture sees them."""
+"""Fraction of unseen cells of a texture or grid from which a line is returned."""
 _MOST_VIEWS = 4
 _SEEDS, _RENDERINGS = (3, 4), 8
-"""Of the two independent halves, and renderings per view of two changes."""
+"""Seeds of the two independent halves, and number of renderings per view for two changes."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """By how much pictures change, as mean squares over pixels and channels.
+    """Change of images as mean squares over pixels and channels.
 
     Attributes:
-        square: of the change, without the noise of rendering; may be below 0.
-        error: standard error of that.
-        scale: mean square of the pictures.
+        square: mean square of the change without rendering noise; may be negative.
+        error: standard error of `square`.
+        scale: mean square of the images.
     """
 
     square: float
@@ -45,23 +45,22 @@ class Change:
     scale: float
 
     def is_below(self, share: float, scale: float | None = None) -> bool:
-        """Return whether the change is surely less than `share` of the root mean square of the pictures, or of √`scale`."""
+        """Return whether the change is significantly less than `share` of the root mean square of the images, or of √`scale`."""
         return self.square + _ERRORS * self.error < share**2 * (self.scale if scale is None else scale)
 
 
 def undetermined(
     problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf, per_pass: int | None = None
 ) -> list[str]:
-    """Return a line for each parameter that hardly changes the pictures over its whole range.
+    """Return a line for each parameter that hardly changes the images over its entire range.
 
-    Parameters of materials and media are looked at, one after the other, as long as there is time. All elements of a parameter move
-    together.
+    Parameters of materials and media are tested in sequence while time remains. All elements of a parameter change together.
 
     Args:
-        problem: its views and scene.
-        values: {key: array}, where the other parameters stay.
+        problem: problem with views and scene.
+        values: {key: array}, values of the other parameters.
         spp: samples per pixel of each of four renderings per view.
-        seconds: after which no further parameter is looked at; the first one always is.
+        seconds: time after which no further parameter is tested; the first one always is.
         per_pass: see `render`.
     """
     known, lines = problem.renderer.parameters(), []
@@ -78,28 +77,28 @@ def undetermined(
         )
         try:
             change = _change(problem, first, last, spp, per_pass)
-        except InputError:  # the renderer refuses an end of the range
+        except InputError:  # the renderer rejects a value at the end of the range
             continue
         longest = max(longest, time.perf_counter() - started)
         if change.is_below(_LEAST):
             lines.append(
-                f"{key}: over its whole range the pictures change by less than {_LEAST:.1%}; its value is the start's, or noise"
+                f"{key}: over its entire range the pictures change by less than {_LEAST:.1%}; its value is the initial one, or noise"
             )
     return lines
 
 
 def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a line for each texture or grid of which a notable part hardly changes the pictures.
+    """Return a line for each texture or grid with a notable part that hardly changes the images.
 
     Args:
         sensitivities: {key: array}, see `unrender.sensitivity`.
     """
     lines = []
-    for key, found in sensitivities.items():
-        where = seen_cells(found)
+    for key, sensitivity in sensitivities.items():
+        where = seen_cells(sensitivity)
         if where is not None and (share := 1.0 - float(where.mean())) >= _UNSEEN:
             lines.append(
-                f"{key}: {share:.0%} of it hardly changes the pictures; values there are the start's, or smoothed"
+                f"{key}: {share:.0%} of it hardly changes the pictures; values there are the initial ones, or smoothed"
             )
     return lines
 
@@ -107,15 +106,15 @@ def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
 def common_factor(
     problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf, per_pass: int | None = None
 ) -> list[str]:
-    """Return one line where the pictures determine lights and reflectances up to a common factor only; none elsewhere.
+    """Return one line if the images determine emitters and reflectances only up to a common factor; otherwise none.
 
-    Lights become brighter by a factor and reflectances darker by the same; the pictures tell the two apart if they change.
+    Emitters become brighter by a factor, and reflectances darker by the same factor. The images distinguish the two if they change.
 
     Args:
-        problem: its views and scene.
-        values: {key: array}, the parameters at which it is looked.
+        problem: problem with views and scene.
+        values: {key: array}, parameters at which it is tested.
         spp: samples per pixel of each of eight renderings per view.
-        seconds: what it may take; nothing is looked at where one rendering shows that it would take longer.
+        seconds: time limit; nothing is tested if one rendering shows that it would be exceeded.
         per_pass: see `render`.
     """
     known = problem.renderer.parameters()
@@ -143,12 +142,12 @@ def common_factor(
         for key, x in after.items()
         if (truth := problem.unknowns[key].truth) is not None
     }
-    told = listed([f"{key} {error:.3g}" for key, error in errors.items() if error is not None])
-    return [f"{line}; with lights divided by {factor:.3g} and reflectances multiplied by it, errors are {told}"]
+    error_list = listed([f"{key} {error:.3g}" for key, error in errors.items() if error is not None])
+    return [f"{line}; with lights divided by {factor:.3g} and reflectances multiplied by it, errors are {error_list}"]
 
 
 def _factor(problem: Problem, key: str, values: np.ndarray) -> float | None:
-    """The factor by which values are too large, in the mean; None where the truth is unknown or 0."""
+    """Return the mean factor by which values are too large; None if the truth is unknown or 0."""
     truth = problem.truth.get(key)
     if truth is None or truth.shape != values.shape or not np.mean(truth) > 0 or not np.mean(values) > 0:
         return None
@@ -156,7 +155,7 @@ def _factor(problem: Problem, key: str, values: np.ndarray) -> float | None:
 
 
 def _views(problem: Problem) -> list[int]:
-    """The views that are rendered: all, or evenly some of many."""
+    """Return the views to render: all, or an even selection of many."""
     count = len(problem.views)
     return sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
 
@@ -164,7 +163,10 @@ def _views(problem: Problem) -> list[int]:
 def _change(
     problem: Problem, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], spp: int, per_pass: int | None
 ) -> Change:
-    """Between two states. The product of two independent differences has no bias by noise; each is of equal random numbers."""
+    """Return the change between two states.
+
+    The product of two independent differences has no noise bias; each uses equal random numbers.
+    """
     products, squares = [], []
     for view in _views(problem):
         differences = []

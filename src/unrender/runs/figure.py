@@ -24,7 +24,7 @@ _LONGEST_TITLE = 22
 
 
 class ResultFigure(Figure):
-    """A figure that a notebook shows whether or not pyplot was imported. It belongs to no pyplot session, so it is shown once."""
+    """A figure that a notebook displays with or without pyplot. It belongs to no pyplot session, so it is displayed only once."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -33,7 +33,7 @@ class ResultFigure(Figure):
 
 
 def plot(result: Result) -> ResultFigure:
-    """See `Result.plot`."""
+    """Return the figure of `Result.plot`."""
     shown = list(notebook.shown_pictures(result).items())
     rows = math.ceil(len(shown) / _COLUMNS)
     columns = min(max(len(shown), 1), _COLUMNS)
@@ -74,7 +74,7 @@ def _draw(axes: Axes, title: str, drawn: dict[str, notebook.Curve]) -> None:
 
 
 def _title(text: str) -> str:
-    """Without matplotlib's mathematics, broken where it is long."""
+    """Escape matplotlib's mathematics, and break long titles into lines."""
     plain = text.replace("$", r"\$").lstrip("_")
     what, colon, key = plain.partition(": ")
     if not colon or len(plain) <= _LONGEST_TITLE:

@@ -1,4 +1,4 @@
-"""The final pictures of a run, for its report, and how far they are from the references."""
+"""Final images of a run for its report, and their errors against the references."""
 
 from __future__ import annotations
 
@@ -22,34 +22,34 @@ from unrender.statistics import debiased
 _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
 _SHARE, _LEAST_SECONDS = 0.05, 1.0
-"""Of the time of the steps, what final pictures may take, but a second at least."""
+"""Time limit of final images relative to the time of the steps, and its minimum in seconds."""
 _SENSITIVITY_SHARE = 0.5
-"""Of that time, what the sensitivity to the parameters may take besides, but one probe at least."""
+"""Additional time limit of the sensitivity relative to that; it takes at least one probe."""
 _LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
-"""Of the time of the steps, what each of two looks at what the pictures do not determine may take, but a quarter of a second at least."""
+"""Time limit of each of two tests of undetermined parameters relative to the time of the steps, and its minimum in seconds."""
 _NUMBERS_SHARE = 0.05
-"""Of the time of the steps, what the least squares of few numbers may take, but a second at least."""
+"""Time limit of least squares of few numbers relative to the time of the steps; at least one second."""
 _TRIAL_PATHS = 1 << 18
 _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 """Paths of one pass over all views, and its most samples per pixel."""
 _PICTURES_SHARE = 0.5
 """Share of the time that is left at the end that final pictures may take."""
 _MOST_BYTES, _PICTURES = 1 << 29, 3
-"""Of the pictures of views whose references are not held in memory: of each view, reference, start and result."""
+"""Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
 _SEEDS = {"initial": 1, "result": 2}
 _SECOND_HALF = 1 << 16
-"""Added to the seed for the second half of a picture's samples."""
+"""Offset of the seed for the second half of an image's samples."""
 
 
 @dataclass(frozen=True)
 class FinalImages:
-    """Pictures at the end of a run.
+    """Images at the end of a run.
 
     Attributes:
         pictures: see `Result.pictures`.
         errors: see `Result.image_errors`.
-        spp: samples per pixel of each.
+        spp: samples per pixel of each image.
         sensitivity: see `Result.sensitivity`.
         undetermined: see `Result.undetermined`.
         warnings: one line for each unknown that had not settled at the end.
@@ -64,12 +64,12 @@ class FinalImages:
 
 
 def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
-    """The pictures of `render_final_images`."""
+    """Return the images of `render_final_images`."""
     return render_final_images(problem, result, spp).pictures
 
 
 def warm_up(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
-    """Compile the kernels of `render_final_images`, by a picture of one pass and one probe of the sensitivity of one view."""
+    """Compile the kernels of `render_final_images` with an image of one pass per view and one probe of the sensitivity."""
     pass_spp, count = _pass_spp(problem), len(problem.views)
     own = count if count < MANY_SENSORS else 1  # more of them share their kernels
     for view in range(own):
@@ -81,19 +81,18 @@ def warm_up(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
 def render_final_images(
     problem: Problem, result: Result, spp: int | None = None, left: Callable[[], float] = lambda: math.inf
 ) -> FinalImages:
-    """Reference, initial and final picture of each view, the control weight and the probability of pixels where there are any; and how
-    much the views tell of each element of the parameters. Of many large views, whose references are not held in memory, pictures of some.
+    """Render the reference, initial and final image of each view, and collect control weights, pixel probabilities and sensitivities.
 
-    Each picture is rendered in two independent halves, which tell its error, by the view's mask, apart from its noise
-    (`evaluation.debiased`).
+    Of many large views, whose references are not in memory, only some are rendered. Each image is rendered in two independent halves,
+    which separate its error, weighted by the view's mask, from its noise (`statistics.debiased`).
 
     Args:
-        problem: what was run.
-        result: its outcome.
-        spp: samples per pixel. None for as many as a twentieth of the time of the run's steps allows, or one second where that is longer,
-            but no more than some four million paths per picture: a power of two, at least 2. Compiling is no part of that time.
-        left: returns the seconds that are left for all of this. Pictures have fewer samples, and what the pictures do not determine is
-            left out, if they are few.
+        problem: problem of the run.
+        result: result of the run.
+        spp: samples per pixel. None takes a power of two, at least 2, that fits into a twentieth of the time of the run's steps, or one
+            second if that is longer, and into about four million paths per image. That time excludes compiling.
+        left: function that returns the remaining seconds. If few remain, images have fewer samples, and tests of undetermined parameters
+            are omitted.
     """
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
     pictures: dict[str, np.ndarray] = {}
@@ -118,21 +117,21 @@ def render_final_images(
                 pictures[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * left())
         everything = len(chosen) == len(problem.views) and seconds > 0.0
-        found = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
-        lines, warnings = _undetermined(problem, result, found, 0.25 * left()) if everything else ([], ())
-    return FinalImages(pictures, errors, samples, found, tuple(lines), tuple(warnings))
+        sensitivities = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
+        lines, warnings = _undetermined(problem, result, sensitivities, 0.25 * left()) if everything else ([], ())
+    return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), tuple(warnings))
 
 
 def _undetermined(
-    problem: Problem, result: Result, found: Mapping[str, np.ndarray], most: float
+    problem: Problem, result: Result, sensitivities: Mapping[str, np.ndarray], most: float
 ) -> tuple[list[str], tuple[str, ...]]:
-    """What the pictures do not determine, and which numbers had not settled, in lines; of a run without steps nothing.
+    """Return lines about what the images do not determine, and about numbers that have not settled; none without steps.
 
-    Each look takes `most` seconds, or few more.
+    Each test takes at most about `most` seconds.
     """
     if not result.steps:
         return [], ()
-    lines = undetermined_cells(found)
+    lines = undetermined_cells(sensitivities)
     spp, seconds = _trial_spp(problem), min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
     if seconds <= 0.0:
         return lines, ()
@@ -141,13 +140,13 @@ def _undetermined(
     lines += undetermined(problem, result.parameters, spp, seconds, per_pass)
     allowed = min(max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed)
-    told = "\n".join(lines)
-    lines += [line for key, line in numbers.undetermined.items() if key not in told]
-    return lines, tuple(line for key, line in numbers.unfinished.items() if key not in told)
+    text = "\n".join(lines)
+    lines += [line for key, line in numbers.undetermined.items() if key not in text]
+    return lines, tuple(line for key, line in numbers.unfinished.items() if key not in text)
 
 
 def _chosen(problem: Problem) -> list[int]:
-    """The views that have pictures: all, or evenly some of many large ones."""
+    """Return the views to render: all, or an even selection of many large ones."""
     largest = max(height * width for height, width in problem.sizes)
     most = max(1, _MOST_BYTES // (_PICTURES * 12 * largest))
     count = len(problem.views)
@@ -157,14 +156,14 @@ def _chosen(problem: Problem) -> list[int]:
 
 
 def image_name(view: int, which: str) -> str:
-    """The name of a view's "initial" or "result" among pictures and their errors."""
+    """Return the name of a view's "initial" or "result" image."""
     return f"view{view}/{which}"
 
 
 def _picture(
     problem: Problem, values: Mapping[str, np.ndarray], view: int, spp: int, seed: int
 ) -> tuple[np.ndarray, tuple[float, float] | None]:
-    """A view's picture, and its error with the standard error; None for a single sample, which has no halves."""
+    """Return a view's image, and its error with the standard error; None for a single sample, which has no halves."""
     first = spp // 2
     if first == 0:
         return render(problem, values, view, spp, seed), None
@@ -179,11 +178,11 @@ def _picture(
 
 
 def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
-    """Samples per pixel that final pictures may have: what they take is measured on a few samples of the first view."""
+    """Return the affordable samples per pixel of final images, from the measured time of a few samples of the first view."""
     sizes = [height * width for height, width in problem.sizes]
     most, trial = _most_spp(problem), _pass_spp(problem)
     seconds = 0.0
-    for seed in (0, 1):  # the first time, kernels are compiled
+    for seed in (0, 1):  # the first rendering compiles kernels
         started = time.perf_counter()
         render(problem, result.parameters, 0, trial, seed, per_pass=trial)
         seconds = time.perf_counter() - started
@@ -203,11 +202,11 @@ def _pass_spp(problem: Problem) -> int:
 
 
 def _trial_spp(problem: Problem) -> int:
-    """Samples per pixel of renderings that tell something in little time."""
+    """Return the samples per pixel of quick test renderings."""
     height, width = problem.sizes[0]
     return _power_of_two(min(max(_TRIAL_PATHS // (height * width), 1), _most_spp(problem) // 2))
 
 
 def _power_of_two(number: int) -> int:
-    """The greatest that is not above `number`; 1 for less than 1. Few different sample counts mean few different kernels."""
+    """Return the largest power of two <= `number`, at least 1. Few different sample counts need few different kernels."""
     return 1 << (max(number, 1).bit_length() - 1)

@@ -1,4 +1,4 @@
-"""A run that can be looked at, paused and stopped from outside, by files in its folder."""
+"""Observation and control of a run from outside, by files in its folder."""
 
 from __future__ import annotations
 
@@ -42,22 +42,22 @@ _LARGEST_CONTROL = 4096
 
 
 class Live(Callback):
-    """Writes what a run looks like now, about once a second, and follows commands.
+    """Callback that writes the current state of a run about once per second, and executes commands.
 
-    Into `live/` of the run folder go: `status.json`; `views.npz`, each view's picture as the loss saw it, with its control weight or
-    pixel probability where there is one; `parameters.npz`; once, `run.json`, `start.npz` (references, and the first step's pictures),
-    `initial.npz` and `truth.npz`; and `history.jsonl`, unless the run folder itself gets one. Large pictures,
-    textures and volumes are box-filtered, of the first eight views at most. Each file is written beside its place and renamed.
+    It writes to `live/` in the run folder: `status.json`; `views.npz`, with each view's image at which the loss was evaluated, and its
+    control weight or pixel probability if any; `parameters.npz`; once, `run.json`, `start.npz` (references, and the first step's images),
+    `initial.npz` and `truth.npz`; and `history.jsonl`, unless the run folder itself has one. Large images, textures and volumes are
+    box-filtered; at most eight views are written. Each file is written atomically.
 
-    `control.json` in the run folder holds {"command": "run"}, "pause" or "stop". A pause blocks after a step, and is no time of the
-    run; a stop ends the run as Ctrl-C does. Commands left from before the run are removed.
+    `control.json` in the run folder contains {"command": "run"}, "pause" or "stop". A pause blocks after a step, and does not count as
+    the run's time. A stop ends the run as Ctrl-C does. Commands from before the run are removed.
 
-    The time between two updates grows with what they cost, so that they take at most 2 % of the run's.
+    The interval between updates grows with their cost, so that they take at most 2 % of the run's time.
 
     Args:
-        folder: the run folder. Where it cannot be written to, the run goes on with a warning, commands are followed nevertheless, and
-            writing is tried again every few seconds. Where it vanishes, or `live` is a link, that is the end of it, with a warning.
-        name, method, command, settings: as `Result` has them, for people.
+        folder: the run folder. If it is not writable, the run continues with a warning, still executes commands, and tries to write every
+            few seconds. If the folder disappears, or `live` is a link, observation ends with a warning.
+        name, method, command, settings: as in `Result`, for display.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Live(Callback):
             self._put_off(run, error)
 
     def clear(self) -> None:
-        """Remove what this callback wrote, once the run folder itself holds all of it."""
+        """Remove the files of this callback, once the run folder itself contains everything."""
         (self._folder / CONTROL).unlink(missing_ok=True)
         if not self._live.is_symlink():
             shutil.rmtree(self._live, ignore_errors=True)
@@ -132,8 +132,8 @@ class Live(Callback):
             try:
                 self._update(run, record, "paused")
             except (OSError, InputError) as error:
-                self._put_off(run, error)  # it is paused, though nobody can be told
-            # In a folder that is gone, no command could end the pause.
+                self._put_off(run, error)  # the run pauses although its status cannot be written
+            # In a deleted folder no command could end the pause.
             while command == "pause" and not run.stopped and self._folder.is_dir():
                 time.sleep(_POLL_SECONDS / 2)
                 command = self._read_command()
@@ -142,7 +142,7 @@ class Live(Callback):
             run.stop("interrupted")
 
     def _read_command(self) -> str:
-        """The command that holds now; the last one where the file is no command, "run" where there is none."""
+        """Return the current command; the last one if the file is invalid, "run" if there is none."""
         path = self._folder / CONTROL
         try:
             status = os.stat(path, follow_symlinks=False)
@@ -150,8 +150,8 @@ class Live(Callback):
             if stamp != self._command[0]:
                 self._command = stamp, self._command[1]
                 if 0 < status.st_size <= _LARGEST_CONTROL and path.is_file() and not path.is_symlink():
-                    found = json.loads(path.read_text("utf-8"))
-                    command = found.get("command") if isinstance(found, dict) else None
+                    content = json.loads(path.read_text("utf-8"))
+                    command = content.get("command") if isinstance(content, dict) else None
                     if command in COMMANDS:
                         self._command = stamp, command
         except FileNotFoundError:
@@ -161,7 +161,7 @@ class Live(Callback):
         return self._command[1]
 
     def _update(self, run: Run, record: dict[str, Any], status: str) -> None:
-        dr.sync_thread()  # what is still being computed is the run's own time
+        dr.sync_thread()  # pending computation counts as the run's time
         began = time.monotonic()
         if self._start is not None:
             if self._folder.is_dir():
@@ -179,7 +179,7 @@ class Live(Callback):
         self._next_update = began + max(_INTERVAL, self._cost / _SHARE)
 
     def _write_start(self, run: Run) -> None:
-        """What stays the same in the course of the run. Until it is written, `_start` holds the parameters that the run began with."""
+        """Write the files that do not change during the run. Until then, `_start` holds the initial parameters."""
         initial = self._start or {}
         self._initial_error = run.problem.parameter_error(initial)
         self._write_arrays(LIVE_START, _references(run))
@@ -209,12 +209,12 @@ class Live(Callback):
         self._start = None
 
     def _write_arrays(self, name: str, values: Mapping[str, np.ndarray]) -> None:
-        if not self._live.is_dir():  # writing would bring back a folder that somebody removed
+        if not self._live.is_dir():  # writing would recreate a folder that a user removed
             raise InputError(f"{self._live}: the folder is gone")
         files.write_arrays(self._live / name, values, compress=False, durable=False)
 
     def _write_status(self, run: Run, status: str, record: Mapping[str, Any] | None) -> None:
-        found = schema.LiveStatus.model_construct(
+        live_status = schema.LiveStatus.model_construct(
             status=status,
             stopped=run.stopped,
             step=run.step,
@@ -232,10 +232,10 @@ class Live(Callback):
             initial_error=self._initial_error,
             shapes=run.problem.shapes(),
         )
-        _write_json(self._live / LIVE_STATUS, found)
+        _write_json(self._live / LIVE_STATUS, live_status)
 
     def _put_off(self, run: Run, error: Exception) -> None:
-        """Try again later what could not be written; never, where the folder is gone or none of this run's."""
+        """Schedule another attempt after a failure; give up if the folder is gone or does not belong to this run."""
         reason = " ".join(str(error).split())
         to_be_made = self._start is not None and self._folder.is_dir()
         self._disabled = self._live.is_symlink() or not (self._live.is_dir() or to_be_made)
@@ -250,7 +250,7 @@ class Live(Callback):
 
 
 class _LiveHistory:
-    """Appends to live/history.jsonl as long as the run folder itself gets no history.jsonl."""
+    """Appends to live/history.jsonl while the run folder itself has no history.jsonl."""
 
     def __init__(self, folder: Path):
         self._other = folder / schema.HISTORY
@@ -291,28 +291,28 @@ def _references(run: Run) -> dict[str, np.ndarray]:
 
 
 def _images(run: Run) -> dict[str, np.ndarray]:
-    """{"view0": (H, W, 3)} as the loss saw them, of the views that the last estimate has."""
+    """Return {"view0": (H, W, 3)}, the images at which the loss was evaluated, of the views in the last estimate."""
     info = run.estimate.info if run.estimate is not None else {}
-    found = {i: arrays.numpy(image) for i, image in info.get("images", {}).items() if i < _VIEWS}
+    images = {i: arrays.numpy(image) for i, image in info.get("images", {}).items() if i < _VIEWS}
     wanted = {i: (*size, 3) for i, size in enumerate(run.problem.sizes)}
-    return {f"view{i}": reduced(image, _PICTURE) for i, image in found.items() if image.shape == wanted.get(i)}
+    return {f"view{i}": reduced(image, _PICTURE) for i, image in images.items() if image.shape == wanted.get(i)}
 
 
 def _views(run: Run) -> dict[str, np.ndarray]:
-    found = {f"{name}/result": image for name, image in _images(run).items()}
+    views = {f"{name}/result": image for name, image in _images(run).items()}
     info = run.estimate.info if run.estimate is not None else {}
     for kind in ("control_weight", "pixel_probability"):
         for i, values in info.get(kind, {}).items():
             if i < _VIEWS and (array := arrays.numpy(values)).ndim in (2, 3):
                 size = run.problem.sizes[i]
                 small = reduced(np.empty((*size, 0), np.float32), _PICTURE).shape[:2]
-                found[f"view{i}/{kind}"] = resize_nearest(reduced(array, _PICTURE), *small)
-    return found
+                views[f"view{i}/{kind}"] = resize_nearest(reduced(array, _PICTURE), *small)
+    return views
 
 
 def _reduced_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Textures and volumes box-filtered; of other large arrays the least and the greatest value."""
-    found = {}
+    """Return textures and volumes box-filtered, and the minimum and maximum of other large arrays."""
+    reduced_arrays = {}
     for key, value in parameters.items():
         array = np.asarray(value)
         if array.ndim == 4:
@@ -321,8 +321,8 @@ def _reduced_parameters(parameters: Mapping[str, np.ndarray]) -> dict[str, np.nd
             array = reduced(array, _PICTURE)
         elif array.size > _LARGEST_OTHER:
             array = np.array([array.min(), array.max()])
-        found[key] = array
-    return found
+        reduced_arrays[key] = array
+    return reduced_arrays
 
 
 def _write_json(path: Path, model: BaseModel) -> None:

@@ -1,4 +1,4 @@
-"""The descent: estimate, update, precondition, bound. Whatever else a run does is a `Hook`."""
+"""The optimisation loop: estimate, update, precondition, bound. Everything else is a `Hook`."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ __all__ = ["Descent", "descend", "initialize", "prepare"]
 
 _ERRORS_PER_SECOND = 10.0
 _ERROR_PAUSE = 20.0
-"""Times what it took, before the parameters' error is measured again."""
+"""Ratio of the pause before the next measurement of the parameters' error to the measurement's duration."""
 
 
 @dataclass
 class Descent:
-    """A run with all that belongs to it.
+    """A run with everything that belongs to it.
 
     Attributes:
-        run: what callbacks see.
-        state: what it carries from step to step beside that.
-        log: its history, and what its result says besides.
-        hooks: what takes part in it, in the order in which they are called.
+        run: part that callbacks get.
+        state: further state from step to step.
+        log: history and description of the run.
+        hooks: hooks in calling order.
     """
 
     run: Run
@@ -52,11 +52,11 @@ class Descent:
     hooks: Sequence[Hook] = field(default_factory=tuple)
 
     def result(self, info: bool = False) -> Result:
-        """What the run has reached so far; with `info`, what the last estimate tells besides."""
+        """Return the current result; with `info`, including the information of the last estimate."""
         optimizer = self.run.optimizer
         adapted = optimizer.choices(self.state.optimizer) if isinstance(optimizer, Choosing) else ()
-        found = self.log.result(self.run, [line for hook in self.hooks for line in hook.warnings(self)], info, adapted)
-        return replace(found, standard_error=self._standard_errors())
+        result = self.log.result(self.run, [line for hook in self.hooks for line in hook.warnings(self)], info, adapted)
+        return replace(result, standard_error=self._standard_errors())
 
     def _standard_errors(self) -> dict[str, np.ndarray]:
         """Return the standard error of the parameters that have one, in their units."""
@@ -64,20 +64,20 @@ class Descent:
         if not isinstance(optimizer, Measuring):
             return {}
         coordinates = run.problem.coordinates
-        found = optimizer.standard_errors(self.state.optimizer, coordinates.of(run.parameters))
-        slopes = coordinates.slopes({key: run.parameters[key] for key in found})
-        by_x = {key: np.abs(arrays.numpy(slopes[key])) * x if key in slopes else x for key, x in found.items()}
+        errors = optimizer.standard_errors(self.state.optimizer, coordinates.of(run.parameters))
+        slopes = coordinates.slopes({key: run.parameters[key] for key in errors})
+        by_x = {key: np.abs(arrays.numpy(slopes[key])) * x if key in slopes else x for key, x in errors.items()}
         return {key: x.astype(np.float32) for key, x in by_x.items()}
 
     def snapshot(self) -> dict[str, Any]:
-        """All that decides what the next steps do."""
+        """Return everything that determines the next steps."""
         return snapshot(self.run, self.state)
 
     def warm_up(self) -> tuple[float, dict[str, Any]]:
-        """Trace and compile every kernel of a step by taking two whose outcome is discarded.
+        """Trace and compile every kernel of a step by taking two steps whose results are discarded.
 
         Returns:
-            The seconds it took, and the snapshot after the two steps.
+            The elapsed seconds, and the snapshot after the two steps.
         """
         started = time.perf_counter()
         run, state = replace(self.run, warnings=[]), replace(self.state, noise=GradientNoise())
@@ -96,15 +96,15 @@ class Descent:
 
 
 def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> tuple[Run, RunState]:
-    """Return a run before its first step. Raises `InputError` for a seed that no file could hold."""
+    """Return a run before its first step. Raises `InputError` for a seed that files cannot store."""
     seed = check_seed("seed", seed)
     problem, estimator = plan.configured(), plan.estimator
     optimizer = plan.bound_optimizer(problem)
     problem.executor.check(estimator)
-    if optimizer.requires == Capabilities(LossFunction):  # a search, whose mean would not be where the loop has it
+    if optimizer.requires == Capabilities(LossFunction):  # a search, whose mean would differ from the loop's parameters
         for key in problem.coordinates.preconditioners:
             raise InputError(
-                f"{type(optimizer).__name__}: parameter {key} has a preconditioner; leave it out, a search has a covariance of its own"
+                f"{type(optimizer).__name__}: parameter {key} has a preconditioner; remove it, because a search adapts its own covariance"
             )
     run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
@@ -113,7 +113,7 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
 
 
 def initialize(run: Run, state: RunState, step: int) -> None:
-    """Give a run that has not begun its initial parameters, at their resolution of a step, and initial states of that resolution."""
+    """Set the initial parameters of a new run at the resolution of a step, and initial states for that resolution."""
     problem = run.problem
     run.parameters = {k: problem.unknowns[k].project(x) for k, x in problem.start(step).items()}
     state.estimator = run.estimator.init(problem, run.parameters)
@@ -121,7 +121,7 @@ def initialize(run: Run, state: RunState, step: int) -> None:
 
 
 def descend(descent: Descent) -> Result:
-    """Take steps until a hook, a callback or Ctrl-C stops the run. See `Hook` for what happens when."""
+    """Take steps until a hook, a callback or Ctrl-C stops the run. See `Hook` for the order of events."""
     run, hooks = descent.run, descent.hooks
     try:
         fresh = descent.snapshot()
@@ -163,13 +163,13 @@ def _announce(descent: Descent, estimate: Estimate, applied: bool) -> None:
 def _step(
     run: Run, state: RunState, on_update: Callable[[Estimate, bool], None] = lambda estimate, applied: None
 ) -> dict[str, Any]:
-    """One step. Returns its record of the history.
+    """Take one step, and return its record of the history.
 
-    One whose estimate is not finite is not applied, nor is one where the optimizer makes a step that is not finite of an estimate that is.
+    A step is not applied if its estimate is not finite, or if the optimizer's step is not finite.
     """
     problem = run.problem
     started = time.perf_counter()
-    run.estimate = None  # its gradient is as large as the one to come
+    run.estimate = None  # frees a gradient as large as the next one
     memory.trim_cache(run.parameters)
     estimate, after = run.estimator.estimate(problem, run.parameters, state.estimator, Key(run.seed, run.step))
     estimate = penalized(estimate, problem, run.parameters)
@@ -209,7 +209,7 @@ def _step(
 
 
 def _not_finite(estimate: Estimate) -> str:
-    """What of an estimate is not finite, "" for nothing."""
+    """Return which part of an estimate is not finite, "" if all are."""
     if not np.isfinite(estimate.loss):
         return "the loss"
     for what, tree in (("gradient", estimate.gradient), ("gradient's variance", estimate.variance or {})):
@@ -220,14 +220,14 @@ def _not_finite(estimate: Estimate) -> str:
 
 
 def _warn_of_skipping(run: Run, culprit: str) -> None:
-    """Warn of a step that is not applied, once for each culprit."""
+    """Warn of a step that is not applied, once per cause."""
     line = f"{culprit} was not finite; such steps are not applied"
     if not any(known.endswith(line) for known in run.warnings):
         run.warnings.append(f"step {run.step}: {line}")
 
 
 def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
-    """Warn of steps of meshes that are shortened, once for each."""
+    """Warn of shortened steps of meshes, once per mesh."""
     for key in keys:
         also = " or passed through others" if run.problem.unknowns[key].given.self_intersection == "prevent" else ""
         line = f"{key}: triangles would have turned over{also}; such steps are shortened"
@@ -237,12 +237,12 @@ def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class _Update:
-    """What an optimizer makes of an estimate.
+    """Result of an optimizer's update.
 
     Attributes:
-        parameters, state: after it; of the state, large arrays are still to be evaluated.
+        parameters, state: values after the update; large arrays of the state are not yet evaluated.
         shortened: meshes whose triangles would have turned over.
-        not_finite: what of it is not finite, "" for nothing; it is then not to be applied.
+        not_finite: part that is not finite, "" for none; the update must then not be applied.
     """
 
     parameters: Tree
@@ -252,13 +252,13 @@ class _Update:
 
 
 def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimizer, parameters: Tree) -> _Update:
-    """Transform, update, transform back, bound: the optimizer works in the problem's `coordinates`, bounds are the parameters' own."""
+    """Transform, update, transform back, and bound: the optimizer uses the problem's `coordinates`; bounds apply to the parameters."""
     coordinates = problem.coordinates
-    found = by_coordinates(estimate, problem, parameters)
-    steps, state = optimizer.update(found, state, coordinates.of(parameters))
+    mapped = by_coordinates(estimate, problem, parameters)
+    steps, state = optimizer.update(mapped, state, coordinates.of(parameters))
     moved, reached = coordinates.moved(parameters, steps)
     bounded = {k: problem.unknowns[k].project(x) for k, x in reached.items()}
-    # Before they are bounded: the nearest point to what is no number may be a bound.
+    # Checked before projection, because the projection of a NaN may be a bound.
     finite = trees.map(arrays.is_finite, moved)
     del steps, moved, reached
     arrays.evaluate(bounded, finite, memory.small_parts(state))

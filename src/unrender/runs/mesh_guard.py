@@ -1,4 +1,4 @@
-"""Steps of meshes that keep triangles from turning over and, where asked for, from passing through one another."""
+"""Limitation of mesh steps, to prevent triangles from turning over and, optionally, from intersecting."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from unrender.scene.surfaces import area_normals
 
 _HALVINGS = 3
 _LEAST_AREA = 0.01
-"""Of a triangle's area, as seen from where its normal pointed before, below which it counts as turned over."""
+"""Smallest projected area of a triangle along its previous normal, relative to its previous area; below it, it counts as turned over."""
 
 
 def guarded(before: np.ndarray, after: np.ndarray, faces: np.ndarray, crossing: bool = True) -> np.ndarray:
-    """Vertex positions (3 V,) on the way from `before` to `after` at which no triangle has turned over; `after` itself where none does.
+    """Return vertex positions (3 V,) between `before` and `after` at which no triangle has turned over; `after` itself if possible.
 
-    The whole step is halved up to three times; where triangles still turn over, their vertices stay where they were. Triangles without area
-    before do not count.
+    The step is halved up to three times. Vertices of triangles that would still turn over do not move. Degenerate triangles are ignored.
 
     Args:
         before, after: vertex positions, (3 V,).
-        faces: (F, 3).
-        crossing: whether triangles may pass through one another; if not, those that would, and did not before, count as turned over.
+        faces: vertex indices, (F, 3).
+        crossing: whether triangles may intersect; if not, new intersections count as turned over.
     """
     start, end = before.reshape(-1, 3).astype(np.float64), after.reshape(-1, 3).astype(np.float64)
     normals = area_normals(start, faces)
@@ -31,12 +30,12 @@ def guarded(before: np.ndarray, after: np.ndarray, faces: np.ndarray, crossing: 
     known = np.zeros((0, 2), int) if crossing else crossing_triangles(start, joined)
 
     def turned(vertices: np.ndarray) -> np.ndarray:
-        found = np.sum(normals * area_normals(vertices, faces), axis=1) < least
+        over_mask = np.sum(normals * area_normals(vertices, faces), axis=1) < least
         if not crossing:
             pairs = crossing_triangles(vertices, joined)
             new = ~np.isin(pairs @ [len(faces), 1], known @ [len(faces), 1])
-            found[pairs[new].reshape(-1)] = True
-        return found
+            over_mask[pairs[new].reshape(-1)] = True
+        return over_mask
 
     if not turned(end).any():
         return after
@@ -52,13 +51,13 @@ def guarded(before: np.ndarray, after: np.ndarray, faces: np.ndarray, crossing: 
 
 
 def _joined(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Faces by the first of all vertices at each place."""
+    """Return faces with each vertex replaced by the first vertex at its position."""
     _, first, places = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     return first[places.reshape(-1)][faces]
 
 
 def _at_same_place(chosen: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """The chosen vertices (V,) and all others at their places, as along seams; `chosen` becomes that."""
+    """Extend the chosen vertices (V,) by all others at their positions, as on both sides of seams. Modifies `chosen`."""
     _, places = np.unique(vertices, axis=0, return_inverse=True)
     places = places.reshape(-1)
     chosen |= np.bincount(places, weights=chosen)[places] > 0

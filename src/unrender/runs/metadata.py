@@ -1,4 +1,4 @@
-"""What a result and a run folder say of a run beside what the run found."""
+"""Description of a run in its result and run folder."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 @dataclass(frozen=True)
 class RunAnnotations:
-    """What a run folder should say of its run beside what `optimize` knows.
+    """Additional description of a run for its run folder.
 
     Attributes:
-        method: its name; "" for the estimator's.
-        settings: of the method, as JSON can hold them.
-        choices: what the method chose and why, one line each.
-        command: what was typed.
-        final_spp: samples per pixel of the final pictures; None chooses.
-        phases: {phase: seconds} of what came before, such as loading.
-        within_seconds: Whether the budget in seconds covers compilation and final pictures too, not the steps alone.
-        spent: Seconds of that budget that are gone before the run, such as those of loading.
+        method: name of the method; "" for the estimator's.
+        settings: settings of the method, in types of JSON.
+        choices: choices of the method and their reasons, one line each.
+        command: the command line.
+        final_spp: samples per pixel of the final images; None chooses.
+        phases: {phase: seconds} before the run, such as loading.
+        within_seconds: Whether the budget in seconds includes compiling and final images, not only the steps.
+        spent: Seconds of that budget that have passed before the run, such as those of loading.
     """
 
     method: str = ""
@@ -52,21 +52,21 @@ class RunAnnotations:
 
 
 def first_values(run: Run) -> dict[str, np.ndarray]:
-    """{key: array} of a run that has not begun, at the scene's own resolution: the problem's own arrays where they are equal, in place of
-    copies of the run's."""
+    """Return {key: array} of a run before its first step, at the scene's resolution, without copies where equal to the problem's
+    arrays."""
     known = run.problem.unknowns
     return {k: known[k].initial if np.array_equal(known[k].initial, x) else x for k, x in run.full().items()}
 
 
 @dataclass
 class RunMetadata:
-    """What a result says beside what the run found.
+    """Description of a run, from which results are made.
 
     Attributes:
         description: fields of `Result`, see `describe_run`.
-        initial: {key: array}, where the descent began.
+        initial: {key: array}, initial parameters.
         history: one record per step.
-        warmup_seconds: of tracing and compiling.
+        warmup_seconds: seconds of tracing and compiling.
     """
 
     description: dict[str, Any]
@@ -75,11 +75,11 @@ class RunMetadata:
     warmup_seconds: float = 0.0
 
     def result(self, run: Run, warnings: Sequence[str] = (), info: bool = False, adapted: Sequence[str] = ()) -> Result:
-        """What the run has reached so far.
+        """Return the current result of the run.
 
         Args:
             run: the run.
-            warnings: lines beside those of the run.
+            warnings: lines in addition to the run's.
             info: whether to include `Estimate.info` of the last step.
             adapted: see `Result.adapted`.
         """
@@ -99,7 +99,7 @@ class RunMetadata:
 
 
 def describe(estimator: Estimator) -> str:
-    """A short name: the class, whether it is the coupled form, and the class of its image where it has one."""
+    """Return a short name: the class, the coupled form, and the class of the image estimator if any."""
     image = getattr(estimator, "image", None)
     words = ["coupled"] if getattr(estimator, "coupled", False) else []
     words += [type(image).__name__] if image is not None else []
@@ -107,7 +107,7 @@ def describe(estimator: Estimator) -> str:
 
 
 def describe_run(run: Run, annotations: RunAnnotations) -> dict[str, Any]:
-    """Fields of `Result` that are known before the first step."""
+    """Return the fields of `Result` that are known before the first step."""
     problem = run.problem
     loss = repr(problem.loss) if is_dataclass(problem.loss) else type(problem.loss).__name__
     components = {"estimator": repr(run.estimator), "optimizer": repr(run.optimizer)}
@@ -132,18 +132,18 @@ def describe_run(run: Run, annotations: RunAnnotations) -> dict[str, Any]:
 
 
 def recorded_measures(problem: Problem) -> dict[str, Any]:
-    """Return how errors are measured as a run folder records it: without the plain measures."""
+    """Return the error measures as recorded in a run folder, without the default ones."""
     return {key: u.measure.record() for key, u in problem.unknowns.items() if u.measure != PLAIN}
 
 
 def fingerprint_of(run: Run) -> dict[str, str]:
-    """The problem's fingerprint, and those of estimator and optimizer: their representations without memory addresses."""
+    """Return the fingerprints of the problem, the estimator and the optimizer, without memory addresses."""
     components = {"estimator": run.estimator, "optimizer": run.optimizer}
     return fingerprint(run.problem) | {name: _ADDRESS.sub("", repr(part)) for name, part in components.items()}
 
 
 def to_numpy(info: Any) -> Any:
-    """`Estimate.info` with NumPy arrays in place of Dr.Jit's."""
+    """Convert the Dr.Jit arrays of `Estimate.info` to NumPy."""
     if isinstance(info, Mapping):
         return {key: to_numpy(value) for key, value in info.items()}
     return arrays.numpy(info) if arrays.is_drjit(info) else info

@@ -1,4 +1,4 @@
-"""How a result is shown: one line of text, and a block of HTML in a notebook."""
+"""Display of a result as one line of text, and as HTML in a notebook."""
 
 from __future__ import annotations
 
@@ -28,18 +28,19 @@ Curve = tuple[np.ndarray, np.ndarray]
 
 
 def loss_curve(history: Sequence[Mapping[str, Any]]) -> Curve:
-    """The loss of the steps' own samples: means over up to 200 groups of consecutive steps; NaN where none was finite."""
+    """Return the loss from the steps' samples: means over up to 200 groups of consecutive steps; NaN for a group without finite
+    values."""
     seconds = np.array([record["seconds"] for record in history], float)
     values = np.array([record["loss"] for record in history], float)
     values[~np.isfinite(values)] = np.nan
     groups = np.array_split(np.arange(len(history)), min(len(history), _POINTS)) if len(history) else []
-    means = [np.mean(kept) if (kept := values[g][np.isfinite(values[g])]).size else np.nan for g in groups]
+    means = [np.mean(finite) if (finite := values[g][np.isfinite(values[g])]).size else np.nan for g in groups]
     return np.array([seconds[g[-1]] for g in groups]), np.array(means, float)
 
 
 def error_curves(history: Sequence[Mapping[str, Any]], initial: Mapping[str, float]) -> dict[str, Curve]:
-    """{key: error} where it was measured, from the start's `initial` on."""
-    found: dict[str, Curve] = {}
+    """Return {key: error curve} of the measured errors, starting with `initial`."""
+    curves: dict[str, Curve] = {}
     for key, first in initial.items():
         known = [
             (record["seconds"], record["parameter_error"][key])
@@ -48,17 +49,18 @@ def error_curves(history: Sequence[Mapping[str, Any]], initial: Mapping[str, flo
         ]
         if known:
             seconds, values = np.array([(0.0, first), *known], float).T
-            found[key] = seconds, values
-    return found
+            curves[key] = seconds, values
+    return curves
 
 
 class NotebookProgress(Callback):
-    """A bar in a notebook's cell: compiling, steps with loss and parameter error, final pictures; then one line. A context manager."""
+    """Progress bar in a notebook cell: compiling, steps with loss and parameter error, final images, and a final line. A context
+    manager."""
 
     def __init__(self) -> None:
         self._bar = NotebookBar()
         self._listening = phases.listening(self._bar)
-        self._told = ""
+        self._summary = ""
 
     def __enter__(self) -> NotebookProgress:
         self._listening.__enter__()
@@ -66,7 +68,7 @@ class NotebookProgress(Callback):
 
     def __exit__(self, *_: object) -> None:
         self._listening.__exit__(None, None, None)
-        self._bar.close(self._told)
+        self._bar.close(self._summary)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         parts = [
@@ -79,8 +81,8 @@ class NotebookProgress(Callback):
 
     def on_end(self, run: Run, result: Result) -> None:
         del run
-        self._told = f"{result.steps} steps in {formatting.duration(result.seconds)}"
-        self._told += (
+        self._summary = f"{result.steps} steps in {formatting.duration(result.seconds)}"
+        self._summary += (
             f" and {formatting.duration(result.warmup_seconds)} to compile" if result.warmup_seconds >= 0.5 else ""
         )
 
@@ -89,12 +91,12 @@ _VIEWS, _MAPS = 2, 3
 
 
 def line(result: Result) -> str:
-    """Result('indirect-room', rcv: 300 steps in 12.3 s, parameter error 0.306 → 0.0283, finished)."""
-    return f"Result({result.name!r}, {_told(result)})"
+    """Return a summary: Result('indirect-room', rcv: 300 steps in 12.3 s, parameter error 0.306 → 0.0283, finished)."""
+    return f"Result({result.name!r}, {_summary(result)})"
 
 
 def html(result: Result) -> str:
-    """Pictures, recovered maps beside truth and start, curves, where the time went, warnings."""
+    """Return HTML with images, recovered textures with truth and start, curves, times and warnings."""
     end = result.seconds or 1.0
     seconds, loss = loss_curve(result.history)
     errors = error_curves(result.history, start_errors(result))
@@ -105,7 +107,7 @@ def html(result: Result) -> str:
     ]
     rows = _numbers(result) | {"image error": _image_error(result), "time": formatting.phases(result.phases)}
     return notebook.block(
-        f"Result of {result.name}, {_told(result)}",
+        f"Result of {result.name}, {_summary(result)}",
         notebook.picture_row(shown_pictures(result)),
         notebook.charts(drawn),
         notebook.facts({name: text for name, text in rows.items() if text}),
@@ -114,9 +116,9 @@ def html(result: Result) -> str:
 
 
 def shown_pictures(result: Result) -> dict[str, np.ndarray]:
-    """{caption: (H, W, 3) in [0, 1]}: views, where there are pictures, then parameters that are maps."""
+    """Return {caption: (H, W, 3) in [0, 1]}: views, if there are images, then parameters that can be displayed as images."""
     shown: dict[str, np.ndarray] = {}
-    found = measures(result)
+    measure_of = measures(result)
     for view in range(_VIEWS):
         reference = result.pictures.get(f"view{view}/reference")
         for what in ("reference", "initial", "result"):
@@ -124,7 +126,7 @@ def shown_pictures(result: Result) -> dict[str, np.ndarray]:
             if picture is not None:
                 shown[f"view {view}: {'start' if what == 'initial' else what}"] = shown_image(picture, reference)
     for key in [key for key, values in result.parameters.items() if pictures.is_map(values)][:_MAPS]:
-        truth, columns = result.truth.get(key), found[key].repeated
+        truth, columns = result.truth.get(key), measure_of[key].repeated
         like = result.parameters[key] if truth is None else truth
         for what, values in (("truth", truth), ("start", result.initial[key]), ("recovered", result.parameters[key])):
             colours = None if values is None else shown_map(periodic.interior(values, columns), like)
@@ -134,16 +136,16 @@ def shown_pictures(result: Result) -> dict[str, np.ndarray]:
 
 
 def measures(result: Result) -> dict[str, ErrorMeasure]:
-    """Return {key: how its error is measured}."""
+    """Return {key: error measure}."""
     recorded = result.problem.get("measures", {})
     return {key: parameter_errors.from_record(recorded.get(key)) for key in result.parameters}
 
 
 def start_errors(result: Result) -> dict[str, float]:
-    """{key: error of the start} where the truth is known, see `Problem.parameter_error`."""
-    found = measures(result)
+    """Return {key: initial error} of parameters with a known truth, see `Problem.parameter_error`."""
+    measure_of = measures(result)
     errors = {
-        key: found[key].error(result.initial[key], truth)
+        key: measure_of[key].error(result.initial[key], truth)
         for key, truth in result.truth.items()
         if key in result.initial
     }
@@ -151,12 +153,12 @@ def start_errors(result: Result) -> dict[str, float]:
 
 
 def error_title(result: Result) -> str:
-    """Return what a chart of the errors of the result shows."""
-    found = measures(result)
-    return parameter_errors.title(found[key] for key in result.truth if key in found)
+    """Return the title of a chart of the result's errors."""
+    measure_of = measures(result)
+    return parameter_errors.title(measure_of[key] for key in result.truth if key in measure_of)
 
 
-def _told(result: Result) -> str:
+def _summary(result: Result) -> str:
     words = f"{result.method or 'run'}: {result.steps} steps in {formatting.duration(result.seconds)}"
     before = start_errors(result)
     last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})

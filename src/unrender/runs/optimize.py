@@ -1,4 +1,4 @@
-"""`unrender.optimize` and `unrender.estimate`."""
+"""Functions `unrender.optimize` and `unrender.estimate`."""
 
 from __future__ import annotations
 
@@ -63,38 +63,38 @@ def optimize(
     annotations: RunAnnotations | None = None,
     progress: bool | None = None,
 ) -> Result:
-    """Recover the problem's parameters by descent.
+    """Recover the problem's parameters by gradient-based optimisation.
 
     Args:
-        problem: what to recover, from which images.
-        estimator: Computes gradients; or a `methods.plan.Plan` or a method's name (`unrender methods`), which bring an optimizer along.
-        optimizer: Computes steps from gradients; None for the method's.
-        steps: how many steps at most, >= 1.
-        seconds: how much time at most, > 0, without warm-up, callbacks and checkpoints. One of the two must be given.
-        seed: of every random number of the run. Equal arguments give equal results: bit for bit with one thread; with more, the
-            threads add to a gradient in the order they finish, and results agree to rounding.
-        callbacks: listeners.
-        run_directory: the run folder: history and checkpoints as the run goes, the result with final pictures of every view at its end; in
-            place of an earlier run's. `resume` continues a run that ended early. None for no run folder.
-        checkpoint_every: steps between checkpoints, >= 1; None for 50 or so, as far as they take no more than a hundredth of the time.
-            There is one at the end, too.
-        annotations: what else the run folder should say.
-        progress: whether to show a bar; None does so in notebooks.
+        problem: problem to solve.
+        estimator: Gradient estimator; or a `methods.plan.Plan` or a method's name (`unrender methods`), which include an optimizer.
+        optimizer: Optimizer; None for the method's.
+        steps: maximum number of steps, >= 1.
+        seconds: time limit, > 0, without warm-up, callbacks and checkpoints. At least one of the two limits is required.
+        seed: seed of all random numbers of the run. Equal arguments give equal results, bit for bit with one thread. With more threads,
+            the order of summation varies, and results agree to rounding error.
+        callbacks: callbacks that observe the run.
+        run_directory: the run folder, which replaces that of an earlier run. History and checkpoints are written during the run, and the
+            result with final images of every view at its end. `resume` continues a run that ended early. None for no run folder.
+        checkpoint_every: steps between checkpoints, >= 1. None takes about 50, within a hundredth of the run's time. There is one at the
+            end, too.
+        annotations: additional description of the run for the run folder.
+        progress: whether to show a progress bar; None does so in notebooks.
 
-    Ctrl-C ends the run after the present step and returns what was reached; a second one interrupts at once. SIGTERM ends a run with a
-    run folder, without final pictures, and then the process, unless the program handles it. Both work in the main thread alone.
+    Ctrl-C ends the run after the current step and returns the result so far; a second Ctrl-C interrupts at once. SIGTERM ends a run with
+    a run folder, without final images, and then the process, unless the program handles it. Both work in the main thread only.
 
-    A step whose loss or gradient is not finite is not applied, nor remembered by the estimator, and neither is one that the optimizer
-    makes not finite; it is counted in `Result.skipped`, and a warning says what was not finite. After twenty in a row the run is given
-    up: `Result.status` is "failed", and the parameters are the last that were finite.
+    A step is not applied if its loss, gradient or update is not finite, and the estimator ignores it. It is counted in `Result.skipped`,
+    and a warning names the cause. After twenty such steps in a row the run stops: `Result.status` is "failed", and the parameters are the
+    last finite ones.
 
-    Threads take turns: while a run goes on, another thread's `optimize`, `resume` or `render` is refused.
+    Only one thread may compute at a time: during a run, another thread's `optimize`, `resume` or `render` is refused.
 
-    What goes wrong with the run folder while the run goes is a line among the warnings (and in the log), and the run goes on.
+    A failure to write the run folder during the run is a warning (also logged), and the run continues.
 
     Raises:
-        InputError: the optimizer requires what the estimator does not provide, or the budget makes no sense; the run folder is in use,
-            cannot be begun, or cannot be written in the end; another thread has a run in progress.
+        InputError: the optimizer requires what the estimator does not provide, or the budget is invalid; the run folder is in use, cannot
+            be created, or cannot be written at the end; another thread has a run in progress.
     """
     plan = components.resolve(problem, estimator, optimizer)
     check(plan.estimator, plan.optimizer, steps, seconds)
@@ -114,11 +114,11 @@ def optimize(
 
 @contextmanager
 def _progress(wanted: bool | None) -> Iterator[list[Callback]]:
-    """The callback that shows a bar, while it is up; none where none is wanted."""
+    """Yield the callback of the progress bar while it is displayed; none if it is not wanted."""
     if wanted is False or (wanted is None and not in_notebook()):
         yield []
         return
-    from unrender.runs.progress import Progress  # rich takes long to import
+    from unrender.runs.progress import Progress  # imports rich, which is slow
 
     with NotebookProgress() if in_notebook() else Progress() as bar:
         yield [bar]
@@ -128,7 +128,7 @@ def _progress(wanted: bool | None) -> Iterator[list[Callback]]:
 def _folder(
     run: Run, log: RunMetadata, annotations: RunAnnotations, directory: str | Path | None, checkpoint_every: int | None
 ) -> Iterator[list[RunWriter]]:
-    """The writer of the run folder, which is begun; none where no folder is wanted."""
+    """Yield the writer of the run folder after its start; an empty list without a folder."""
     if directory is None:
         yield []
         return
@@ -143,9 +143,9 @@ def _folder(
 def assemble_hooks(
     callbacks: Sequence[Callback], *folder: Hook, earlier: Mapping[str, float] | None = None
 ) -> list[Hook]:
-    """What takes part in every run, then what keeps its run folder, then the user's callbacks.
+    """Return the hooks of every run, then those of the run folder, then the user's callbacks.
 
-    `earlier` is the seconds of phases before the run.
+    `earlier` contains the seconds of phases before the run.
     """
     return [
         PhaseTimes(earlier),
@@ -162,9 +162,9 @@ def assemble_hooks(
 
 
 def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | None, final_spp: int | None) -> RunWriter:
-    """The writer of a run's folder, to be used as a context manager. What goes wrong with the folder goes to the run's warnings."""
+    """Return the writer of a run's folder, a context manager. Failures are added to the run's warnings."""
     table = method_file.serialize(run, method, checkpoint_every, final_spp)
-    # By a closure: resuming replaces the list of warnings.
+    # A closure, because resuming replaces the list of warnings.
     return RunWriter(
         folder, run.plan.problem, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line)
     )
@@ -174,25 +174,26 @@ def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | Non
 def estimate(
     problem: Problem, estimator: Estimator | str, parameters: Mapping[str, np.ndarray] | None = None, seed: int = 0
 ) -> Estimate:
-    """One estimate from a fresh state, its arrays as NumPy: to look at a gradient.
+    """Return one estimate from an initial state, with NumPy arrays, for inspection of a gradient.
 
     Args:
-        problem: what to recover.
-        estimator: where gradients come from, or the name of a method.
-        parameters: {key: array} for all parameters of the problem, or None for the initial ones. Values at an end of their range count
-            as 1e-4 of the range inside: no path shows the gradient by a black reflectance, or by a lobe of probability 0.
-        seed: of its random numbers.
+        problem: problem to solve.
+        estimator: gradient estimator, or the name of a method.
+        parameters: {key: array} of all parameters of the problem; None for the initial ones. Values at a bound of their
+            range are moved inside by 1e-4 of the range: no path has a gradient with respect to a black reflectance, or to a lobe of
+            probability 0.
+        seed: seed of the random numbers.
     """
     estimator = components.resolve_estimator(problem, estimator, "estimate")
     problem.executor.check(estimator)
     point = off_ends(as_tree(problem, parameters), problem.renderer.parameters())
     state = estimator.init(problem, point)
-    found, _ = estimator.estimate(problem, point, state, Key(seed))
-    return replace(as_numpy(found), info=to_numpy(found.info))
+    result, _ = estimator.estimate(problem, point, state, Key(seed))
+    return replace(as_numpy(result), info=to_numpy(result.info))
 
 
 def check(estimator: Estimator, optimizer: Optimizer, steps: int | None, seconds: float | None) -> None:
-    """Raise `InputError` where the optimizer requires what the estimator does not provide, or the budget makes no sense."""
+    """Raise `InputError` if the optimizer requires what the estimator does not provide, or the budget is invalid."""
     missing = optimizer.requires - estimator.provides
     if missing:
         raise InputError(

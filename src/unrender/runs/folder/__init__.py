@@ -1,1 +1,1 @@
-"""The run folder: its schema, its writer, its reader."""
+"""Run folder: schema, writer, reader."""

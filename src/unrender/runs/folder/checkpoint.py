@@ -1,7 +1,7 @@
-"""Checkpoints: `checkpoints/<step>/state.safetensors` and `manifest.json`, none of which is ever seen half-written.
+"""Atomic checkpoints: `checkpoints/<step>/state.safetensors` and `manifest.json`.
 
-A checkpoint is written into a folder of another name; its manifest comes last and is on the disk before the folder gets its name.
-What is removed loses its manifest first. So whatever instant a process dies at, all folders with a name and a manifest are whole.
+A checkpoint is written to a folder with a temporary name. Its manifest comes last, and is on disk before the folder is renamed. Removal
+deletes the manifest first. So at every instant, each folder with a checkpoint's name and a manifest is complete.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = [
 
 FOLDER = CHECKPOINTS
 KEEP = 3
-"""Checkpoints that a run folder has at most."""
+"""Maximum number of checkpoints in a run folder."""
 _NAME = re.compile(r"\d{8,12}")
 _LARGEST_MANIFEST = 1 << 24
 _LARGEST_STATE = 1 << 36
@@ -50,7 +50,7 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint that was read, its state still in parts."""
+    """A checkpoint as read, with its state still packed."""
 
     manifest: Manifest
     packed: Packed
@@ -67,7 +67,7 @@ def write(
 ) -> Path:
     """Write a checkpoint of the run folder `folder`, then remove all but the last `keep`.
 
-    Raises `OSError` where that fails, and leaves the earlier ones as they were.
+    Raises `OSError` if that fails, and leaves earlier checkpoints unchanged.
     """
     root = folder / FOLDER
     partial, final = root / f".{step:08d}.{os.getpid()}.{files.PARTIAL}", root / f"{step:08d}"
@@ -106,24 +106,24 @@ def write(
 def candidates(
     folder: Path, reject: Callable[[Checkpoint], str] = lambda _: ""
 ) -> Iterator[tuple[Checkpoint | None, list[str]]]:
-    """The checkpoints of a run folder that can be read and are not rejected, the latest first; None alone where there is none at all.
+    """Yield the readable checkpoints of a run folder that are not rejected, latest first; None alone if there are none.
 
     Args:
         folder: the run folder.
-        reject: says why a checkpoint does not suit; "" for one that does.
+        reject: function that returns why a checkpoint is unsuitable, "" if it is suitable.
 
     Yields:
-        Each with one line for every later one that was passed over, in a list that the caller may add to: why this one is, too.
+        Each checkpoint with one line for every later one that was skipped, in a list to which the caller may add why it skips this one.
 
     Raises:
-        InputError: there are some, but all are passed over; what is wrong with the latest.
+        InputError: all existing checkpoints were skipped; the message is that of the latest.
     """
     root = folder / FOLDER
     if root.is_symlink():
         raise InputError(f"{root}: a link, expected a folder")
     passed_over: list[str] = []
-    found = _finished(root)
-    for path in reversed(found):
+    finished = _finished(root)
+    for path in reversed(finished):
         try:
             one = read(path)
             if reason := reject(one):
@@ -134,17 +134,17 @@ def candidates(
         yield one, passed_over
     if passed_over:
         raise InputError(passed_over[0])
-    if not found:
+    if not finished:
         yield None, []
 
 
 def latest(folder: Path, reject: Callable[[Checkpoint], str] = lambda _: "") -> tuple[Checkpoint | None, list[str]]:
-    """The first of the `candidates`. Raises `InputError` where there are some, but none can be read."""
+    """Return the first of the `candidates`. Raises `InputError` if none of the existing ones is readable."""
     return next(candidates(folder, reject))
 
 
 def read(path: Path) -> Checkpoint:
-    """The checkpoint in a folder. Raises `InputError` for a malformed one: one line with the file and what is wrong."""
+    """Read the checkpoint in a folder. Raises `InputError` with the file and the fault."""
     if path.is_symlink() or any((path / name).is_symlink() for name in (STATE, MANIFEST)):
         raise InputError(f"{path}: a link, or with links inside; expected a folder with files")
     where = str(path / MANIFEST)
@@ -156,7 +156,7 @@ def read(path: Path) -> Checkpoint:
 
 
 def clear(folder: Path) -> None:
-    """Remove all checkpoints of a run folder, those that were never finished among them. Links are removed, not followed."""
+    """Remove all checkpoints of a run folder, including unfinished ones. Links are removed, not followed."""
     root = folder / FOLDER
     if root.is_symlink():
         root.unlink()
@@ -167,7 +167,7 @@ def clear(folder: Path) -> None:
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove the checkpoints that runs which died left half-written or half-removed. For the process that holds the folder."""
+    """Remove checkpoints that dead processes left half-written or half-removed. Only for the process that holds the folder's lock."""
     root = folder / FOLDER
     if root.is_symlink() or not root.is_dir():
         return
@@ -193,7 +193,7 @@ def _tensors(path: Path, manifest: Manifest) -> dict[str, Any]:
     if not isinstance(header, dict):
         raise InputError(f"{path}: tensors cannot be read: its header is not an object")
     try:
-        # Checks every type, shape and offset against the bytes that are there before it takes memory for any.
+        # safetensors checks every type, shape and offset against the available bytes before it allocates memory.
         return {name: array.copy() for name, array in safetensors.numpy.load(data).items()}
     except safetensors.SafetensorError as error:
         raise InputError(f"{path}: tensors cannot be read: {str(error)[:200]}") from error
@@ -202,12 +202,12 @@ def _tensors(path: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def _finished(root: Path) -> list[Path]:
-    """The finished checkpoints, oldest first."""
+    """Return the finished checkpoints, oldest first."""
     if not root.is_dir():
         return []
-    found = [path for path in root.iterdir() if _NAME.fullmatch(path.name)]
+    named = [path for path in root.iterdir() if _NAME.fullmatch(path.name)]
     return sorted(
-        (path for path in found if (path / MANIFEST).exists() or path.is_symlink()), key=lambda p: int(p.name)
+        (path for path in named if (path / MANIFEST).exists() or path.is_symlink()), key=lambda p: int(p.name)
     )
 
 
@@ -219,7 +219,7 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def _remove(path: Path) -> None:
-    """Whatever is there; a checkpoint's manifest first, so that half of one is none."""
+    """Remove a path; of a checkpoint the manifest first, so that a partial one is never valid."""
     if path.is_symlink() or path.is_file():
         path.unlink(missing_ok=True)
         return

@@ -1,6 +1,6 @@
-"""history.jsonl: one line a step, written as soon as the step is done; and read, whole or as it grows.
+"""history.jsonl: one line per step, written as soon as the step is done; with readers for finished and growing files.
 
-A run of millions of steps keeps fewer lines of its earlier ones (`thinned`), so that no file grows past what is read in seconds.
+A run of millions of steps thins its earlier lines (`thinned`), so that the file can be read in seconds.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from unrender.io import bounded_files, files
 from unrender.runs.folder.schema import HISTORY_AXES, HISTORY_COLUMNS
 
 LARGEST_LINE = 1 << 20
-"""In bytes."""
+"""Largest line in bytes."""
 LARGEST = 1 << 30
-"""Of the whole file, in bytes."""
+"""Largest file in bytes."""
 MOST_KEPT = 1 << 26
-"""Bytes of a run's file from which on its earlier steps are thinned."""
+"""Size in bytes from which a run's earlier steps are thinned."""
 _CHUNK = 1 << 20
 
 
@@ -34,15 +34,15 @@ _CHUNK = 1 << 20
 
 
 def steps_in(records: Sequence[Mapping[str, Any]]) -> int:
-    """How many steps a history is of, those among them whose records were thinned out."""
+    """Return the number of steps of a history, including those whose records were removed."""
     return max(int(records[-1].get("step", 0)) + 1, len(records)) if records else 0
 
 
 def thinned(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The records with about every second of the earlier three quarters left out.
+    """Remove about every second record of the earlier three quarters.
 
-    Of those the ones remain whose step is a multiple of twice the first ones' stride, and those that record a change of resolution: a
-    history that is thinned time and again stays evenly spaced, by powers of two.
+    Records remain if their step is a multiple of twice the current stride, or if they record a change of resolution. A history that is
+    thinned repeatedly stays evenly spaced, by powers of two.
     """
     early = len(records) - len(records) // 4
     if early < 2:
@@ -52,27 +52,27 @@ def thinned(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         stride *= 2
         if stride > records[-1]["step"]:
             return list(records)
-    kept = [r for r in records[:early] if r["step"] % (2 * stride) == 0 or "resolution" in r]
-    return [*kept, *records[early:]]
+    thinned_records = [r for r in records[:early] if r["step"] % (2 * stride) == 0 or "resolution" in r]
+    return [*thinned_records, *records[early:]]
 
 
 # ---------------------------------------------------------------------- writing
 
 
 class HistoryFile:
-    """The file while the run goes. A line that could not be written is held back, and written with the next."""
+    """The file during a run. A line that cannot be written is buffered, and written with the next."""
 
     def __init__(self, path: Path):
         self.path = path
         self._file: int | None = None
         self._pending: list[bytes] = []
         self.size = 0
-        """Of the file, in bytes."""
+        """Size of the file in bytes."""
 
     def rewrite(self, records: Iterable[Mapping[str, Any]], name_too: bool = True) -> None:
-        """Make the file hold just these, and go on from there; see `files.write`.
+        """Replace the contents by these records, and append after them; see `files.write`.
 
-        Raises `OSError` or `InputError`; the file is then as it was.
+        Raises `OSError` or `InputError`; the file is then unchanged.
         """
         text = lines(records)
         files.write(self.path, text, name_too=name_too)
@@ -81,7 +81,7 @@ class HistoryFile:
         self._file, self.size, self._pending = opened, len(text), []
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Add one line. Raises `OSError`; the file then ends with the last whole line."""
+        """Append one line. Raises `OSError`; the file then ends with the last complete line."""
         self._pending.append(lines([record]))
         if self._file is None:
             raise OSError("the file is closed")
@@ -98,19 +98,19 @@ class HistoryFile:
         self._pending = []
 
     def sync(self) -> None:
-        """Have it on the disk before this returns. Raises `OSError`."""
+        """Flush the file to the disk. Raises `OSError`."""
         if self._file is not None:
             files.flush(self._file)
 
     def close(self) -> None:
-        """Harmless where it is closed."""
+        """Close the file. Does nothing if it is closed."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
 
 
 def lines(records: Iterable[Mapping[str, Any]]) -> bytes:
-    """The records as JSON, one a line; numbers that are not finite become null."""
+    """Return the records as JSON, one per line; numbers that are not finite become null."""
     return "".join(json.dumps(_finite_or_null(record), allow_nan=False) + "\n" for record in records).encode()
 
 
@@ -126,28 +126,29 @@ def _finite_or_null(value: Any) -> Any:
 
 
 def read_records(path: Path, folder: Path) -> tuple[list[dict[str, Any]], str]:
-    """The records of a history up to the first line that is no record of a later step, and what is wrong with that line, "" for nothing.
+    """Return the records up to the first invalid line, and the fault of that line, "" for none.
 
-    A last line that was cut off is nothing wrong. Raises `InputError` where the file cannot be read, or is larger than `LARGEST`.
+    A line is invalid if it is not the record of a later step. A truncated last line is not a fault. Raises `InputError` if the file
+    cannot be read or is larger than `LARGEST`.
     """
-    found: list[dict[str, Any]] = []
+    records: list[dict[str, Any]] = []
     with bounded_files.open_regular(path, folder) as file:
         if os.fstat(file.fileno()).st_size > LARGEST:
             raise InputError(f"{path}: larger than {LARGEST >> 30} GiB, which no run writes")
         while (line := file.readline(LARGEST_LINE + 1)).endswith(b"\n"):
-            where = f"{path}:{len(found) + 1}"
+            where = f"{path}:{len(records) + 1}"
             try:
-                record = bounded_files.parse_json(line.removeprefix(codecs.BOM_UTF8 if not found else b""), where)
+                record = bounded_files.parse_json(line.removeprefix(codecs.BOM_UTF8 if not records else b""), where)
             except InputError as error:
-                return found, str(error)
+                return records, str(error)
             step = record.get("step") if isinstance(record, dict) else None
-            if type(step) is not int or step < steps_in(found):
+            if type(step) is not int or step < steps_in(records):
                 shown = printable(line.decode(errors="replace").strip()[:60])
-                return found, f"{where}: expected the record of step {steps_in(found)} or a later one, got {shown}"
-            found.append(record)
+                return records, f"{where}: expected the record of step {steps_in(records)} or a later one, got {shown}"
+            records.append(record)
     if len(line) > LARGEST_LINE:
-        return found, f"{path}:{len(found) + 1}: a line of more than {LARGEST_LINE >> 20} MiB"
-    return found, ""
+        return records, f"{path}:{len(records) + 1}: a line of more than {LARGEST_LINE >> 20} MiB"
+    return records, ""
 
 
 # ---------------------------------------------------------------------- reading columns, to show them
@@ -155,11 +156,11 @@ def read_records(path: Path, folder: Path) -> tuple[list[dict[str, Any]], str]:
 
 @dataclass(frozen=True)
 class ErrorHistory:
-    """One parameter's root mean square error where it was recorded; arrays of equal length.
+    """One parameter's recorded root mean square error; arrays of equal length.
 
     Attributes:
-        records: which of the history's records, ascending.
-        values: >= 0; infinite where the record holds no number.
+        records: indices into the history's records, ascending.
+        values: >= 0; infinite if the record has no number.
     """
 
     records: np.ndarray
@@ -168,12 +169,12 @@ class ErrorHistory:
 
 @dataclass(frozen=True)
 class History:
-    """history.jsonl, by columns of one length.
+    """history.jsonl as columns of equal length.
 
     Attributes:
-        seconds, samples: since the start, ascending.
-        loss, gradient_noise: NaN where the record holds no number.
-        parameter_error: {key: where and what}.
+        seconds, samples: totals since the start, ascending.
+        loss, gradient_noise: NaN if the record has no number.
+        parameter_error: {key: its error history}.
     """
 
     seconds: np.ndarray
@@ -188,11 +189,11 @@ class History:
 
 @dataclass
 class HistoryReader:
-    """Reads a history that may still grow. A file that was replaced or cut is read anew.
+    """Reader of a history that may still grow. A file that was replaced or truncated is read from the start.
 
     Attributes:
-        path: the file.
-        folder: the run folder that it must lie in.
+        path: path of the file.
+        folder: run folder that must contain it.
     """
 
     path: Path
@@ -208,13 +209,13 @@ class HistoryReader:
         self._reset()
 
     def read(self, to_the_end: bool = True) -> History:
-        """What the file holds now.
+        """Return the current contents of the file.
 
         Args:
-            to_the_end: also a last line without a line break. A run that goes on may be writing it: then leave it.
+            to_the_end: whether to include a last line without a line break, which a running process may still be writing.
 
         Raises:
-            InputError: the file is missing, too large, or a line of it is malformed; the file and the line are named.
+            InputError: the file is missing or too large, or a line is malformed; the message names file and line.
         """
         with bounded_files.open_regular(self.path, self.folder) as file:
             status = os.fstat(file.fileno())
@@ -231,7 +232,7 @@ class HistoryReader:
                 if to_the_end and self._rest:
                     self._add(b"\n")
             except InputError:
-                self._reset()  # so that the next call says the same, and does not go on behind the line
+                self._reset()  # the next call must report the same error, and not continue after the line
                 raise
         return self._history()
 
@@ -241,8 +242,8 @@ class HistoryReader:
         self._line, self._offset, self._rest, self._file = 0, 0, b"", (0, 0)
 
     def _add(self, data: bytes) -> None:
-        *whole, self._rest = (self._rest + data).split(b"\n")
-        for line in whole:
+        *complete, self._rest = (self._rest + data).split(b"\n")
+        for line in complete:
             self._line += 1
             self._add_record(line)
         if len(self._rest) > LARGEST_LINE:
@@ -258,11 +259,15 @@ class HistoryReader:
             record = bounded_files.parse_object(line.decode("utf-8-sig" if self._line == 1 else "utf-8"), where)
         except UnicodeDecodeError as error:
             raise InputError(f"{where}: not UTF-8 text ({error.reason} at byte {error.start})") from error
-        found = {name: _number(record.get(name), f"{where}: {name}", name in HISTORY_AXES) for name in self._columns}
+        numbers_by_name = {
+            name: _number(record.get(name), f"{where}: {name}", name in HISTORY_AXES) for name in self._columns
+        }
         for name in HISTORY_AXES:
             last = self._columns[name][-1] if self._columns[name] else 0.0
-            if found[name] < last:
-                raise InputError(f"{where}: {name}: expected no less than {last:g} before it, got {found[name]:g}")
+            if numbers_by_name[name] < last:
+                raise InputError(
+                    f"{where}: {name}: expected no less than {last:g} before it, got {numbers_by_name[name]:g}"
+                )
         errors = record.get("parameter_error", {})
         if not isinstance(errors, dict):
             raise InputError(f"{where}: parameter_error: expected an object {{key: number}}, got {_short(errors)}")
@@ -270,7 +275,7 @@ class HistoryReader:
             key: _number(value, f"{where}: parameter_error.{printable(key)}", False) for key, value in errors.items()
         }
         for name, column in self._columns.items():
-            column.append(found[name])
+            column.append(numbers_by_name[name])
         for key, value in values.items():
             records, numbers = self._errors.setdefault(key, ([], []))
             records.append(len(self._columns["seconds"]) - 1)
@@ -291,12 +296,12 @@ def _number(value: Any, where: str, required: bool) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InputError(f"{where}: expected a number, got {_short(value)}")
     try:
-        found = float(value)
+        number = float(value)
     except OverflowError:
-        found = math.inf
-    if required and not math.isfinite(found):
+        number = math.inf
+    if required and not math.isfinite(number):
         raise InputError(f"{where}: expected a finite number, got {_short(value)}")
-    return found if math.isfinite(found) else math.nan
+    return number if math.isfinite(number) else math.nan
 
 
 def _short(value: Any) -> str:

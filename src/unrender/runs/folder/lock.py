@@ -1,9 +1,9 @@
-"""Who holds a run folder: one process at a time, and one that died holds nothing.
+"""Lock of a run folder: one process at a time; a dead process holds nothing.
 
-The file `lock` names the process and is locked (`flock`) while it lives: the kernel lets go when it ends, however it ends, so neither a
-crash, nor a process id that was given to another, nor a container that starts again under another host name can leave a folder locked.
-Where the file system does not lock, or its locks hold within one machine though others write to it too, the name decides: process id and
-time of its start, counted from the machine's own start and so untouched by clocks set back.
+The file `lock` names the process and is locked (`flock`) while it lives. The kernel releases the lock when the process ends for any
+reason. So a folder cannot stay locked after a crash, by a reused process id, or by a container that restarts with another host name. If
+the file system does not lock, or locks within one machine only although others write to it, the name decides: process id and start time,
+measured from the boot of the machine and thus independent of its clock.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _SHARED = re.compile(
 )
 """File systems that several machines may write to."""
 _WITHIN_ONE_MACHINE = {"nolock", "local_lock=flock", "local_lock=all", "nobrl"}
-"""Options of those in whose presence locks are not passed on."""
+"""Mount options with which these do not forward locks to the server."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Holder:
     """A process.
 
     Attributes:
-        pid: its number.
-        host: the machine.
-        started: what tells it from another process of the same number: the machine's start and the process's since then.
+        pid: process id.
+        host: name of the machine.
+        started: boot id and start time, which distinguish it from another process with the same id.
     """
 
     pid: int
@@ -51,19 +51,19 @@ class Holder:
         return f"process {self.pid} on {self.host}"
 
     def is_gone(self) -> bool:
-        """Whether the process is known to have ended. One of another machine never is."""
+        """Return whether the process is known to have ended; never for a process of another machine."""
         return self.host == platform.node() and _started(self.pid) != self.started
 
 
 class Lock:
-    """Holds a run folder from `acquire` on until `release`. The folder must be there."""
+    """Lock of an existing run folder, from `acquire` to `release`."""
 
     def __init__(self, folder: Path):
         self.path = folder / LOCK
         self._file: int | None = None
 
     def acquire(self) -> None:
-        """Raises `InputError` where another process holds the folder, or none can: one line that says who, or why."""
+        """Acquire the lock. Raises `InputError` if another process holds it, or it cannot be taken, with the holder or the reason."""
         try:
             while self._file is None:
                 self._file = self._try()
@@ -71,7 +71,7 @@ class Lock:
             raise InputError(f"run folder {self.path.parent}: cannot be locked: {error.strerror or error}") from error
 
     def is_held(self) -> bool:
-        """Whether the folder still holds this lock: it may have been deleted, or deleted and locked by another process."""
+        """Return whether the folder still has this lock: it may have been deleted, and locked by another process."""
         if self._file is None:
             return False
         with contextlib.suppress(OSError):
@@ -79,7 +79,7 @@ class Lock:
         return False
 
     def release(self) -> None:
-        """Let the folder go. Harmless where it is not held."""
+        """Release the lock. Does nothing if it is not held."""
         if self._file is None:
             return
         try:
@@ -91,7 +91,7 @@ class Lock:
             self._file = None
 
     def _try(self) -> int | None:
-        """The locked file; None where it was deleted in between: then try again."""
+        """Return the locked file; None if it was deleted in between, so that the caller tries again."""
         file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
         locked = False
         try:
@@ -101,7 +101,7 @@ class Lock:
             except BlockingIOError:
                 raise InputError(self._in_use(_read(self.path))) from None
             except OSError:
-                pass  # a file system without locks: the name decides
+                pass  # the file system does not lock, so the name decides
             if not os.path.exists(self.path) or not os.path.samestat(os.stat(self.path), os.fstat(file)):
                 os.close(file)
                 return None
@@ -126,13 +126,13 @@ class Lock:
 
 
 def holder(folder: Path) -> Holder | None:
-    """The process that holds a run folder, as far as can be told without asking for it; None where none does, or it has ended."""
-    found = _read(folder / LOCK)
-    return None if found is None or found.is_gone() or _is_free(folder / LOCK) else found
+    """Return the process that holds a run folder, as far as known without acquiring it; None if there is none or it has ended."""
+    known = _read(folder / LOCK)
+    return None if known is None or known.is_gone() or _is_free(folder / LOCK) else known
 
 
 def _is_free(path: Path) -> bool:
-    """Whether the lock is known to be held by no process on any machine."""
+    """Return whether the lock is known to be held by no process of any machine."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
@@ -147,24 +147,24 @@ def _is_free(path: Path) -> bool:
 
 
 def _locks_for_all(file: int) -> bool:
-    """Whether a lock of this file excludes every process that could hold it, on whatever machine.
+    """Return whether a lock of this file excludes every process of every machine.
 
-    On a file system of this machine all processes ask its one kernel. NFS and SMB pass locks on to the server unless they are mounted not
-    to; of others that several machines may share nothing is known.
+    On a local file system, all processes use one kernel. NFS and SMB forward locks to the server unless mounted otherwise. Nothing is
+    known about other shared file systems.
     """
     device = os.fstat(file).st_dev
     number = f"{os.major(device)}:{os.minor(device)}"
     try:
         mounts = [line.split(" - ") for line in _MOUNTS.read_text().splitlines()]
     except OSError:
-        return False  # not Linux: what it is cannot be told
+        return False  # not Linux: the file system is unknown
     for mount, described in (parts for parts in mounts if len(parts) == 2):
         if mount.split()[2] == number:
             kind, _, options = described.split(" ", 2)
             return not _SHARED.match(kind) or (
                 bool(_SERVER.match(kind)) and _WITHIN_ONE_MACHINE.isdisjoint(options.split(","))
             )
-    return True  # btrfs and overlays have numbers that no mount has; what is shared has its own
+    return True  # btrfs and overlays use device numbers without a mount; shared file systems have their own
 
 
 def _read(path: Path) -> Holder | None:
@@ -174,15 +174,15 @@ def _read(path: Path) -> Holder | None:
             case {"pid": int(pid), "host": str(host), "started": str(started)} if 0 < pid < 1 << 31:
                 return Holder(pid, host[:200], started)
     except InputError:
-        pass  # nothing there, or written by no run: nobody is named
+        pass  # missing, or not written by a run
     return None
 
 
 def _started(pid: int) -> str:
-    """When a process of this machine started; "" where there is none of that number."""
+    """Return the start time of a process of this machine; "" if there is none with this id."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-        # The name, in parentheses, may hold anything; the 22nd field is the start in ticks since the machine's.
+        # The name, in parentheses, may contain anything. The 22nd field is the start in ticks since boot.
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return "" if fields[0] == "Z" else f"{boot}/{fields[19]}"
     except (OSError, IndexError):

@@ -1,4 +1,4 @@
-"""method.toml: the plan and the options of a run."""
+"""method.toml: plan and options of a run."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _Seconds = Annotated[StrictFloat | StrictInt, Field(gt=0, allow_inf_nan=False)]
 
 
 class Method(BaseModel):
-    """method.toml.
+    """Contents of method.toml.
 
     Attributes:
-        name: of the method; "" for none.
+        name: name of the method; "" for none.
         steps, seconds: the budget.
-        seed: of the run.
+        seed: seed of the run.
         checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
-        threads: that the run had.
+        threads: number of threads of the run.
         estimator, optimizer, settings: See `Plan.table`.
     """
 
@@ -47,8 +47,8 @@ class Method(BaseModel):
 
 
 def serialize(run: Run, name: str, checkpoint_every: int | None, final_spp: int | None) -> dict[str, Any]:
-    """The contents of method.toml for a run."""
-    found = {
+    """Return the contents of method.toml for a run."""
+    contents = {
         "name": name,
         "steps": run.steps,
         "seconds": run.seconds,
@@ -58,7 +58,7 @@ def serialize(run: Run, name: str, checkpoint_every: int | None, final_spp: int 
         "threads": dr.thread_count(),
         **run.plan.table(),
     }
-    return {key: value for key, value in found.items() if value is not None}
+    return {key: value for key, value in contents.items() if value is not None}
 
 
 def read(path: Path) -> Method:
@@ -67,7 +67,7 @@ def read(path: Path) -> Method:
 
 
 def encode(method: Mapping[str, Any], path: Path) -> bytes:
-    """Return the bytes of the file that `serialize` describes. Raises `InputError` where `read` would refuse them."""
+    """Return the bytes of the file for the result of `serialize`. Raises `InputError` if `read` would reject them."""
     text = "# The run: its method, budget and seed\n" + tomli_w.dumps(dict(method))
     data = toml_lines.encode(text, str(path))
     _parse(text, path)
@@ -75,9 +75,9 @@ def encode(method: Mapping[str, Any], path: Path) -> bytes:
 
 
 def _parse(text: str, path: Path) -> Method:
-    found = toml_lines.parse(text, str(path))
+    contents = toml_lines.parse(text, str(path))
     try:
-        return Method.model_validate(found)
+        return Method.model_validate(contents)
     except pydantic.ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = ".".join(str(part) for part in first["loc"][:1]) or "the file"

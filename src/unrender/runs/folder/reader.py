@@ -1,6 +1,6 @@
-"""Reading a run folder, and saying in one line what is wrong with one that cannot be read.
+"""Reader of run folders, with one-line errors.
 
-All that reads run folders goes through here and `history`: resume, report, compare, watch, export. Nothing in a folder is trusted.
+Resume, report, compare, watch and export read run folders through this module and `history`. Nothing in a folder is trusted.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from unrender.runs.folder.schema import RunRecord
 from unrender.scene.surfaces import Surface, surface_error
 
 _MOST_LISTED = 1000
-"""Of the files in a folder that is no run folder, looked through for a hint."""
+"""Maximum number of entries of a folder that are searched for a hint."""
 
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """Of one view, each (H, W, 3), linear; the probability with which a pixel is drawn (H, W)."""
+    """Images of one view, each (H, W, 3), linear; and the sampling probability of pixels, (H, W)."""
 
     reference: np.ndarray
     result: np.ndarray
@@ -39,18 +39,18 @@ class ViewPictures:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """All of a run folder.
+    """Contents of a run folder.
 
     Attributes:
-        path: the folder.
+        path: path of the folder.
         record: run.json.
         history: history.jsonl.
-        parameters, initial, truth: {key: array}; `truth` holds the keys whose truth is known.
-        views: {view index: pictures}, ascending; empty where the run saved none.
-        error_before, error_after: {key: error} at the start and at the end, where they are known, see `measure`.
-        sensitivity: see `Result.sensitivity`; {} where the run saved none.
+        parameters, initial, truth: {key: array}; `truth` contains the keys with a known truth.
+        views: {view index: images}, ascending; empty if the run saved none.
+        error_before, error_after: {key: error} at the start and at the end, if known; see `measure`.
+        sensitivity: see `Result.sensitivity`; {} if the run saved none.
         meshes: {key: `meshes.RunMesh`} of the parameters that are vertex positions.
-        shapes: {key: shape} of parameters whose arrays here are smaller than those of the run.
+        shapes: {key: shape} of parameters whose arrays here are smaller than in the run.
     """
 
     path: Path
@@ -72,11 +72,11 @@ class RunFolder:
         return (*self.truth, *(key for key in self.error_before if key not in self.truth))
 
     def measure(self, key: str) -> ErrorMeasure:
-        """Return how the error of a parameter is measured."""
+        """Return the error measure of a parameter."""
         return self.record.problem.measure(key)
 
     def shape(self, key: str) -> tuple[int, ...]:
-        """Of a parameter, as it is in the run."""
+        """Return the shape of a parameter in the run."""
         return self.shapes.get(key, self.parameters[key].shape)
 
 
@@ -84,7 +84,7 @@ def read(directory: str | Path) -> RunFolder:
     """Read and check a run folder.
 
     Raises:
-        InputError: there is none, or a file or field of it is missing or malformed, or leads out of the folder.
+        InputError: it is missing, or one of its files or fields is missing, malformed, or outside of the folder.
     """
     path = Path(directory)
     record = read_run_record(path)
@@ -107,24 +107,24 @@ def read(directory: str | Path) -> RunFolder:
             if (error := _surface_error(values[key], faces, mesh.truth)) is not None:
                 errors[key] = error
     views = pictures_by_view(_optional(path / schema.PICTURES, path), path / schema.PICTURES)
-    told = {
+    sensitivity = {
         k: x
         for k, x in _optional(path / schema.SENSITIVITY, path).items()
         if k in parameters and x.shape == parameters[k].shape
     }
-    return RunFolder(path, record, history, parameters, initial, known, views, before, after, {}, told, meshes)
+    return RunFolder(path, record, history, parameters, initial, known, views, before, after, {}, sensitivity, meshes)
 
 
 def read_run_record(folder: Path) -> RunRecord:
-    """The record of a run folder.
+    """Return the record of a run folder.
 
     Raises:
-        InputError: there is no such folder, it is no run folder, or run.json is malformed.
+        InputError: the folder is missing or not a run folder, or run.json is malformed.
     """
-    if (found := bounded_files.kind(folder)) != "folder":
+    if (kind := bounded_files.kind(folder)) != "folder":
         around = itertools.islice(folder.parent.iterdir(), _MOST_LISTED) if folder.parent.is_dir() else []
         siblings = [p.name for p in around if p.is_dir()]
-        what = "a file, expected a run folder" if found else "no such run folder"
+        what = "a file, expected a run folder" if kind else "no such run folder"
         raise InputError(f"{folder}: {what}{did_you_mean(folder.name, siblings)}")
     if bounded_files.kind(folder / schema.RECORD) != "file":
         inside = sorted(
@@ -138,12 +138,12 @@ def read_run_record(folder: Path) -> RunRecord:
 
 
 def read_record(path: Path, folder: Path) -> RunRecord:
-    """The record in a file of a run folder. Raises `InputError`."""
+    """Return the record in a file of a run folder. Raises `InputError`."""
     return schema.validate(RunRecord, bounded_files.read_object(path, folder), str(path))
 
 
 def root_mean_square(a: np.ndarray, b: np.ndarray) -> float | None:
-    """The root of the mean squared difference; None where shapes differ (a parameter refined on the way) or there are no elements."""
+    """Return the root mean square difference; None if shapes differ (a refined parameter) or there are no elements."""
     if a.shape != b.shape or a.size == 0:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
@@ -151,7 +151,7 @@ def root_mean_square(a: np.ndarray, b: np.ndarray) -> float | None:
 
 
 def _surface_error(values: np.ndarray, faces: np.ndarray, truth: Surface | None) -> float | None:
-    """The distance of a mesh from its true surface; None where there is none, or the mesh is no surface."""
+    """Return the distance of a mesh from its true surface; None if there is none, or the mesh is not a surface."""
     if truth is None:
         return None
     try:
@@ -161,8 +161,8 @@ def _surface_error(values: np.ndarray, faces: np.ndarray, truth: Surface | None)
 
 
 def pictures_by_view(arrays: dict[str, np.ndarray], path: Path) -> dict[int, ViewPictures]:
-    """{"view0/reference": array, ...} by view. Raises `InputError` naming `path`, where they came from."""
-    found: dict[int, dict[str, np.ndarray]] = {}
+    """Group {"view0/reference": array, ...} by view. Raises `InputError` that names `path`, their file."""
+    by_view: dict[int, dict[str, np.ndarray]] = {}
     for name, array in arrays.items():
         match = schema.PICTURE_NAME.fullmatch(name)
         if match is None:
@@ -173,9 +173,9 @@ def pictures_by_view(arrays: dict[str, np.ndarray], path: Path) -> dict[int, Vie
                 raise InputError(f"{path}: {name}: expected shape (height, width), got {array.shape}")
         elif array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
             raise InputError(f"{path}: {name}: expected shape (height, width, 3), got {array.shape}")
-        found.setdefault(int(match[1]), {})[match[2]] = array
+        by_view.setdefault(int(match[1]), {})[match[2]] = array
     views = {}
-    for view, pictures in sorted(found.items()):
+    for view, pictures in sorted(by_view.items()):
         for kind in ("reference", "result"):
             if kind not in pictures:
                 raise InputError(f"{path}: view{view}/{kind} is missing")

@@ -1,20 +1,20 @@
-"""What lies in a run folder: the names of its files, and the models of those that are JSON.
+"""Files of a run folder: their names, and the models of the JSON files.
 
-A run writes what these models say, and `reader` checks what it reads against them. Fields that a model does not have are ignored.
+A run writes what these models describe, and `reader` checks its input against them. Unknown fields are ignored.
 
-| file | holds |
+| file | contents |
 |---|---|
 | `run.json` | `RunRecord` |
 | `method.toml` | `method_file.Method` |
-| `problem.toml`, `problem/` | see `problem.serialization` |
+| `problem.toml`, `problem/` | see `scene.serialization` |
 | `history.jsonl` | one JSON object per step, see `HISTORY_COLUMNS` |
-| `parameters.npz`, `initial.npz`, `truth.npz` | {key: array}: the latest, the first, the true values where they are known |
-| `last.npz` | {key: array} after the last step, where `parameters.npz` holds better ones of an earlier step |
+| `parameters.npz`, `initial.npz`, `truth.npz` | {key: array}: the latest, the initial, and the known true values |
+| `last.npz` | {key: array} after the last step, if `parameters.npz` contains better ones of an earlier step |
 | `pictures.npz` | {"view0/reference": (H, W, 3), ...}, see `PICTURE_NAME` |
 | `sensitivity.npz` | {key: array}: see `Result.sensitivity` |
-| `meshes.npz`, `meshes/` | see `meshes.arrays_of`; PLY and OBJ files of the meshes that were recovered |
+| `meshes.npz`, `meshes/` | see `meshes.arrays_of`; PLY and OBJ files of the recovered meshes |
 | `checkpoints/00000050/` | `state.safetensors` and `manifest.json`, see `Manifest` |
-| `live/` | what a run looks like now, see `live.Live`; `status.json` is a `LiveStatus` |
+| `live/` | current state of a run, see `live.Live`; `status.json` is a `LiveStatus` |
 | `control.json` | {"command": one of `COMMANDS`} |
 | `lock` | the process that holds the folder, see `lock` |
 """
@@ -45,16 +45,19 @@ CHECKPOINTS, STATE, MANIFEST = "checkpoints", "state.safetensors", "manifest.jso
 LIVE, LIVE_STATUS, LIVE_START, LIVE_VIEWS = "live", "status.json", "start.npz", "views.npz"
 
 COMMANDS = ("run", "pause", "stop")
-"""What control.json may say."""
+"""Commands of control.json."""
 
 PICTURE_NAME = re.compile(r"view([0-9]{1,6})/(reference|initial|result|control_weight|pixel_probability)")
-"""Of the arrays in pictures.npz, live/start.npz and live/views.npz."""
+"""Names of the arrays in pictures.npz, live/start.npz and live/views.npz."""
 
 HISTORY_AXES = ("seconds", "samples")
-"""Columns of the history that every record has, finite and never falling: seconds of optimization and paths traced so far."""
+"""Columns that every record has, finite and never decreasing: seconds of optimisation and paths traced so far."""
 HISTORY_COLUMNS = (*HISTORY_AXES, "loss", "gradient_noise")
-"""Columns that are numbers; the last two are null where a step was not finite or nothing is known yet. A record also has "step", from 0,
-and may have "parameter_error", {key: see `Problem.parameter_error`}, and "resolution", {key: texels along each axis}."""
+"""Numeric columns.
+
+The last two are null if a step was not finite or they are unknown. A record also has "step", from 0, and may have "parameter_error",
+{key: see `Problem.parameter_error`}, and "resolution", {key: texels along each axis}.
+"""
 
 _Count = Annotated[StrictInt, Field(ge=0, lt=2**63)]
 _Seconds = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
@@ -62,23 +65,23 @@ _Status = Literal["running", "finished", "interrupted", "failed", "worse than st
 
 WORSE, MEMORY_DISAGREES = "worse than start", "memory disagrees"
 DOUBTFUL = frozenset({WORSE, MEMORY_DISAGREES})
-"""Statuses of runs that used up their budget, and that fresh pictures contradict."""
+"""Statuses of runs that used up their budget, but that new images contradict."""
 ENDED = DOUBTFUL | {"finished"}
 """Statuses of runs that used up their budget."""
 NOT_VERIFIED = "not verified"
-"""What is said of runs without `RunRecord.verification`."""
+"""Status of runs without `RunRecord.verification`."""
 
 
 # ---------------------------------------------------------------------- run.json
 
 
 class ProblemRecord(BaseModel):
-    """What run.json says of the problem: keys of parameters, number of views, loss, and so on, for people.
+    """Description of the problem in run.json: keys of parameters, number of views, loss and others, for display.
 
     Attributes:
-        fingerprint: see `problem.fingerprint`; None where it was not taken.
-        origin: where the problem came from, see `Problem.origin`.
-        measures: {key: how its error is measured}, see `ErrorMeasure.record`; without the plain ones.
+        fingerprint: see `scene.fingerprint`; None if not computed.
+        origin: origin of the problem, see `Problem.origin`.
+        measures: {key: error measure}, see `ErrorMeasure.record`; without the default ones.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -88,34 +91,34 @@ class ProblemRecord(BaseModel):
     measures: dict[StrictStr, Any] = {}
 
     def measure(self, key: str) -> ErrorMeasure:
-        """Return how the error of a parameter is measured."""
+        """Return the error measure of a parameter."""
         return parameter_errors.from_record(self.measures.get(key))
 
     @property
     def description(self) -> dict[str, Any]:
-        """The fields that are for people."""
+        """Fields for display."""
         return dict(self.model_extra or {})
 
 
 class RunRecord(BaseModel):
-    """run.json: what was run and how far it came; live/run.json is a part of it.
+    """run.json: the run and its progress; live/run.json contains a part of it.
 
     Attributes:
-        status: what the run does or how it ended.
-        name: of the problem.
-        method, settings: how it was run.
+        status: activity of the run, or how it ended.
+        name: name of the problem.
+        method, settings: method and its options.
         choices, adapted: see `Result`.
-        seed: of all random numbers.
-        command: what was typed; "" for a run of the library.
-        versions, hardware, variant: on what it ran.
-        stopped: see `Result.stopped`; "" while the run goes on.
+        seed: seed of all random numbers.
+        command: the command line; "" for a run of the library.
+        versions, hardware, variant: software and hardware.
+        stopped: see `Result.stopped`; "" while it runs.
         steps, seconds, warmup_seconds, skipped, warnings: see `Result`.
-        problem: what was to be recovered.
-        resumed: the steps at which it was resumed.
+        problem: description of the problem.
+        resumed: steps at which it was resumed.
         image_errors, undetermined, phases: see `Result`.
-        standard_error: of each number, {key: one value per element}; see `Result`.
+        standard_error: standard errors of each number, {key: one value per element}; see `Result`.
         verification: see `Result`; empty for runs that were not verified.
-        error: the exception by which the run failed; "" for none.
+        error: exception by which the run failed; "" for none.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -148,27 +151,27 @@ class RunRecord(BaseModel):
 
     @property
     def verified(self) -> str:
-        """The status that fresh pictures give the run; "not verified" where none were rendered, as in folders of earlier versions."""
-        found = self.verification.get("status")
-        return found if found in ENDED else NOT_VERIFIED
+        """Status of the run according to new images; "not verified" if none were rendered, as in folders of earlier versions."""
+        status = self.verification.get("status")
+        return status if status in ENDED else NOT_VERIFIED
 
 
 # ---------------------------------------------------------------------- live/status.json
 
 
 class LiveStatus(BaseModel):
-    """live/status.json: where a run is now.
+    """live/status.json: current state of a run.
 
     Attributes:
         status: "running", "paused" or "ended".
-        stopped: see `Result.stopped`; "" while the run goes on.
-        step, steps: how many are done, and of how many; None without such a budget.
-        seconds, budget_seconds: of optimization so far, and at most.
-        loss, samples: of the last record of the history.
+        stopped: see `Result.stopped`; "" while it runs.
+        step, steps: number of completed steps, and their total; None without such a budget.
+        seconds, budget_seconds: seconds of optimisation so far, and their limit.
+        loss, samples: from the last record of the history.
         skipped, warnings: see `Result`.
-        control: the command that holds.
-        process, host: who runs.
-        update_seconds: what the last update of live/ took.
+        control: current command.
+        process, host: process of the run.
+        update_seconds: duration of the last update of live/.
         initial_error: {key: root mean square error} before the first step.
         shapes: {key: shape} of the parameters, whose arrays in live/ may be smaller.
     """
@@ -200,13 +203,13 @@ class Manifest(BaseModel):
     """manifest.json of a checkpoint.
 
     Attributes:
-        format: of the checkpoint.
-        step: how many steps were done.
-        seed: the run's.
-        size, sha256: of state.safetensors.
-        versions: of what decides the numbers.
-        problem: the problem's fingerprint.
-        state: how the tensors are put together, see `state.py`.
+        format: version of the format.
+        step: number of completed steps.
+        seed: seed of the run.
+        size, sha256: those of state.safetensors.
+        versions: versions of the software on which the numbers depend.
+        problem: fingerprint of the problem.
+        state: structure of the tensors, see `state.py`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -225,7 +228,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def validate(model: type[Model], given: Any, where: str) -> Model:
-    """`given` as the model. Raises `InputError`: one line that begins with `where` and names the first field that does not suit."""
+    """Validate a value against a model. Raises `InputError`: one line that begins with `where` and names the first invalid field."""
     try:
         return model.model_validate(given)
     except RecursionError as error:
@@ -244,10 +247,10 @@ def validate(model: type[Model], given: Any, where: str) -> Model:
 
 
 def encode(model: type[BaseModel], given: Any, where: str) -> bytes:
-    """Return the bytes of a JSON file that the reader takes as the model.
+    """Return the bytes of a JSON file that the reader accepts as the model.
 
     Raises:
-        InputError: the reader would refuse them; one line that begins with `where` and names the field.
+        InputError: the reader would reject them; one line that begins with `where` and names the field.
     """
     try:
         data = encode_text(json.dumps(given, indent=2, ensure_ascii=False) + "\n", where)
@@ -260,5 +263,5 @@ def encode(model: type[BaseModel], given: Any, where: str) -> bytes:
 
 
 def serialize(record: BaseModel) -> dict[str, Any]:
-    """The fields that were given to a model made by `model_construct`, in the model's order, as they were given."""
+    """Return the fields that were passed to `model_construct`, in the model's order, unchanged."""
     return record.model_dump(exclude_unset=True, warnings=False)

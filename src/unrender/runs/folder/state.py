@@ -1,8 +1,8 @@
-"""States as flat tensors and a skeleton of JSON, and back: what lets a checkpoint write any state without knowing it.
+"""Conversion of states to flat tensors and a JSON skeleton, and back, so that a checkpoint can store any state.
 
 A state is a frozen dataclass of this package or of a module that registered a component (`unrender.register`), or a dictionary, tuple,
-list, number, text or array, nested to any depth. An array that occurs twice is stored once, and is one object again when it is read:
-components may tell the present from the past by identity.
+list, number, text or array, nested to any depth. An array that occurs twice is stored once, and restored as one object, because
+components may compare states by identity.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _NOT_FINITE = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 @dataclass(frozen=True)
 class Packed:
-    """A state taken apart.
+    """A packed state.
 
     Attributes:
-        skeleton: JSON that says how it is put together; arrays are named by number.
-        tensors: {number as text: array}, on the host; on a CPU the state's own memory.
+        skeleton: structure of the state as JSON, in which arrays are numbered.
+        tensors: {number as text: array}, on the host; on a CPU they share the state's memory.
     """
 
     skeleton: Any
@@ -45,23 +45,23 @@ class Packed:
 
 
 def pack(state: Any) -> Packed:
-    """Take a state apart. Waits for the device. Raises `TypeError` for one that holds what no state should."""
+    """Pack a state. Waits for the device. Raises `TypeError` for an unsupported part."""
     packer = _Packer()
     return Packed(packer.node(state), packer.tensors)
 
 
 def unpack(packed: Packed, patterns: Sequence[Any] = ()) -> Any:
-    """Put a state together again.
+    """Restore a state.
 
-    A class is looked up among frozen dataclasses that are loaded already: those of this package, those of the modules of registered
-    components, and those that occur in `patterns`. No module is imported because a file names it.
+    A class is looked up among frozen dataclasses that are already imported: those of this package, of the modules of registered
+    components, and those in `patterns`. The name of a module in a file never imports it.
 
     Args:
-        packed: from `pack`.
-        patterns: states of the same components, where those are of classes that are not registered.
+        packed: result of `pack`.
+        patterns: states of the same components, if their classes are not registered.
 
     Raises:
-        InputError: the skeleton is none, or does not fit the tensors.
+        InputError: the skeleton is invalid, or does not fit the tensors.
     """
     unpacker = _Unpacker(packed.tensors, {_path(kind): kind for pattern in patterns for kind in _classes(pattern)})
     try:
@@ -76,14 +76,14 @@ def unpack(packed: Packed, patterns: Sequence[Any] = ()) -> Any:
 
 
 def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> None:
-    """Raise `InputError` unless each part of `state` has the form of that part of one of `patterns`, states of the same components.
+    """Raise `InputError` unless each part of `state` has the form of that part in one of `patterns`, states of the same components.
 
-    Same classes, keys, lengths and kinds of arrays, and same shapes; but the first axis of an array on the host may differ, since some
-    states grow with the steps, and where all patterns have nothing yet there may be anything that a state is made of.
+    The form is class, keys, lengths, array types and shapes. The first axis of an array on the host may differ, because some states grow
+    with the steps. Where all patterns are empty, any state is accepted.
     """
     if all(pattern is None or (isinstance(pattern, (tuple, list, dict)) and not pattern) for pattern in patterns):
         return
-    # A number may be NumPy's or Python's: where arrays are NumPy's, one that was not yet summed to is still Python's.
+    # A number may be NumPy's or Python's: with NumPy arrays, a sum without terms is still Python's.
     if isinstance(state, _FLOATS) and any(isinstance(pattern, _FLOATS) for pattern in patterns):
         return
     fitting = [pattern for pattern in patterns if type(pattern) is type(state)]
@@ -121,7 +121,7 @@ def _check_array(array: Any, patterns: list[Any], where: str) -> None:
 
 
 def not_finite(state: Any, where: str = "state") -> str:
-    """Where a state first holds a number that is not finite: "state.second_moment['wall']"; "" where it holds none."""
+    """Return the path of the first number in a state that is not finite: "state.second_moment['wall']"; "" if there is none."""
     if dataclasses.is_dataclass(state) and not isinstance(state, type):
         parts = ((getattr(state, each.name), f"{where}.{each.name}") for each in dataclasses.fields(state))
     elif isinstance(state, Mapping):
@@ -175,9 +175,9 @@ class _Packer:
             if array.dtype.kind not in "fiub":
                 raise TypeError(f"a state's arrays are of real numbers, got {array.dtype}")
             number = len(self.tensors)
-            # `ascontiguousarray` alone would turn a number into an array of one.
+            # `ascontiguousarray` alone would convert a scalar to one dimension.
             self.tensors[str(number)] = np.ascontiguousarray(array).reshape(array.shape)
-            self._seen[id(original)] = original, number  # held, so that its id is not given to another
+            self._seen[id(original)] = original, number  # the reference prevents reuse of its id
         return {"array": self._seen[id(original)][1], "kind": kind}
 
 
@@ -213,14 +213,14 @@ class _Unpacker:
         raise InputError(f"state: expected a part of a state, got {repr(node)[:80]}")
 
     def _dictionary(self, pairs: list[Any], depth: int) -> dict[Any, Any]:
-        found: dict[Any, Any] = {}
+        dictionary: dict[Any, Any] = {}
         for pair in pairs:
             match pair:
-                case [str() | int() as key, part] if key not in found and not isinstance(key, bool):
-                    found[key] = self.node(part, depth + 1)
+                case [str() | int() as key, part] if key not in dictionary and not isinstance(key, bool):
+                    dictionary[key] = self.node(part, depth + 1)
                 case _:
                     raise InputError(f"state: expected [name, part], every name once, got {repr(pair)[:80]}")
-        return found
+        return dictionary
 
     def _array(self, number: str, kind: str) -> Any:
         if number not in self.tensors:
@@ -248,7 +248,7 @@ def _path(kind: type) -> str:
 
 
 def _classes(state: Any) -> Iterator[type]:
-    """The frozen dataclasses that a state is made of."""
+    """Yield the frozen dataclasses in a state."""
     if dataclasses.is_dataclass(state) and not isinstance(state, type):
         if _is_state(type(state)):
             yield type(state)
@@ -263,7 +263,7 @@ def _classes(state: Any) -> Iterator[type]:
 
 
 def _is_state(kind: Any) -> bool:
-    """Whether it is a frozen dataclass that only holds what it is given."""
+    """Return whether it is a frozen dataclass without `__new__` and `__post_init__`, whose construction runs no other code."""
     return (
         isinstance(kind, type)
         and dataclasses.is_dataclass(kind)
@@ -275,7 +275,7 @@ def _is_state(kind: Any) -> bool:
 
 
 def _class(name: str) -> type:
-    """The state of that name, if it is of this package or of a registered component's module, and loaded."""
+    """Return the state class of this name, if it is imported and belongs to this package or a registered component's module."""
     module, _, word = name.rpartition(".")
     ours = module.startswith(f"{_PACKAGE}.")
     home = sys.modules.get(module) if ours or module in registry.state_modules() else None
@@ -283,7 +283,7 @@ def _class(name: str) -> type:
     if not isinstance(kind, type) or kind.__module__ != module or not _is_state(kind):
         how = "" if ours else "; install the package that registers its component, or import its module first"
         raise InputError(
-            f"state: {name[:80]!r} is no state of this version of {_PACKAGE}, nor of a registered component{how}"
+            f"state: {name[:80]!r} is not a state of this version of {_PACKAGE}, nor of a registered component{how}"
         )
     return kind
 
@@ -295,7 +295,7 @@ def _device_name(kind: type) -> str:
 
 
 def _on_device(host: np.ndarray, name: str) -> Any:
-    """A Dr.Jit array of the variant in use, in memory of its own (see `MitsubaRenderer.array`)."""
+    """Return a Dr.Jit array of the current variant that owns its memory (see `MitsubaRenderer.array`)."""
     import mitsuba as mi
 
     kind = getattr(sys.modules[mi.Float.__module__], name)

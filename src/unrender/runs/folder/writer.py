@@ -1,7 +1,7 @@
-"""The run folder while its run goes: begun before the first step, kept up at every one, whole at every instant.
+"""Writer of a run folder: created before the first step, updated at every step, and consistent at every instant.
 
-All but the history is on the disk when it has its name, and the history when a checkpoint counts on it: so what a power cut leaves is what
-a kill would have left at the last checkpoint, or later.
+Everything but the history is on disk before it is renamed, and the history before a checkpoint refers to it. So a power cut leaves what a
+kill would have left at the last checkpoint, or later.
 """
 
 from __future__ import annotations
@@ -66,19 +66,19 @@ _log = logging.getLogger("unrender")
 
 @dataclass
 class RunWriter(Hook):
-    """Writes a run folder: the history at every step, checkpoints, and the result with final pictures.
+    """Hook that writes a run folder: the history at every step, checkpoints, and the result with final images.
 
-    What goes wrong on the way is a warning, once, and does not end the run; at the end it raises. As a context manager it holds the
-    folder's lock; `start` or `resume` must follow before the descent.
+    A failure during the run is a warning, issued once, and does not end the run; a failure at the end raises. As a context manager it
+    holds the folder's lock; `start` or `resume` must be called before the run.
 
     Args:
-        folder: where.
-        problem: what is run.
-        method: method.toml, see `method_file`.
-        checkpoint_every: steps between checkpoints; None for 50 or so: fewer than 50 where they take over a minute, more where writing
-            would cost more than a hundredth of the run's time.
-        final_spp: samples per pixel of the final pictures; None chooses.
-        warn: called with each thing that goes wrong, one line.
+        folder: path of the folder.
+        problem: problem of the run.
+        method: contents of method.toml, see `method_file`.
+        checkpoint_every: steps between checkpoints. None takes about 50: fewer if they take over a minute, more if writing would take
+            over a hundredth of the run's time.
+        final_spp: samples per pixel of the final images; None chooses.
+        warn: function that is called with a line for each failure.
     """
 
     folder: Path
@@ -106,7 +106,7 @@ class RunWriter(Hook):
     # ------------------------------------------------------------------ from start to end
 
     def __enter__(self) -> RunWriter:
-        """Lock the folder, made where there is none. Raises `InputError` where another process holds it, or it cannot be written."""
+        """Lock the folder, and create it if missing. Raises `InputError` if another process holds it, or it is not writable."""
         self._acquire()
         return self
 
@@ -115,9 +115,10 @@ class RunWriter(Hook):
         self._lock.release()
 
     def start(self, result: Result) -> None:
-        """Write what a new run starts with, in place of what an earlier one left.
+        """Write the initial files of a new run, and remove those of an earlier run.
 
-        Raises `InputError` where that cannot be, and where the files could not be read again: before an earlier run is removed.
+        Raises `InputError` if they cannot be written. It is also raised if they could not be read again; the earlier run is then still
+        there.
         """
         self._check(result)
         try:
@@ -130,11 +131,11 @@ class RunWriter(Hook):
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
         except (KeyboardInterrupt, InputError):
             with contextlib.suppress(OSError):
-                _clear(self.folder)  # what is whole but for run.json nothing would take for a run
+                _clear(self.folder)  # files without run.json are not recognised as a run
             raise
 
     def resume(self, records: Sequence[Mapping[str, Any]], result: Result) -> None:
-        """Go on after `records`, with which the history is rewritten. Raises `InputError` where that cannot be."""
+        """Continue after `records`, with which the history is rewritten. Raises `InputError` if that fails."""
         try:
             _sweep(self.folder)
             self._history.rewrite(records)
@@ -152,7 +153,7 @@ class RunWriter(Hook):
                 warm_up(descent.run.problem, descent.run.full())
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
-        """Append the step to the history; write a checkpoint where one is due."""
+        """Append the step to the history, and write a checkpoint if due."""
         self.append(record)
         if self._history.size > max(MOST_KEPT, self._thin_from):
             self._guarded("history", lambda: self._thin(descent.log.history))
@@ -160,14 +161,14 @@ class RunWriter(Hook):
             self.write_checkpoint(descent)
 
     def on_result(self, descent: Descent, result: Result) -> Result:
-        """Write the last checkpoint and the result, render the final pictures, and write the result with them.
+        """Write the last checkpoint and the result, render the final images, and write the result with them.
 
-        Without pictures for a run that was told to terminate, since whoever did waits for seconds at most, and for one that was pruned.
+        A terminated run has no final images, because its caller waits for seconds only, nor does a pruned one.
         """
         self.write_checkpoint(descent, result)
         if result.stopped not in (TERMINATED, PRUNED):
             if result.status not in ENDED or self._written_step != result.steps:
-                # What took long is safe, and how it ended is known, before what takes seconds more.
+                # Save the long computation and its outcome before the final images take more time.
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
             images = render_final_images(descent.run.problem, result, self.final_spp, descent.run.time_left)
@@ -185,7 +186,7 @@ class RunWriter(Hook):
         return result
 
     def on_error(self, descent: Descent, error: BaseException) -> None:
-        """Note that the run ended by an exception; nothing where it had not started, or the folder is held by another run."""
+        """Record that the run ended by an exception, if it had started and still holds the folder."""
         if not self._started or not self._lock.is_held():
             return
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
@@ -203,7 +204,7 @@ class RunWriter(Hook):
             self._checkpoint_at_once |= not (self._taken_over or self._lock.is_held())
 
     def checkpoint_due(self, step: int) -> bool:
-        """Whether to write a checkpoint now."""
+        """Return whether a checkpoint is due."""
         if self._checkpoint_at_once:
             return True
         if self.checkpoint_every is not None:
@@ -212,14 +213,14 @@ class RunWriter(Hook):
         return (step % _STEPS == 0 or since >= _MOST_SECONDS) and since * _SHARE >= self._cost
 
     def write_checkpoint(self, descent: Descent, result: Result | None = None) -> None:
-        """Write a checkpoint after the last step, and `result`, by default what has been reached so far; once per step."""
+        """Write a checkpoint after the last step with `result`, by default the current one; at most once per step."""
         result = result or descent.result()
         if descent.run.problem.remeshed_from is not None:
-            return  # the last one is from before: a resumed run remeshes once more, to the same mesh
+            return  # the last checkpoint precedes remeshing: a resumed run remeshes again, to the same mesh
         if result.steps == self._written_step and not self._checkpoint_at_once:
             return
         started = time.perf_counter()
-        state = descent.snapshot()  # which takes time where workers hold a part of it
+        state = descent.snapshot()  # takes time if workers hold a part of it
         self._checkpoint_at_once = False
         self._guarded("checkpoint", lambda: self._write_checkpoint(result, descent.run.seed, state))
         self._written_at = time.perf_counter()
@@ -235,14 +236,14 @@ class RunWriter(Hook):
         self._lock.acquire()
 
     def _save(self, result: Result, status: str) -> None:
-        """Write the result. Raises `InputError` where it cannot be written."""
+        """Write the result. Raises `InputError` if it cannot be written."""
         self._restore_folder(result)
         if self._taken_over:
             raise InputError(f"run folder {self.folder}: another run has taken its place; the result is not saved")
         result.save(self.folder, status)
 
     def _check(self, result: Result) -> None:
-        """Raise `InputError` where the reader would refuse what this run writes."""
+        """Raise `InputError` if the reader would reject the files of this run."""
         result.encoded_record("running", "", self.folder / RECORD)
         method_file.encode(self.method, self.folder / METHOD)
         for key in result.parameters:
@@ -277,16 +278,18 @@ class RunWriter(Hook):
         self._written_step = result.steps
 
     def _thin(self, records: list[dict[str, Any]]) -> None:
-        """Keep fewer records of the earlier steps, in memory and in the file."""
-        kept = thinned(records)
-        self._thin_from = self._history.size + MOST_KEPT // 8  # not at every step where it is of no use, or fails
-        if len(kept) < len(records):
-            records[:] = kept
+        """Remove records of earlier steps, in memory and in the file."""
+        thinned_records = thinned(records)
+        self._thin_from = (
+            self._history.size + MOST_KEPT // 8
+        )  # avoids an attempt at every step if thinning has no effect
+        if len(thinned_records) < len(records):
+            records[:] = thinned_records
             self._history.rewrite(records)
             self._thin_from = 0
 
     def _restore_folder(self, result: Result) -> None:
-        """See that the folder is still there and locked; make it again where it was deleted."""
+        """Check that the folder still exists and is locked; recreate it if it was deleted."""
         if self._taken_over or self._lock.is_held():
             return
         if self._lock.path.exists():
@@ -300,7 +303,7 @@ class RunWriter(Hook):
         self._acquire()
         self._write_start(result)
         self._warn_once(
-            f"run folder {self.folder}: deleted while the run goes; it was made again, without the earlier checkpoints"
+            f"run folder {self.folder}: deleted during the run; it was created again, without the earlier checkpoints"
         )
 
     def _guarded(self, what: str, write: Callable[[], None]) -> None:
@@ -319,7 +322,7 @@ class RunWriter(Hook):
 
 
 def _clear(folder: Path) -> None:
-    """Remove what an earlier run left, and nothing else."""
+    """Remove the files of an earlier run, and nothing else."""
     for name in _FILES:
         (folder / name).unlink(missing_ok=True)
     checkpoint.clear(folder)
@@ -330,7 +333,7 @@ def _clear(folder: Path) -> None:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove what processes that died left half-written: runs, reports, and exports to where they go by default."""
+    """Remove what dead processes left half-written: runs, reports, and exports at their default place."""
     files.remove_leftovers(folder, (*_FILES, _EXPORT))
     for name in (serialization.ARRAYS, LIVE, MESH_FILES):
         files.remove_leftovers(folder / name)
