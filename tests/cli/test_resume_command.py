@@ -60,12 +60,12 @@ def test_resume_shows_what_changed(unrender, stopped: Path):
     scene.write_text(scene.read_text().replace("0.2", "0.25"))
     answer = unrender("resume", "result")
     assert answer.status == 2
-    assert answer.error.startswith("unrender: run folder result: not as it was: ")
+    assert answer.error.startswith("unrender: run folder result: changed since: ")
     assert "file wall.xml has changed" in answer.error
     assert answer.error.count("\n") == 1
     forced = unrender("resume", "result", "--force")
     assert forced.status == 0, forced.error
-    assert "warning resumed by force though not as it was: " in forced.out
+    assert "warning resumed with force although changed since: " in forced.out
 
 
 @pytest.mark.parametrize(

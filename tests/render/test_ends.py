@@ -101,7 +101,7 @@ def test_a_run_that_is_given_up_has_failed(tmp_path: Path) -> None:
     assert (result.status, result.stopped, result.steps, result.skipped) == ("failed", "non-finite", 25, 20)
     np.testing.assert_array_equal(result.parameters[RATE], start(None, 5).parameters[RATE])  # the last that was finite
     written = record(folder)
-    assert (written["status"], written["error"]) == ("failed", "given up: the last gradients were not finite")
+    assert (written["status"], written["error"]) == ("failed", "stopped: the last gradients were not finite")
     first, last = result.warnings
     assert first == (
         "step 5: the optimizer's step for rate (from its own state, or the preconditioner) was not finite; such steps are not applied"
@@ -173,7 +173,7 @@ def test_a_checkpoint_that_parses_but_cannot_be_used_is_passed_over(
     assert result.resumed == [4]
     np.testing.assert_array_equal(result.parameters[RATE], whole.parameters[RATE])
     (line,) = result.warnings
-    assert line.startswith("passed over: ")
+    assert line.startswith("skipped: ")
     assert "checkpoint of step 6" in line or "state: " in line
     assert record(folder)["warnings"] == [line]
 

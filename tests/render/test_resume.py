@@ -106,7 +106,7 @@ def test_the_clock_goes_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     parts = ur.PathGradient(spp=2), ur.optimizers.Adam()
     first = ur.optimize(ur.gallery.problem("exponential"), *parts, seconds=0.05, run_directory=folder)
-    with pytest.raises(InputError, match=r"finished, after .* give a larger budget"):
+    with pytest.raises(InputError, match=r"finished, after .* set a larger budget"):
         ur.resume(folder, seconds=0.04)
     second = ur.resume(folder, seconds=0.1)
     assert second.stopped == "seconds"
@@ -129,7 +129,7 @@ def test_a_spoilt_checkpoint_is_passed_over(tmp_path: Path) -> None:
     state.write_bytes(state.read_bytes()[:-1])
     result = ur.resume(folder)
     assert result.resumed == [2]
-    assert "passed over" in result.warnings[0]
+    assert "skipped" in result.warnings[0]
     assert "00000004/state.safetensors: expected" in result.warnings[0]
 
 
@@ -151,7 +151,7 @@ def test_a_finished_run_wants_more(tmp_path: Path) -> None:
     parts = ur.PathGradient(spp=2), ur.optimizers.Adam()
     ur.optimize(ur.gallery.problem("exponential"), *parts, 4, run_directory=folder)
     for steps in (None, 4, 1):
-        with pytest.raises(InputError, match=r"finished, after 4 steps .*; to go on, give a larger budget"):
+        with pytest.raises(InputError, match=r"finished, after 4 steps .*; to continue, set a larger budget"):
             ur.resume(folder, steps=steps)
     whole = ur.optimize(ur.gallery.problem("exponential"), *parts, 9)
     assert ur.resume(folder, steps=9).parameters == whole.parameters
@@ -199,13 +199,13 @@ def test_what_changed_is_shown_and_can_be_forced(wall: Path, name: str) -> None:
     before = (folder / "history.jsonl").read_bytes(), (folder / "run.json").read_bytes()
     with pytest.raises(InputError) as caught:
         ur.resume(folder)
-    assert str(caught.value).startswith(f"run folder {folder}: not as it was: ")
+    assert str(caught.value).startswith(f"run folder {folder}: changed since: ")
     for what in told:
         assert what in str(caught.value)
     assert before == ((folder / "history.jsonl").read_bytes(), (folder / "run.json").read_bytes())
     result = ur.resume(folder, force=True)
     assert result.steps == 8
-    assert "resumed by force though not as it was: " in result.warnings[0]
+    assert "resumed with force although changed since: " in result.warnings[0]
 
 
 def test_other_versions_are_refused(tmp_path: Path) -> None:
@@ -213,7 +213,7 @@ def test_other_versions_are_refused(tmp_path: Path) -> None:
     interrupted(ur.gallery.problem("exponential"), folder)
     for manifest in folder.glob("checkpoints/*/manifest.json"):
         _edit(manifest, '"unrender": "', '"unrender": "0.0.')
-    with pytest.raises(InputError, match=r"not as it was: unrender was 0\.0\..*, is "):
+    with pytest.raises(InputError, match=r"changed since: unrender was 0\.0\..*, is "):
         ur.resume(folder)
     assert ur.resume(folder, force=True).steps == 8
 
@@ -354,7 +354,7 @@ def test_states_come_back_as_they_were() -> None:
 
 
 def test_states_of_other_packages_do_not_come_back() -> None:
-    with pytest.raises(InputError, match="Foreign' is no state"):
+    with pytest.raises(InputError, match="Foreign' is not a state"):
         unpack(pack(Foreign(1)))
 
 

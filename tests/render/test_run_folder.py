@@ -463,7 +463,7 @@ def test_a_run_killed_while_its_folder_was_begun_says_so(tmp_path: Path) -> None
 
 def test_what_result_save_wrote_says_what_it_lacks(tmp_path: Path) -> None:
     plain(2).save(tmp_path / "saved")
-    with pytest.raises(InputError, match=r"method\.toml: no such file: Result\.save keeps no run to go on with"):
+    with pytest.raises(InputError, match=r"method\.toml: no such file: Result\.save stores no resumable run"):
         ur.resume(tmp_path / "saved")
-    with pytest.raises(InputError, match=r"problem\.toml: no such file: Result\.save keeps no problem; pass it"):
+    with pytest.raises(InputError, match=r"problem\.toml: no such file: Result\.save stores no problem; pass it"):
         ur.app.export(tmp_path / "saved", tmp_path / "scene")

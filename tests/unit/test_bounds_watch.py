@@ -24,5 +24,5 @@ def test_numbers_that_end_at_their_bounds_are_told() -> None:
     problem = ur.Problem(renderer, parameters, [ur.View(reference)], max_depth=1)
     result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.05), steps=200)
     assert [line for line in result.warnings if "next to its bound" in line] == [
-        "parameter beyond: ended at 1, next to its bound 1: where that is not to be expected, try another seed or a lower learning_rate"
+        "parameter beyond: ended at 1, next to its bound 1: if this is unexpected, try another seed or a lower learning_rate"
     ]

@@ -1,4 +1,4 @@
-"""Where the time of a run goes."""
+"""Times of the phases of a run."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 COMPILING, STEPS, ASIDE = "compiling", "steps", "checkpoints and callbacks"
 VERIFYING, PICTURES = "verification", "final pictures"
-"""Phases of a run, in their order: before the first step; the steps themselves; what stands between and after them."""
+"""Phases of a run in order: before the first step; the steps; what happens between and after them."""
 
 RUN_PHASES = (COMPILING, STEPS, ASIDE, VERIFYING, PICTURES)
 
 
 class PhaseTimes(Hook):
-    """Notes the seconds of each phase in `Result.phases`. First among the hooks, so that the result has them when it is saved.
+    """Hook that records the seconds of each phase in `Result.phases`. It is the first hook, so that saved results contain them.
 
     Args:
-        earlier: {phase: seconds} before this was made, such as loading.
+        earlier: {phase: seconds} before the run, such as loading.
     """
 
     def __init__(self, earlier: Mapping[str, float] | None = None):
@@ -38,10 +38,10 @@ class PhaseTimes(Hook):
     def on_result(self, descent: Descent, result: Result) -> Result:
         steps = descent.run.clock - self._clock
         aside = time.perf_counter() - self._started - steps
-        found = {COMPILING: self._started - self._made, STEPS: steps, ASIDE: max(aside, 0.0)}
-        return replace(result, phases={**self._earlier, **found})
+        run_phases = {COMPILING: self._started - self._made, STEPS: steps, ASIDE: max(aside, 0.0)}
+        return replace(result, phases={**self._earlier, **run_phases})
 
 
 def with_phase(result: Result, name: str, seconds: float) -> Result:
-    """The result with one more phase."""
+    """Return the result with an additional phase."""
     return replace(result, phases={**result.phases, name: seconds})

@@ -1,4 +1,4 @@
-"""What a call is doing: a bar that moves on a terminal, a line now and then elsewhere."""
+"""Display of a call's progress: a bar on a terminal, occasional lines elsewhere."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _SMOOTHING = 0.1
 
 
 class Progress(Callback):
-    """Names each phase of a command as it begins (loading, reference images, compiling), and shows how far it is. Of the steps it shows
-    loss, parameter error (where the truth is known), gradient noise, speed and the time left; the loss is smoothed over about ten steps.
+    """Displays each phase of a command (loading, reference images, compiling) with its progress.
 
-    Use as a context manager, so that it hears of the phases, and the bar is taken down whatever happens.
+    For steps it displays loss, parameter error (if the truth is known), gradient noise, speed and remaining time. The loss is smoothed
+    over about ten steps. Use it as a context manager, so that it gets the phases, and the bar is always removed.
 
     Args:
-        console: where to; None for standard output.
+        console: console for the output; None for standard output.
 
     Attributes:
-        budget_began: when this was made, or a stage began, on the clock of `time.perf_counter`.
+        budget_began: time of `time.perf_counter` at which this object was created, or a stage started.
     """
 
     def __init__(self, console: Console | None = None):
@@ -62,18 +62,18 @@ class Progress(Callback):
 
     @property
     def seconds(self) -> dict[str, float]:
-        """{phase: seconds} so far; the time that nobody named is in no phase."""
+        """{phase: seconds} so far, without time outside of phases."""
         return dict(self._stopwatch.seconds)
 
     @property
     def elapsed(self) -> float:
-        """Seconds since this was made."""
+        """Seconds since construction."""
         return time.perf_counter() - self._began
 
     # ------------------------------------------------------------------ phases
 
     def on_phase(self, name: str) -> None:
-        """See `phases.Listener.on_phase`."""
+        """Display the name of a phase that starts."""
         self._stopwatch.on_phase(name)
         self._within.append(name)
         if self._console.is_terminal:
@@ -83,7 +83,7 @@ class Progress(Callback):
             self._printed = name
 
     def on_progress(self, share: float) -> None:
-        """See `phases.Listener.on_progress`."""
+        """Display the progress of the innermost phase."""
         now = time.perf_counter()
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], total=1.0, completed=share)
@@ -91,7 +91,7 @@ class Progress(Callback):
             self._print(f"{self._within[-1]} {100 * share:.0f}%")
 
     def on_phase_end(self, name: str) -> None:
-        """See `phases.Listener.on_phase_end`."""
+        """Return to the enclosing phase."""
         self._stopwatch.on_phase_end(name)
         self._within.pop()
         self._close()
@@ -133,7 +133,7 @@ class Progress(Callback):
     # ------------------------------------------------------------------ the parts
 
     def _open(self, name: str, total: float | None) -> None:
-        """A bar: one that moves by itself where it is not known how much there is to do."""
+        """Open a bar, which is animated if the total is unknown."""
         self._close()
         columns = BarColumn(bar_width=20), TextColumn("{task.description}", markup=False)
         self._bar = Bar(*columns, console=self._console, transient=True, auto_refresh=total is None)

@@ -1,7 +1,7 @@
-"""Coarse to fine: parameters that take steps to finer resolutions while the run goes.
+"""Coarse to fine: refinement of parameters during a run.
 
-By default (`CoarseToFine.states`) the estimator's state is carried over (`scene.upsampling`) and the optimizer's is not: a control variate
-stays true, while Adam's mean squares take a thousand steps to follow.
+By default (`CoarseToFine.states`) the estimator's state is interpolated (`scene.upsampling`), and the optimizer's is not: a control
+variate stays valid, whereas Adam's mean squares take a thousand steps to adapt.
 """
 
 from __future__ import annotations
@@ -21,45 +21,46 @@ if TYPE_CHECKING:
 
 
 _MEASURED, _COARSE_SHARE = 3, 0.4
-"""Steps whose time tells how many the budget allows; share of these after which all resolutions are the scene's own."""
+"""Number of steps that are timed to predict the number of steps in the budget, and the fraction of these after which all resolutions are
+the scene's."""
 
 
 def hurry(run: Run) -> None:
-    """Bring the changes of resolution forward where the time of the first steps tells that the budget ends too early.
+    """Advance the changes of resolution if the time of the first steps shows that the budget ends too early.
 
-    It happens once, and the checkpoint remembers it. Steps at which the problem itself asks for a change stay.
+    It happens once, and the checkpoint stores it. Steps that the problem itself specifies are not changed.
     """
-    ways = run.problem.coarse_to_fine
-    if run.step != _MEASURED or not run.seconds or not ways or run.plan.problem.coarse_to_fine:
+    levels = run.problem.coarse_to_fine
+    if run.step != _MEASURED or not run.seconds or not levels or run.plan.problem.coarse_to_fine:
         return
     allowed = _COARSE_SHARE * run.allowed_seconds() * run.step / max(run.clock, 1e-9)
-    last = max(way.steps[-1] for way in ways.values())
+    last = max(each.steps[-1] for each in levels.values())
     run.ahead = max(0, last - max(int(allowed), run.step)) if last < NEVER else 0
 
 
 def is_due(run: Run) -> bool:
-    """Whether the next step is the first of another resolution."""
+    """Return whether the next step is the first with another resolution."""
     return bool(run.problem.coarse_to_fine) and trees.shapes(run.parameters) != run.problem.shapes(run.step + run.ahead)
 
 
 def unfinished(run: Run) -> list[str]:
-    """One line for each parameter that did not come to its scene's own resolution."""
-    found = []
-    for key, way in run.problem.coarse_to_fine.items():
-        if (shape := arrays.shape(run.parameters[key])) != run.problem.shapes()[key] and way.steps[-1] < NEVER:
+    """Return one line for each parameter that did not reach its scene's resolution."""
+    lines = []
+    for key, levels in run.problem.coarse_to_fine.items():
+        if (shape := arrays.shape(run.parameters[key])) != run.problem.shapes()[key] and levels.steps[-1] < NEVER:
             size = "x".join(map(str, reversed(shape[:-1])))
-            found.append(
-                f"parameter {key}: still {size} at the end, after {run.step} steps of at least {way.steps[-1] + 1}"
+            lines.append(
+                f"parameter {key}: still {size} at the end, after {run.step} steps of at least {levels.steps[-1] + 1}"
             )
-    return found
+    return lines
 
 
 def refine(run: Run, state: RunState) -> float:
-    """Bring parameters and states to the resolution of the next step. Returns the seconds it took."""
+    """Convert parameters and states to the resolution of the next step. Returns the elapsed seconds."""
     started = time.perf_counter()
     upsampler = Upsampler(run.problem, run.step + run.ahead, run.parameters)
-    asked = {way.states for key, way in run.problem.coarse_to_fine.items() if key in upsampler.shares}
-    carry = {"estimator": "reset" not in asked, "optimizer": asked == {"carry"}}
+    modes = {way.states for key, way in run.problem.coarse_to_fine.items() if key in upsampler.shares}
+    carry = {"estimator": "reset" not in modes, "optimizer": modes == {"carry"}}
     run.parameters = upsampler.tree(run.parameters)
     fresh = (
         run.estimator.init(run.problem, run.parameters),
@@ -70,7 +71,7 @@ def refine(run: Run, state: RunState) -> float:
         try:
             after = upsampled(component, upsampler) if carry[name] else restarted(component, new)
         except NotCarried as error:
-            run.warnings.append(f"step {run.step}: {error} cannot be carried to another resolution: it starts anew")
+            run.warnings.append(f"step {run.step}: {error} cannot be carried to another resolution: it restarts")
             after = restarted(component, new)
         setattr(state, name, after)
     state.noise = GradientNoise()
@@ -79,7 +80,7 @@ def refine(run: Run, state: RunState) -> float:
 
 
 class Refinement(Hook):
-    """Refines parameters and states before the steps at which their resolution changes, and records the resolutions.
+    """Hook that refines parameters and states before the steps at which their resolution changes, and records the resolutions.
 
     Compiling the kernels of the new resolution counts as warm-up.
     """
@@ -100,5 +101,5 @@ class Refinement(Hook):
             record["resolution"] = {key: run.parameters[key].shape[:-1] for key in keys}
 
     def warnings(self, descent: Descent) -> list[str]:
-        """See `Hook.warnings`: parameters that did not come to their scene's own resolution."""
+        """Return warnings about parameters that did not reach their scene's resolution."""
         return unfinished(descent.run) if descent.run.stopped else []

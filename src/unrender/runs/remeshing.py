@@ -1,4 +1,4 @@
-"""A run's step to other triangles of its meshes: the problem, the parameters, and what its parts remember."""
+"""Remeshing during a run: replacement of the problem, the parameters and the states."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 
 def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
-    """Return the same problem with other meshes, {key of vertex positions: mesh}, which are also where these parameters start.
+    """Return the same problem with other meshes, {key of vertex positions: mesh}, which are also the initial values of these parameters.
 
-    Raises `InputError` where the renderer has no meshes to replace.
+    Raises `InputError` if the renderer does not support it.
     """
     if not isinstance(problem.renderer, Remeshable):
-        raise InputError(f"{', '.join(meshes)}: this renderer's meshes keep their triangles")
+        raise InputError(f"{', '.join(meshes)}: this renderer does not support remeshing")
     given = [
         replace(p, initial=meshes[p.key].vertices.reshape(-1).astype(np.float32)) if p.key in meshes else p
         for p in problem.parameters
     ]
     shapes = {key.rpartition(".")[0]: mesh for key, mesh in meshes.items()}
     renderer = problem.renderer.with_meshes(shapes, [p.key for p in given])
-    # Checked views are RGB, which films of other formats would take for theirs.
+    # Checked views are RGB; films of other formats would misinterpret them.
     plain = all(format_of(renderer, view.sensor).colour == "rgb" for view in problem.views)
     made = Problem(
         renderer,
@@ -54,9 +54,9 @@ def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
 
 
 class MeshRefinement(Hook):
-    """Gives meshes other triangles before the steps that `Parameter.remeshing` names. Compiling kernels anew counts as warm-up.
+    """Hook that remeshes before the steps in `Parameter.remeshing`. Compiling new kernels counts as warm-up.
 
-    Where a mesh cannot be remeshed, it stays as it is, with a warning.
+    If a mesh cannot be remeshed, it stays unchanged, with a warning.
     """
 
     def __init__(self) -> None:
@@ -64,25 +64,29 @@ class MeshRefinement(Hook):
 
     def before_step(self, descent: Descent) -> None:
         run, state = descent.run, descent.state
-        ways = {key: unknown.remeshing for key, unknown in run.problem.unknowns.items()}
-        due = {key: way for key, way in ways.items() if way is not None and run.step in way.steps}
+        remeshings = {key: unknown.remeshing for key, unknown in run.problem.unknowns.items()}
+        due = {
+            key: remeshing
+            for key, remeshing in remeshings.items()
+            if remeshing is not None and run.step in remeshing.steps
+        }
         if not due:
             return
-        started, found = time.perf_counter(), {}
-        for key, way in due.items():
+        started, meshes = time.perf_counter(), {}
+        for key, remeshing in due.items():
             vertices = arrays.numpy(run.parameters[key]).reshape(-1, 3)
             try:
-                mesh = way.apply(vertices, run.problem.faces[key], run.problem.texture_coordinates(key))
+                mesh = remeshing.apply(vertices, run.problem.faces[key], run.problem.texture_coordinates(key))
             except InputError as error:
-                run.warnings.append(f"step {run.step}: {key}: {error}; the mesh stays as it is")
+                run.warnings.append(f"step {run.step}: {key}: {error}; the mesh is unchanged")
                 continue
-            found[key] = mesh
+            meshes[key] = mesh
             self._made[key] = len(mesh.faces)
-        if not found:
+        if not meshes:
             return
-        run.problem = remeshed(run.problem, found)
-        kept = {key: arrays.numpy(value) for key, value in run.parameters.items() if key not in found}
-        values = {key: kept.get(key, run.problem.unknowns[key].initial) for key in run.parameters}
+        run.problem = remeshed(run.problem, meshes)
+        unchanged = {key: arrays.numpy(value) for key, value in run.parameters.items() if key not in meshes}
+        values = {key: unchanged.get(key, run.problem.unknowns[key].initial) for key in run.parameters}
         run.parameters = {key: run.problem.renderer.array(value) for key, value in values.items()}
         fresh = run.optimizer.init(run.problem.coordinates.of(run.parameters), run.problem.learning_rates)
         state.estimator = run.estimator.init(run.problem, run.parameters)

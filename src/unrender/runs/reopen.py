@@ -1,4 +1,4 @@
-"""Run folders opened again: the problem that a run was of, and the run itself."""
+"""Reopening of run folders: the problem of a run, and the run itself."""
 
 from __future__ import annotations
 
@@ -36,29 +36,30 @@ def resume(
     estimator: Estimator | None = None,
     optimizer: Optimizer | None = None,
 ) -> Result:
-    """Take up a run where its last checkpoint left it: interrupted, killed, or finished and to be given more.
+    """Resume a run from its last checkpoint, whether it was interrupted, killed, or finished and gets a larger budget.
 
-    The resumed run is the one that would have been without the interruption, its clock included: bit for bit on LLVM with one thread
-    (see `optimize` for more threads). What was done after the checkpoint is done again, the same.
+    The resumed run equals an uninterrupted one, including its clock: bit for bit on LLVM with one thread (see `optimize` for more
+    threads). Steps after the checkpoint are repeated identically.
 
     Args:
         directory: the run folder.
-        problem: what it was a run of; None makes it again from the folder, which goes for problem files, XML scenes and the gallery's.
-        steps, seconds: a budget in place of the run's, counted from its start.
-        force: go on though problem, versions or scene files are not as they were.
-        callbacks: listeners.
-        estimator, optimizer: in place of those of method.toml; needed for components that are not registered (`unrender.register`).
+        problem: problem of the run; None recreates it from the folder, which works for problem files, XML scenes and gallery problems.
+        steps, seconds: a budget that replaces the run's, counted from its start.
+        force: whether to continue although the problem, versions or scene files have changed.
+        callbacks: callbacks that observe the run.
+        estimator, optimizer: components that replace those of method.toml; required for components that are not registered
+            (`unrender.register`).
 
     Raises:
-        InputError: no run folder, a malformed one, one in use; finished and no larger budget; something changed since, which the message
-            says; or no checkpoint can be read.
+        InputError: the run folder is missing, malformed or in use; the run is finished and the budget is not larger; something has
+            changed, which the message names; or no checkpoint is readable.
     """
-    found = load_run(directory, steps, seconds)
-    return resume_run(found, problem or problem_of(directory), force, callbacks, estimator, optimizer)
+    stored = load_run(directory, steps, seconds)
+    return resume_run(stored, problem or problem_of(directory), force, callbacks, estimator, optimizer)
 
 
 def with_meshes(problem: Problem, run: RunFolder) -> Problem:
-    """The problem with the triangles that a run's meshes ended with, where they were remeshed on the way."""
+    """Return the problem with the final triangles of a run's meshes, if they were remeshed."""
     replaced = {
         key: ReplacedMesh(run.parameters[key].reshape(-1, 3), mesh.faces, mesh.uv)
         for key, mesh in run.meshes.items()
@@ -68,20 +69,20 @@ def with_meshes(problem: Problem, run: RunFolder) -> Problem:
 
 
 def problem_of(directory: str | Path) -> Problem:
-    """The problem that a run folder is of, made again.
+    """Recreate the problem of a run folder.
 
-    From the problem file that it came from, where that is still there (so what changed in it is noticed), else from the folder's own copy.
+    It is read from the original problem file, if it still exists (so that changes are detected), else from the folder's copy.
 
     Raises:
-        InputError: it was made in Python, or problem.toml is malformed.
+        InputError: the problem was made in Python, or problem.toml is malformed.
     """
     folder = Path(directory)
     origin = read_run_record(folder).problem.origin
     path = folder / serialization.FILE
     if not bounded_files.exists(path):
         raise InputError(
-            f"{path}: no such file: Result.save keeps no problem; pass it, as unrender.app.export((problem, result.parameters), "
-            "out), or keep a whole run, with run_directory="
+            f"{path}: no such file: Result.save stores no problem; pass it, as unrender.app.export((problem, result.parameters), "
+            "out), or store a complete run, with run_directory="
         )
     stored = toml_lines.parse(bounded_files.read_text(path, _LONGEST, folder), str(path))
     if "gallery" in stored:

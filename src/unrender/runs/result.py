@@ -1,4 +1,4 @@
-"""What a run leaves behind."""
+"""Result of a run."""
 
 from __future__ import annotations
 
@@ -25,55 +25,55 @@ if TYPE_CHECKING:
     from unrender.runs.figure import ResultFigure
 
 INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
-"""Reasons for a run to stop (`Result.stopped`) before its budget is used up: Ctrl-C or a command to stop, SIGTERM, and gradients that
-were not finite."""
+"""Reasons for a run to stop (`Result.stopped`) before its budget is used up: Ctrl-C or a stop command, SIGTERM, and gradients that are
+not finite."""
 PRUNED = "pruned"
-"""Likewise, of a sweep's run whose error is above other runs' (finished)."""
+"""Reason for a sweep's run to stop because its error is above that of other runs; such a run is finished."""
 
 
 @dataclass(frozen=True, repr=False)
 class Result:
-    """The outcome of `optimize`.
+    """Result of `optimize`.
 
     Attributes:
-        parameters: {key: array}, float32, the recovered values: the best ones that fresh pictures verify, see `verification`.
-        initial: {key: array}, where the descent began.
-        last: {key: array}, the values after the last step; the same as `parameters` unless earlier values were better.
-        history: one dictionary per step (of a run of millions of steps in a run folder, per second, fourth, ... of the earlier
-            ones): "step" (from 0), "seconds" (of optimization so far, warm-up and callbacks left out),
-            "loss", "samples" (paths traced so far), "gradient_noise" (share in [0, 1] or None), and, where the truth is known,
-            "parameter_error" ({key: error}, see `Problem.parameter_error`) now and then and at the last step; of parameters that are
-            coarse at first, "resolution" ({key: texels along each axis}) at the first step of each resolution.
-        seconds: of optimization.
-        warmup_seconds: of tracing and compiling kernels before the first step.
-        stopped: "steps", "seconds", "callback" or "pruned" (finished); "interrupted" (Ctrl-C, or a command to stop) or "terminated"
+        parameters: {key: array}, float32, the recovered values: the best ones that new images verify, see `verification`.
+        initial: {key: array}, the initial values.
+        last: {key: array}, the values after the last step; equal to `parameters` unless earlier values were better.
+        history: one dictionary per step (in a run folder with millions of steps, per second, fourth, ... of the earlier ones): "step"
+            (from 0), "seconds" (of optimisation so far, without warm-up and callbacks), "loss", "samples" (paths traced so far),
+            "gradient_noise" (fraction in [0, 1] or None), and, if the truth is known, "parameter_error" ({key: error}, see
+            `Problem.parameter_error`) at intervals and at the last step. For parameters with a coarse initial resolution, "resolution"
+            ({key: texels along each axis}) at the first step of each resolution.
+        seconds: seconds of optimisation.
+        warmup_seconds: seconds of tracing and compiling kernels before the first step.
+        stopped: "steps", "seconds", "callback" or "pruned" (finished); "interrupted" (Ctrl-C, or a stop command) or "terminated"
             (SIGTERM); "non-finite" (failed).
-        skipped: steps whose gradient or loss was not finite, and which were not applied.
+        skipped: number of steps that were not applied because the gradient or loss was not finite.
         warnings: one line each.
-        info: of the last estimate, as NumPy arrays.
-        name, method, settings, seed, command, problem: what was run.
-        choices: what the method chose for the problem and why, one line each.
-        adapted: what the optimizer has found as it went, such as how far its rates have changed, one line each.
-        resumed: the steps at which it was resumed.
-        truth: {key: array} where it is known.
-        verification: what fresh pictures say about the run, see `runs.verify`; empty where there were none. "status", "start", "end" and
-            "best_loss" (loss and its standard error), "best" ("start", "step N" or "end"), "paths" (of each picture), and "memory" (the
-            root mean square "error" of remembered images, and of the "picture").
-        image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the
-            reference and what the picture converges to, the noise of its rendering taken out; see `evaluation.debiased`.
-        standard_error: {key: array} of the parameters' shapes: how far the noise of this run's renderings moves each number, one standard
-            deviation; not the noise of the references, nor what other unknowns that are wrong do. Of numbers by `AveragedNewton` after
-            the last step alone; none of those with a share in a direction that the pictures hardly show; {} for others.
-        phases: {phase: seconds}: where the time went, in order: "compiling", "steps", "checkpoints and callbacks", "final pictures",
-            and, of the command line, what came before. Of the last session, where the run was resumed.
-        sensitivity: {key: array} of the parameters' shapes: by how much the images change per unit of each element, as the root of the sum
-            of squares over all pixels and channels, see `unrender.sensitivity`; {} of runs without a run folder, and where path
-            gradients do not reach the parameters. Where it is small, the images tell nothing.
-        pictures: {"view0/reference": (H, W, 3), ...}, linear; what reports show.
-        undetermined: one line for each unknown that the pictures do not determine, see `runs.determination`; empty for runs without a run
+        info: information of the last estimate, as NumPy arrays.
+        name, method, settings, seed, command, problem: description of the run.
+        choices: choices of the method for the problem and their reasons, one line each.
+        adapted: settings that the optimizer has adapted, such as the changes of its learning rates, one line each.
+        resumed: steps at which it was resumed.
+        truth: {key: array} of known true values.
+        verification: results of new images, see `runs.verify`; empty if there were none. "status", "start", "end" and "best_loss" (loss
+            and its standard error), "best" ("start", "step N" or "end"), "paths" (of each image), and "memory" (the root mean square
+            "error" of a control variate, and of the "picture").
+        image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the reference
+            and the image's expectation, without rendering noise; see `statistics.debiased`.
+        standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings,
+            without the noise of the references and errors of other unknowns. Available for numbers optimised by `AveragedNewton`, after
+            its last step, except for those with a share in a direction that the images hardly determine; {} for others.
+        phases: {phase: seconds} in order: "compiling", "steps", "checkpoints and callbacks", "final pictures", and, on the command line,
+            earlier phases. For a resumed run, those of the last session.
+        sensitivity: {key: array} of the parameters' shapes: change of the images per unit of each element, as root sum of squares over
+            all pixels and channels, see `unrender.sensitivity`. {} for runs without a run folder, and for parameters without path
+            gradients. Where it is small, the images do not determine the element.
+        pictures: {"view0/reference": (H, W, 3), ...}, linear, for reports.
+        undetermined: one line for each unknown that the images do not determine, see `runs.determination`; empty for runs without a run
             folder.
         meshes: {"KEY/faces": (F, 3), ...} of the parameters that are vertex positions, and the true surfaces, "KEY/true_vertices" and
-            "KEY/true_faces", where they are known.
+            "KEY/true_faces", if known.
     """
 
     parameters: dict[str, np.ndarray]
@@ -120,8 +120,10 @@ class Result:
         return notebook.html(self)
 
     def plot(self) -> ResultFigure:
-        """A matplotlib figure: pictures of the views where there are some (`pictures`), recovered maps beside truth and start, curves of
-        parameter error and loss. It belongs to no pyplot session: `result.plot().savefig("result.png")`.
+        """Return a matplotlib figure with images of the views if there are any (`pictures`), recovered textures with truth and start, and
+        curves.
+
+        It belongs to no pyplot session: `result.plot().savefig("result.png")`.
         """
         from unrender.runs.figure import plot
 
@@ -129,30 +131,30 @@ class Result:
 
     @property
     def steps(self) -> int:
-        """How many steps were taken, skipped ones among them."""
+        """Number of steps, including skipped ones."""
         return steps_in(self.history)
 
     @property
     def best(self) -> dict[str, np.ndarray]:
-        """The best values that fresh pictures verify: `parameters`."""
+        """The best values that new images verify: `parameters`."""
         return self.parameters
 
     @property
     def status(self) -> str:
-        """How the run ended: "finished", "interrupted", or "failed" (given up).
+        """How the run ended: "finished", "interrupted" or "failed".
 
-        A run that used up its budget may also be "worse than start" (the final picture is worse than the initial one) or "memory disagrees"
-        (a control variate differs from a fresh picture).
+        A run that used up its budget may also be "worse than start" (the final image is worse than the initial one) or "memory disagrees"
+        (a control variate differs from a new image).
         """
         if self.stopped in (INTERRUPTED, TERMINATED):
             return "interrupted"
         return "failed" if self.stopped == NON_FINITE else str(self.verification.get("status", "finished"))
 
     def save(self, directory: str | Path, status: str | None = None) -> Path:
-        """Write the run folder: run.json, history.jsonl, and the arrays. last.npz is written where `last` differs from `parameters`.
+        """Write the run folder: run.json, history.jsonl, and the arrays. last.npz is written if `last` differs from `parameters`.
 
-        Each file is written beside its place, renamed, and on the disk when this returns; run.json, with `status` (None for the result's
-        own), comes last. Raises `InputError` where the folder cannot be written.
+        Each file is written atomically, and is on disk when this returns. run.json, with `status` (None for the result's), comes last.
+        Raises `InputError` if the folder is not writable.
         """
         folder = Path(directory)
         record = self.encoded_record(status or self.status, "", folder / schema.RECORD)
@@ -177,18 +179,18 @@ class Result:
         return folder
 
     def encoded_record(self, status: str, error: str, path: Path) -> bytes:
-        """Return the bytes of run.json. Raises `InputError`, which names `path`, where the reader would refuse them."""
+        """Return the bytes of run.json. Raises `InputError` that names `path` if the reader would reject them."""
         return schema.encode(schema.RunRecord, self.record(status, error), str(path))
 
     def record(self, status: str, error: str = "") -> dict[str, Any]:
-        """run.json, see `schema.RunRecord`.
+        """Return the contents of run.json, see `schema.RunRecord`.
 
         Args:
-            status: "running", or one of `Result.status`.
-            error: the exception by which the run failed; "" for none.
+            status: "running", or a value of `Result.status`.
+            error: exception by which the run failed; "" for none.
         """
         if status == "failed" and not error:
-            error = "given up: the last gradients were not finite"
+            error = "stopped: the last gradients were not finite"
         fields: dict[str, Any] = {
             "status": status,
             "name": self.name,
@@ -225,37 +227,37 @@ class Result:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide the numbers."""
+    """Return the versions of Python and of the packages on which the numbers depend."""
     return dict(_versions())
 
 
 @cache
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    versions_by_package = {"python": platform.python_version()}
     for package in ("unrender", "mitsuba", "drjit", "numpy"):
         try:
-            found[package] = metadata.version(package)
+            versions_by_package[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+            versions_by_package[package] = "not installed"
+    return versions_by_package
 
 
 def deciding_versions() -> dict[str, str]:
-    """What decides the bits of a run's numbers, as far as versions can: packages, LLVM, the variant."""
+    """Return the versions on which the bits of a run's numbers depend: packages, LLVM, the variant."""
     return dict(_deciding_versions(current() or "none"))
 
 
 @cache
 def _deciding_versions(name: str) -> dict[str, str]:
-    found = {name: version for name, version in versions().items() if name != "python"}
+    versions_by_package = {name: version for name, version in versions().items() if name != "python"}
     for package in ("scipy", "cholespy", "cma"):
-        found[package] = metadata.version(package)
+        versions_by_package[package] = metadata.version(package)
     llvm = llvm_version() if name == LLVM else None
-    return {**found, "variant": name, **({"llvm": ".".join(map(str, llvm))} if llvm else {})}
+    return {**versions_by_package, "variant": name, **({"llvm": ".".join(map(str, llvm))} if llvm else {})}
 
 
 def hardware() -> dict[str, Any]:
-    """The processor and how many cores this process may use."""
+    """Return the processor, and the number of cores that this process may use."""
     return dict(_hardware())
 
 

@@ -1,4 +1,4 @@
-"""Resuming a run from its last checkpoint."""
+"""Resuming of a run from its last checkpoint."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ _OPTIONAL = (_CANDIDATE, _AHEAD)
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run folder whose run may be resumed.
+    """A run folder whose run can be resumed.
 
     Attributes:
         folder: the run folder.
         record: run.json.
-        method: method.toml, with the budget that the run is to have now.
+        method: method.toml, with the new budget.
     """
 
     folder: Path
@@ -60,21 +60,19 @@ class StoredRun:
 
 
 def load_run(directory: str | Path, steps: int | None = None, seconds: float | None = None) -> StoredRun:
-    """Read what a run folder says of its run, before anything that takes time.
+    """Read the description of a run from its folder, before anything that takes time.
 
     Args:
         directory: the run folder.
-        steps, seconds: the budget from the run's start on, in place of the run's own.
+        steps, seconds: a budget from the run's start that replaces the run's.
 
     Raises:
-        InputError: it is no run folder, it is malformed, in use, or finished and no larger budget is given.
+        InputError: the folder is not a run folder, is malformed or in use, or the run is finished and the budget is not larger.
     """
     folder = Path(directory)
     record = reader.read_run_record(folder)
     if not bounded_files.exists(folder / METHOD):
-        raise InputError(
-            f"{folder / METHOD}: no such file: Result.save keeps no run to go on with; run_directory= does"
-        )
+        raise InputError(f"{folder / METHOD}: no such file: Result.save stores no resumable run; use run_directory=")
     method = method_file.read(folder / METHOD)
     if (process := holder(folder)) is not None:
         raise InputError(f"run folder {folder}: in use by {process}")
@@ -84,7 +82,7 @@ def load_run(directory: str | Path, steps: int | None = None, seconds: float | N
     if record.status in ENDED and done:
         so_far = f"finished, after {record.steps} steps and {record.seconds:.3g} s"
         raise InputError(
-            f"run folder {folder}: {so_far}; to go on, give a larger budget, in steps or seconds from its start"
+            f"run folder {folder}: {so_far}; to continue, set a larger budget, in steps or seconds from its start"
         )
     return StoredRun(folder, record, method.model_copy(update={"steps": budget[0], "seconds": budget[1]}))
 
@@ -100,7 +98,7 @@ def resume_run(
     earlier: Mapping[str, float] | None = None,
     within_seconds: bool = False,
 ) -> Result:
-    """Resume the run. See `unrender.resume`; `earlier` is the seconds of phases before, for `within_seconds` see `RunAnnotations`."""
+    """Resume the run. See `unrender.resume`; `earlier` contains the seconds of earlier phases; `within_seconds`: see `RunAnnotations`."""
     folder, method = stored.folder, stored.method
     plan = Plan.from_table(problem, method.model_dump(), str(folder / METHOD), estimator, optimizer)
     check(plan.estimator, plan.optimizer, method.steps, method.seconds)
@@ -114,7 +112,7 @@ def resume_run(
             changes = _changes(stored, source.checkpoint, fingerprint)
             if changes and not force:
                 raise InputError(
-                    f"run folder {folder}: not as it was: {changes}; to go on nevertheless, give --force (force=True)"
+                    f"run folder {folder}: changed since: {changes}; to continue nevertheless, give --force (force=True)"
                 )
             _check_budget_left(folder, method, source.checkpoint)
             if source.checkpoint is not None:
@@ -128,7 +126,7 @@ def resume_run(
                 )
                 break
             except _UnusableCheckpoint as error:
-                source.passed_over.append(str(error))  # the one before may serve
+                source.passed_over.append(str(error))  # an earlier checkpoint may be usable
         else:
             raise InputError(f"run folder {folder}: no checkpoint can be used")
     terminate_if_told(run)
@@ -136,15 +134,15 @@ def resume_run(
 
 
 class _SentOtherwise(InputError):
-    """A checkpoint of a run whose workers were sent parameters in another way."""
+    """A checkpoint of a run whose parameters were sent to workers in another encoding."""
 
 
 class _UnusableCheckpoint(InputError):
-    """A checkpoint that can be read, but holds no state that this run can go on with."""
+    """A readable checkpoint without a state that suits this run."""
 
 
 def _metadata(run: Run, stored: StoredRun, initial: dict[str, np.ndarray], fingerprint: dict[str, str]) -> RunMetadata:
-    """What the result is to say of the run beside what it found."""
+    """Return the description of the run for its result."""
     record = stored.record
     annotations = RunAnnotations(
         record.method, _method_settings(record), record.choices, record.command, stored.method.final_spp
@@ -156,12 +154,12 @@ def _metadata(run: Run, stored: StoredRun, initial: dict[str, np.ndarray], finge
 
 @dataclass(frozen=True)
 class _Source:
-    """Where a run is resumed from.
+    """Point from which a run is resumed.
 
     Attributes:
-        checkpoint: None for the run's start.
+        checkpoint: checkpoint; None for the run's start.
         records: the history, which may be longer.
-        passed_over: one line for each later checkpoint that cannot be used; whoever finds that this one cannot adds to it.
+        passed_over: one line for each later checkpoint that was unusable, including this one if it turns out to be.
     """
 
     checkpoint: Checkpoint | None
@@ -170,9 +168,9 @@ class _Source:
 
 
 def _sources(stored: StoredRun) -> Iterator[_Source]:
-    """The checkpoints that can be read and whose steps the history has, the latest first; the run's start where there is none.
+    """Yield the readable checkpoints whose steps are in the history, latest first; the run's start if there are none.
 
-    Raises `InputError` where all are passed over.
+    Raises `InputError` if all existing ones are unusable.
     """
     path = stored.folder / HISTORY
     records, malformed = history.read_records(path, stored.folder) if path.exists() else ([], "")
@@ -188,7 +186,7 @@ def _sources(stored: StoredRun) -> Iterator[_Source]:
 
 
 def _changes(stored: StoredRun, found: Checkpoint | None, fingerprint: dict[str, str]) -> str:
-    """What is not as it was when the checkpoint was written (the run was started, where there is none): phrases on one line."""
+    """Return the changes since the checkpoint was written (or the run started), as phrases on one line."""
     before = stored.record.problem.fingerprint if found is None else found.manifest.problem
     changed = [] if before is None else differences(before, fingerprint)
     if found is not None:
@@ -199,12 +197,12 @@ def _changes(stored: StoredRun, found: Checkpoint | None, fingerprint: dict[str,
 
 
 def _method_settings(record: RunRecord) -> dict[str, Any]:
-    """The settings of the method, without those that every run has."""
+    """Return the settings of the method, without those that every run has."""
     return {k: v for k, v in record.settings.items() if k not in ("estimator", "optimizer", "steps", "seconds")}
 
 
 def _check_budget_left(folder: Path, method: Method, found: Checkpoint | None) -> None:
-    """Raise `InputError` where the budget ends before the checkpoint."""
+    """Raise `InputError` if the budget ends before the checkpoint."""
     done = 0 if found is None else found.manifest.step
     if method.steps is not None and method.steps < done:
         raise InputError(
@@ -214,13 +212,13 @@ def _check_budget_left(folder: Path, method: Method, found: Checkpoint | None) -
 
 @dataclass
 class _Restore(Hook):
-    """Brings a run that is warmed up to where it was left.
+    """Hook that restores a warmed-up run.
 
     Attributes:
         record: run.json of the run so far.
-        source: where it is resumed from.
-        changes: what is not as it was, "" for nothing.
-        writer: of the run folder.
+        source: point from which it is resumed.
+        changes: changes since then, "" for none.
+        writer: writer of the run folder.
     """
 
     record: RunRecord
@@ -235,14 +233,14 @@ class _Restore(Hook):
             if source.checkpoint is None
             else self._unpack(source.checkpoint, fresh, warm, descent.run.problem.shapes())
         )
-        warnings = [f"passed over: {line}" for line in source.passed_over]
-        warnings += [f"resumed by force though not as it was: {self.changes}"] if self.changes else []
+        warnings = [f"skipped: {line}" for line in source.passed_over]
+        warnings += [f"resumed with force although changed since: {self.changes}"] if self.changes else []
         saved[_WARNINGS] = [*saved[_WARNINGS], *warnings]
         log.history[:] = (record for record in source.records if record["step"] < saved["step"])
         log.description["resumed"] = [*self.record.resumed, saved["step"]]
         log.warmup_seconds += self.record.warmup_seconds
         restore(descent.run, descent.state, saved)
-        if self.record.stopped == NON_FINITE:  # who resumes a run that was given up wants it to try once more
+        if self.record.stopped == NON_FINITE:  # resuming a stopped run means another attempt
             descent.state.skipped_in_a_row = 0
         self.writer.resume(log.history, descent.result())
 
@@ -264,7 +262,7 @@ class _Restore(Hook):
 def _unpack(
     found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any], full_shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, Any]:
-    """The snapshot in a checkpoint, which must have the types and shapes of one of this run's."""
+    """Return the snapshot of a checkpoint, after checking its types and shapes against this run's."""
     saved = unpack(found.packed, [fresh, warm])
     where = f"checkpoint of step {found.manifest.step}"
     if isinstance(saved, dict) and (_SENT in saved) != (_SENT in fresh):
@@ -304,7 +302,7 @@ def _unpack(
 
 
 def _ahead(found: Checkpoint) -> int:
-    """How far resolutions are ahead of their schedule in a checkpoint, which is not put together yet: its shapes depend on that."""
+    """Return how many steps resolutions are ahead of their schedule, before the state is restored, whose shapes depend on it."""
     match found.packed.skeleton:
         case {"dict": list(pairs)}:
             number = next((pair[1] for pair in pairs if isinstance(pair, list) and pair[:1] == [_AHEAD]), 0)
@@ -313,7 +311,7 @@ def _ahead(found: Checkpoint) -> int:
 
 
 def _check_candidate(found: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
-    """Raise `InputError` for what is no `Candidate` of parameters of these shapes."""
+    """Raise `InputError` unless it is a `Candidate` of parameters with these shapes."""
     if not isinstance(found, dict) or found.keys() != {"step", "loss", "parameters"}:
         raise InputError(f"{where}: expected step, loss and parameters, got {repr(found)[:60]}")
     if not all(isinstance(found[name], (int, float)) for name in ("step", "loss")):
@@ -328,7 +326,7 @@ def _check_candidate(found: Any, shapes: Mapping[str, tuple[int, ...]], where: s
 
 
 def _check_sent(sent: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
-    """Raise `InputError` for what is no `Outbox.snapshot` of parameters of these shapes, or of coarser ones."""
+    """Raise `InputError` unless it is an `Outbox.snapshot` of parameters with these shapes, or coarser ones."""
     if not isinstance(sent, dict) or (sent and sent.keys() != shapes.keys()):
         raise InputError(f"{where}: expected what workers have of {', '.join(shapes)}, got {repr(sent)[:60]}")
     for key, pair in sent.items():

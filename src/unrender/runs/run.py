@@ -1,4 +1,4 @@
-"""A run: what callbacks see of it, and what it carries from step to step."""
+"""A run: its public part for callbacks, and its state from step to step."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ class Run:
     """A run as callbacks see it.
 
     Attributes:
-        plan: What the run executes; its problem is as its author gave it.
-        problem: With the plan's settings, and with the present meshes.
-        estimator, optimizer, seed: what runs.
-        steps, seconds: the budget; None where there is none.
-        folder: the run folder; None for a run without one.
-        step: how many steps are done.
-        clock: seconds of optimization so far.
-        parameters: the current ones (the renderer's arrays), at the present resolution where the problem has them coarse at first.
-        estimate: the last one.
-        skipped: steps not applied so far.
-        ahead: steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
+        plan: Plan of the run, with the problem as passed.
+        problem: Problem with the plan's settings and the current meshes.
+        estimator, optimizer, seed: components and seed.
+        steps, seconds: the budget; None for no limit.
+        folder: the run folder; None without one.
+        step: number of completed steps.
+        clock: seconds of optimisation so far.
+        parameters: current parameters (arrays of the renderer), possibly at a coarse resolution.
+        estimate: last estimate.
+        skipped: number of steps that were not applied.
+        ahead: number of steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
         warnings: one line each.
-        stopped: why it ends after the present step; "" while it goes on.
-        deadline: when all should be done, final pictures included, on the clock of `time.perf_counter`; None without such a budget.
-        last_step: when the steps should end, on the clock of `time.perf_counter`, so that all is done within the budget; None where the
-            budget is of the steps alone.
+        stopped: reason to end after the current step; "" for none.
+        deadline: time of `time.perf_counter` at which everything should be finished, with final images; None without such a budget.
+        last_step: time of `time.perf_counter` at which the steps should end, so that everything fits into the budget; None if the budget
+            covers the steps only.
     """
 
     plan: Plan
@@ -72,16 +72,16 @@ class Run:
         return math.inf if self.deadline is None else self.deadline - time.perf_counter()
 
     def stop(self, reason: str = "callback") -> None:
-        """End the run after the present step."""
+        """End the run after the current step."""
         self.stopped = self.stopped or reason
 
     def full(self) -> dict[str, np.ndarray]:
-        """The parameters as NumPy arrays at the scene's own resolution."""
+        """Return the parameters as NumPy arrays at the scene's resolution."""
         return self.problem.full(self.parameters)
 
     @contextmanager
     def shown(self) -> Iterator[Run]:
-        """The run as callbacks see it: at the scene's own resolution what its optimizer made coarse, and the problem did not ask for."""
+        """Yield the run as callbacks see it: parameters that only the plan made coarse have the scene's resolution."""
         present, own = self.parameters, self.plan.problem.coarse_to_fine
         shapes, size = self.problem.shapes(), arrays.shape
         coarse = [k for k in self.problem.coarse_to_fine if k not in own and size(present[k]) != shapes[k]]
@@ -97,14 +97,14 @@ class Run:
                 self.parameters = present
 
     def allowed_seconds(self) -> float:
-        """The seconds of steps that the budget allows in all, on the run's clock; infinity without one."""
+        """Return the total seconds of steps in the budget, on the run's clock; infinity without a limit."""
         if self.seconds is None:
             return math.inf
         left = math.inf if self.last_step is None else self.last_step - time.perf_counter()
         return min(self.seconds, self.clock + left)
 
     def progress(self) -> float:
-        """The share of the budget used, in [0, 1]."""
+        """Return the used fraction of the budget, in [0, 1]."""
         shares = [self.step / self.steps if self.steps else 0.0, self.clock / self.seconds if self.seconds else 0.0]
         if self.seconds and self.last_step is not None:
             shares.append(1.0 - (self.last_step - time.perf_counter()) / self.seconds)
@@ -113,12 +113,12 @@ class Run:
 
 @dataclass(frozen=True)
 class Candidate:
-    """Parameters of an earlier step that may turn out better than the last ones.
+    """Parameters of an earlier step that may be better than the last ones.
 
     Attributes:
-        step: how many steps were done.
-        loss: of a fresh picture.
-        parameters: {key: array} at the scene's own resolution.
+        step: number of completed steps.
+        loss: loss of a new image.
+        parameters: {key: array} at the scene's resolution.
     """
 
     step: int
@@ -128,16 +128,16 @@ class Candidate:
 
 @dataclass
 class RunState:
-    """What a run carries from step to step beside what `Run` shows.
+    """State of a run from step to step, in addition to `Run`.
 
     Attributes:
         estimator, optimizer: their states.
         noise: statistics of the gradient so far.
-        zero_gradient: {key: whether its gradient has been exactly zero so far}.
-        samples: paths traced so far.
-        skipped_in_a_row: steps that were not applied since the last that was.
-        next_error: when the parameters' error is due again, on the run's clock.
-        candidate: the best of the earlier parameters that were looked at; None before there are any.
+        zero_gradient: {key: whether its gradient has always been exactly zero}.
+        samples: number of paths so far.
+        skipped_in_a_row: number of steps since the last applied one.
+        next_error: time on the run's clock at which the parameters' error is measured again.
+        candidate: best of the tested earlier parameters; None before the first.
     """
 
     estimator: Any
@@ -151,7 +151,7 @@ class RunState:
 
 
 def snapshot(run: Run, state: RunState) -> dict[str, Any]:
-    """All that decides what the next steps do: what a checkpoint holds, for `state.pack`."""
+    """Return everything that determines the next steps, for checkpoints (`state.pack`)."""
     noise, executor = state.noise, run.problem.executor
     parts = {"sent": executor.snapshot(), "candidate": _packed(state.candidate), "ahead": run.ahead or None}
     return {
@@ -179,7 +179,7 @@ SNAPSHOT_COUNTS = ("step", "clock", "skipped", "samples", "skipped_in_a_row", "n
 
 
 def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
-    """Bring a run to where `snapshot` was taken. The snapshot has been checked to be one of this run's."""
+    """Restore a run from a snapshot, which has been checked to be one of this run's."""
     run.parameters, run.step, run.clock = saved["parameters"], saved["step"], saved["clock"]
     run.skipped, run.warnings, run.ahead = saved["skipped"], list(saved["warnings"]), saved.get("ahead", 0)
     state.estimator, state.optimizer = saved["estimator"], saved["optimizer"]
@@ -192,10 +192,10 @@ def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
 
 @contextmanager
 def interruptible(run: Run) -> Iterator[None]:
-    """Let the first Ctrl-C, or SIGTERM, end the run after the present step; a second one does what it did before.
+    """Let the first Ctrl-C or SIGTERM end the run after the current step; a second one has its previous effect.
 
-    In the main thread alone. SIGTERM is left to whoever handles it already, unless the handler has the attribute `GRACEFUL`, and to the
-    system where the run has no folder that keeps what was reached.
+    Only in the main thread. SIGTERM is not changed if it has a handler, unless the handler has the attribute `GRACEFUL`, or if the run
+    has no folder that stores its result.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -224,6 +224,6 @@ def interruptible(run: Run) -> Iterator[None]:
 
 
 def terminate_if_told(run: Run) -> None:
-    """End the process as SIGTERM would have, once a run that it stopped is saved, where nobody handles it."""
+    """End the process by SIGTERM after a run that it stopped has been saved, if it has no handler."""
     if run.stopped == TERMINATED and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.raise_signal(signal.SIGTERM)

@@ -1,4 +1,4 @@
-"""How much the images tell of each element of the parameters."""
+"""Sensitivity of the images to each element of the parameters."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from unrender.scene.render import as_tree, view_request
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 _MAP_AXES = 3
 _HARDLY = 0.05
-"""Of the median: elements that change the images less are hardly seen."""
+"""Sensitivity relative to the median below which an element hardly affects the images."""
 
 
 @exclusive("sensitivity")
@@ -33,30 +33,29 @@ def sensitivity(
     seed: int = 0,
     views: int | None = None,
 ) -> dict[str, np.ndarray]:
-    """√diag(JᵀJ) with J the derivative of all views' pixels by the parameters: by how much, as the root of the sum of squares over pixels
-    and channels, the images change per unit of each element.
+    """Estimate √diag(JᵀJ), where J is the derivative of all views' pixels with respect to the parameters.
 
-    Where it is small, the images tell nothing of an element, and what is recovered there is noise or smoothing: JᵀJ is the Gauss-Newton
-    Hessian of L2, and with noise σ in each pixel of the references no estimate of the element alone has a smaller standard deviation than
-    σ over this.
+    It is the change of the images per unit of each element, as root sum of squares over pixels and channels. Where it is small, the
+    images do not determine an element, and the recovered value is noise or smoothing. JᵀJ is the Gauss-Newton Hessian of L2. With noise σ
+    in each pixel of the references, no estimate of the element alone has a standard deviation below σ divided by this.
 
-    diag(JᵀJ) is the expectation of (Jᵀs)² over images s of independent signs. The two factors are adjoints on separate paths, so that the
-    product is unbiased; the root, and negative estimates that become 0, are not.
+    diag(JᵀJ) is the expectation of (Jᵀs)² over images s of independent signs. The two factors are adjoints on separate paths, so the
+    product is unbiased. The root, and the clamping of negative estimates to 0, are not.
 
     Args:
-        problem: its views and scene.
+        problem: problem with views and scene.
         values: {key: array}; None for the initial ones.
-        probes: images of signs, >= 1. The standard error of the square is about √(2/probes) of it.
-        spp: samples per pixel of each adjoint, >= 1; None for 4, or fewer where the views have more than 2¹⁸ pixels together.
-        seconds: after which no further probe is begun; there is one at least.
-        seed: of all random numbers.
-        views: how many views to render, the first ones, >= 1; None for all.
+        probes: number of sign images, >= 1. The relative standard error of the square is about √(2/probes).
+        spp: samples per pixel of each adjoint, >= 1; None for 4, or fewer if the views have more than 2¹⁸ pixels in total.
+        seconds: time after which no further probe is started; there is at least one.
+        seed: seed of all random numbers.
+        views: number of views to render, the first ones, >= 1; None for all.
 
     Returns:
-        {key: array} of the parameters' shapes, float32; {} where path gradients do not reach a parameter.
+        {key: array} of the parameters' shapes, float32; {} if a parameter has no path gradient.
 
     Raises:
-        InputError: `values` have other keys or shapes than the problem's; `probes` or `spp` below 1.
+        InputError: `values` have other keys or shapes than the problem's; `probes` or `spp` is below 1.
     """
     checks.integer("sensitivity", "probes", probes, at_least=1)
     if spp is None:
@@ -80,48 +79,52 @@ def sensitivity(
     return {key: periodic.repeat(root, problem.unknowns[key].measure.repeated) for key, root in roots.items()}
 
 
-def around(found: np.ndarray) -> np.ndarray:
-    """The root mean square of an array of `sensitivity` over channels and the cells around each: (..., channels) -> (...).
+def around(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of a sensitivity over channels and neighbouring cells: (..., channels) -> (...).
 
-    Few probes leave much noise in a single element.
+    It averages the noise of single elements from few probes.
     """
     from scipy.ndimage import uniform_filter
 
-    means = uniform_filter(np.mean(np.square(found, dtype=np.float64), axis=-1), 3, mode="nearest")
-    return np.sqrt(means.clip(min=0.0))  # running sums round to less than 0 beside large values
+    means = uniform_filter(np.mean(np.square(values, dtype=np.float64), axis=-1), 3, mode="nearest")
+    return np.sqrt(means.clip(min=0.0))  # running sums may round to below 0 next to large values
 
 
-def hardly_seen(found: np.ndarray) -> np.ndarray:
-    """Which cells of a texture or grid, with those around them, change the images by less than a twentieth of the median of those that do.
+def hardly_seen(values: np.ndarray) -> np.ndarray:
+    """Return a mask of the cells of a texture or grid whose smoothed sensitivity is below a twentieth of the median of the non-zero ones.
 
     Args:
-        found: of `sensitivity`, (..., channels).
+        values: result of `sensitivity`, (..., channels).
 
     Returns:
         (...), truth values.
     """
-    whole = around(found)
-    return whole <= _HARDLY * np.median(whole[whole > 0]) if (whole > 0).any() else np.ones(whole.shape, bool)
+    smoothed = around(values)
+    return (
+        smoothed <= _HARDLY * np.median(smoothed[smoothed > 0])
+        if (smoothed > 0).any()
+        else np.ones(smoothed.shape, bool)
+    )
 
 
-def seen_cells(found: np.ndarray) -> np.ndarray | None:
-    """Return the cells of a texture or grid that change the images, (...) truth values; None for what is neither.
+def seen_cells(values: np.ndarray) -> np.ndarray | None:
+    """Return a mask of the cells of a texture or grid that affect the images, (...); None for other parameters.
 
     Args:
-        found: of `sensitivity`, (..., channels).
+        values: result of `sensitivity`, (..., channels).
     """
-    return ~hardly_seen(found) if found.ndim >= _MAP_AXES and found.size else None
+    return ~hardly_seen(values) if values.ndim >= _MAP_AXES and values.size else None
 
 
 def _projections(
     problem: Problem, session: RenderSession, parameters: Tree, spp: int, key: Key, half: int, views: int | None
 ) -> dict[str, np.ndarray]:
-    """{key: Jᵀs}: of the signs s of a probe, on one of its two halves' paths."""
-    found = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
+    """Return {key: Jᵀs} for the signs s of a probe, on one of its two sets of paths."""
+    sums = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
     signs = np.random.default_rng(key.uint32())
     for view in range(len(problem.views))[:views]:
         rendering = session.image(parameters, view_request(problem, view, spp, key.fold(2 * view + half).uint32()))
         weights = signs.choice(np.array([-1, 1], np.float32), size=arrays.shape(rendering.images))
         for name, value in session.adjoint(parameters, rendering.paths, problem.renderer.array(weights)).items():
-            found[name] += arrays.numpy(value).reshape(found[name].shape)
-    return found
+            sums[name] += arrays.numpy(value).reshape(sums[name].shape)
+    return sums

@@ -1,4 +1,4 @@
-"""Warnings about parameters that end further from their known truth than they began."""
+"""Warnings about parameters whose error against the known truth has grown."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from unrender.scene.problem import Problem
 __all__ = ["FEW_NEWTON_STEPS", "FEW_STEPS", "further_from_truth"]
 
 FEW_STEPS = 32
-"""Number of steps below which a run whose picture has improved is unfinished, and its parameters may still be on their way."""
+"""Number of steps below which a run with an improved image is unfinished, so that its parameters may still be converging."""
 FEW_NEWTON_STEPS = 8
 """The same number for Gauss-Newton steps of all unknowns."""
 _FURTHER, _FURTHER_EARLY = 1.1, 1.5
-"""Ratio of a parameter's last error to its first from which on a warning says so; the second one for runs of few steps."""
+"""Ratio of a parameter's last error to its first from which a warning is given; the second one for runs of few steps."""
 _MAP_AXES = 3
 _ERRORS = 2.0
-"""Standard errors of a parameter that its last error must exceed, besides its first error."""
+"""Number of standard errors of a parameter that its last error must exceed in addition to its first error."""
 _HARDLY = 0.05
-"""Share of the median of the cells that are seen, below which a cell is hardly seen itself."""
+"""Fraction of the median of the seen cells below which a cell is hardly seen."""
 _PROBES, _SECONDS_SHARE = 8, 0.02
-"""Probes of the sensitivity; share of the run's time after which no further one is begun."""
+"""Probes of the sensitivity; fraction of the run's time after which no further one is started."""
 _SIGNS_SEED = 5
 
 
@@ -38,42 +38,42 @@ def further_from_truth(
     few: bool,
     seconds: float,
 ) -> list[str]:
-    """Return a line for each parameter that ends further from its truth than it began, where the pictures show it.
+    """Return a line for each parameter whose error has grown, if the images determine it.
 
-    The error of a texture or grid is that of its cells which change the pictures at the truth. It has to exceed the first error by a
-    tenth, and by more than the noise of the references and of a fresh picture explains. The sensitivity turns that noise into a
-    standard error of the parameter, see `unrender.sensitivity`.
+    The error of a texture or grid includes only cells that affect the images at the truth. It must exceed the first error by a tenth, and
+    by more than the noise of the references and of a new image explains. The sensitivity converts that noise to a standard error of the
+    parameter, see `unrender.sensitivity`.
 
     Args:
-        problem: its truth, views and scene.
-        pictures: for the noise of the references, from a fresh picture of the truth.
+        problem: problem with truth, views and scene.
+        pictures: source of a new image at the truth, for the noise of the references.
         first, last: {key: array}, the parameters at the start and at the end.
-        few: whether the run made fewer than `FEW_STEPS` steps. Its errors have to exceed the first by a half.
-        seconds: of the run.
+        few: whether the run had fewer than `FEW_STEPS` steps; errors must then exceed the first by a half.
+        seconds: seconds of the run.
     """
     ratio = _FURTHER_EARLY if few else _FURTHER
     before, after = problem.parameter_error(first), problem.parameter_error(last)
-    # The error over all cells rises less than that of the seen ones where the others stay.
+    # The error over all cells grows less than that of the seen ones if the others do not change.
     least = {key: 1.0 if last[key].ndim >= _MAP_AXES else _FURTHER for key in after}
     suspects = [key for key, error in after.items() if 0.0 < least[key] * before[key] < error]
     if not suspects:
         return []
     truth = {**last, **{key: value for key, value in problem.truth.items() if key in last}}
     sensitivities = _sensitivities(problem, truth, seconds)
-    # Sensitivities are of all views. The mean square that remains at the truth is the noise of references and picture.
+    # The sensitivity covers all views. The mean square residual at the truth is the noise of references and image.
     residual = pictures.residual(pictures.images(truth)) if sensitivities else math.nan
     lines = []
     for key in suspects:
         measure, where, noise, words = problem.unknowns[key].measure, None, 0.0, ""
         start, end = before[key], after[key]
-        told = sensitivities.get(key)
-        if told is not None and key in problem.truth:
-            where = _seen(told)
+        sensitivity_of_key = sensitivities.get(key)
+        if sensitivity_of_key is not None and key in problem.truth:
+            where = _seen(sensitivity_of_key)
             if where is not None and not where.all():
                 words = " where the pictures show it"
             known = problem.truth[key]
             start, end = (measure.error(np.asarray(x[key]), known, where) or 0.0 for x in (first, last))
-            noise = _noise(problem, key, told, where, residual)
+            noise = _noise(problem, key, sensitivity_of_key, where, residual)
         if start > 0.0 and math.hypot(ratio * start, _ERRORS * noise) < end:
             lines.append(
                 f"{key} ends further from the truth than it began{words}: error {measure.text(end)}, {measure.text(start)} at the "
@@ -85,25 +85,25 @@ def further_from_truth(
 def _sensitivities(problem: Problem, values: Mapping[str, np.ndarray], seconds: float) -> dict[str, np.ndarray]:
     try:
         return sensitivity(problem, values, _PROBES, seconds=_SECONDS_SHARE * seconds)
-    except InputError:  # the renderer refuses the truth
+    except InputError:  # the renderer rejects the true values
         return {}
 
 
-def _seen(told: np.ndarray) -> np.ndarray | None:
-    """Return the cells that change the pictures, themselves and not only those around them; None for what has no cells."""
-    where = seen_cells(told)
+def _seen(sensitivity: np.ndarray) -> np.ndarray | None:
+    """Return the cells that affect the images themselves, not only through their neighbours; None for parameters without cells."""
+    where = seen_cells(sensitivity)
     if where is None:
         return None
-    own = np.sqrt(np.mean(np.square(told, dtype=np.float64), axis=-1))
+    own = np.sqrt(np.mean(np.square(sensitivity, dtype=np.float64), axis=-1))
     return where & (own > _HARDLY * np.median(own[where])) if where.any() else where
 
 
-def _noise(problem: Problem, key: str, told: np.ndarray, where: np.ndarray | None, residual: float) -> float:
-    """Return the standard error of a parameter, in the units of its error measure, from the noise of the pixels.
+def _noise(problem: Problem, key: str, sensitivity: np.ndarray, where: np.ndarray | None, residual: float) -> float:
+    """Return the standard error of a parameter, in the unit of its error measure, from the noise of the pixels.
 
-    Few probes make single sensitivities uncertain, so all elements get the same standard error from their mean square.
+    Few probes make single sensitivities uncertain, so all elements get the standard error of their mean square.
     """
-    seen = told if where is None else told[where]
+    seen = sensitivity if where is None else sensitivity[where]
     square = float(np.mean(np.square(seen, dtype=np.float64))) if seen.size else 0.0
     if not (square > 0.0 and math.isfinite(residual)):
         return 0.0

@@ -1,4 +1,4 @@
-"""Fresh pictures of a run's parameters, and what they say about the run."""
+"""New images of a run's parameters, and their comparison."""
 
 from __future__ import annotations
 
@@ -24,33 +24,34 @@ from unrender.statistics import paired_losses
 __all__ = ["FreshPictures", "Picture", "Remembering", "is_finite", "remembered"]
 
 _GROUPS = 4
-"""Independent images of each fresh picture."""
+"""Number of independent groups of each new image."""
 _LEAST_PATHS, _MOST_PATHS = 1 << 13, 1 << 22
-"""Paths of a fresh picture."""
+"""Limits of the paths of a new image."""
 _LONGER = 4
-"""Ratio of the allowed paths to the least ones below which a picture has the least: another number of pixels is another recording."""
+"""Ratio of the allowed paths to the minimum below which an image has the minimum, because another number of pixels needs another
+recording."""
 _FEW_PIXELS = 1 << 12
-"""Number of pixels of all views up to which whole views are rendered, whatever the number of paths."""
+"""Number of pixels of all views up to which full views are rendered, for any number of paths."""
 _STREAM = 2
-"""Stream of the run's key that fresh pictures draw from; a run's steps use 0, its warm-up 1."""
+"""Stream of the run's key for new images; the steps use 0, the warm-up 1."""
 _MOST_NON_FINITE = 0.01
-"""Share of pixels that may be non-finite besides those of the start, before a picture counts as non-finite."""
+"""Fraction of pixels that may become non-finite, compared to the start, before an image counts as non-finite."""
 
 
 @runtime_checkable
 class Remembering(Protocol):
-    """An estimator's state, or a part of it, that holds images of earlier steps."""
+    """An estimator's state, or a part of it, with control variates of images."""
 
     def remembered(self) -> tuple[Tree, Sequence[Array]] | None:
-        """Return the parameters that the images are of, and the image (H, W, 3) of each view; None before there are any."""
+        """Return the parameters of the images, and the image (H, W, 3) of each view; None before the first step."""
         ...
 
 
 def remembered(state: Any) -> Iterator[tuple[Tree, Sequence[Array]]]:
-    """Yield what all parts of an estimator's state remember."""
+    """Yield the control variates in all parts of an estimator's state."""
     if isinstance(state, Remembering):
-        if (found := state.remembered()) is not None:
-            yield found
+        if (images := state.remembered()) is not None:
+            yield images
     elif dataclasses.is_dataclass(state) and not isinstance(state, type):
         for field in dataclasses.fields(state):
             yield from remembered(getattr(state, field.name))
@@ -64,12 +65,12 @@ def remembered(state: Any) -> Iterator[tuple[Tree, Sequence[Array]]]:
 
 @dataclass(frozen=True)
 class Picture:
-    """The fresh picture of one point.
+    """The new image at one point.
 
     Attributes:
-        images: (K, N, 3) of each frame, independent over K.
-        losses: pseudo-values (K, N) of the parts of the loss; see `paired_losses.pseudo_values`. Parts are pixels, or what was drawn of
-            all pixels: pairs of these, or views.
+        images: images of each frame, (K, N, 3), independent over K.
+        losses: pseudo-values (K, N) of the parts of the loss; see `paired_losses.pseudo_values`. Parts are pixels, or the sampling units:
+            pairs of pixels, or views.
     """
 
     images: tuple[np.ndarray, ...]
@@ -77,7 +78,7 @@ class Picture:
 
     @property
     def loss(self) -> tuple[float, float]:
-        """The loss without the noise of the picture, and its standard error; infinite for a non-finite picture."""
+        """The loss without the image's noise, and its standard error; infinite for a non-finite image."""
         value, error = paired_losses.mean_and_error(self.losses)
         return (value, error) if math.isfinite(value) and math.isfinite(error) else (math.inf, math.inf)
 
@@ -87,10 +88,10 @@ class _Frame:
     """Pixels of one view, or a list of pixels of all views.
 
     Attributes:
-        view: index of the view that is rendered whole; None for a list of pixels.
+        view: index of the view, all of whose pixels are rendered; None for a list of pixels.
         views, pixels: index of each pixel's view, and its row-major index in the film, (N,).
-        reference: (N, 3).
-        factors: (N, 1), factor of each pixel's loss.
+        reference: reference of each pixel, (N, 3).
+        factors: factor of each pixel's loss, (N, 1).
     """
 
     view: int | None
@@ -101,20 +102,20 @@ class _Frame:
 
 
 class FreshPictures:
-    """Renders fresh pictures of any parameters, all with the same random numbers.
+    """Renders new images of any parameters, all with the same random numbers.
 
-    The random numbers come from a stream of the run's key of their own, so they are independent of the run's. Few pixels are rendered
-    as whole views. Many are a list of pixels, a random sample of all where the paths do not suffice. Where the loss needs whole views, or
-    cameras move, it is a random sample of views.
+    The random numbers come from a separate stream of the run's key, so they are independent of the run's. Few pixels are rendered as full
+    views. Many pixels are rendered as a list, which is a random sample if there are too few paths. If the loss needs full views, or
+    cameras move, the sample consists of views.
 
-    The number of samples per pixel of a launch depends on the problem alone, so all pictures share one compiled kernel, and those of a
-    short run one recording. More paths come from more pixels, and then from more launches.
+    The samples per pixel of a launch depend on the problem only, so all images share one compiled kernel, and those of a short run share
+    one recording. More paths use more pixels, and then more launches.
 
     Args:
-        problem: whose views.
-        seed: the run's.
-        paths: about how many to trace for one picture.
-        number: which of the run's independent sets of random numbers.
+        problem: problem with the views.
+        seed: seed of the run.
+        paths: approximate number of paths of one image.
+        number: index of the run's independent set of random numbers.
     """
 
     def __init__(self, problem: Problem, seed: int, paths: float, number: int = 0):
@@ -127,15 +128,15 @@ class FreshPictures:
 
     @property
     def paths(self) -> int:
-        """How many one picture traces."""
+        """Number of paths of one image."""
         return self.pixels * self._spp * self._launches
 
     def picture(self, parameters: Mapping[str, np.ndarray] | Tree, problem: Problem | None = None) -> Picture:
-        """Render the parameters; `problem` where they are those of another mesh."""
+        """Render the parameters; `problem` is needed for parameters of another mesh."""
         images = self.images(parameters, problem)
         parts = [self._losses(frame, of) for frame, of in zip(self.frames, images, strict=True)]
         losses = np.concatenate(parts, axis=1)
-        # Without noise, so each part gets the same share.
+        # The penalty has no noise, so each part gets an equal share.
         losses += penalty(problem or self._problem, parameters) / losses.shape[1]
         return Picture(tuple(images), losses)
 
@@ -144,18 +145,18 @@ class FreshPictures:
         renderer = (problem or self._problem).renderer
         tree = {k: renderer.array(x) if isinstance(x, np.ndarray) else x for k, x in parameters.items()}
         session = renderer.prepare(list(tree), None, derivatives=False)
-        found = []
+        images_by_frame = []
         for index, frame in enumerate(self.frames):
             key, total = self._key.fold(index + 1), np.zeros((_GROUPS, len(frame.pixels), 3))
             for launch in range(self._launches):
                 seed = (key.fold(launch) if launch else key).uint32()
                 images = session.image(tree, self._request(frame, seed)).images
                 total += arrays.numpy(images).reshape(total.shape)
-            found.append(total / self._launches)
-        return found
+            images_by_frame.append(total / self._launches)
+        return images_by_frame
 
     def residual(self, images: Sequence[np.ndarray]) -> float:
-        """Return the mean square over pixels and channels by which images (K, N, 3) of each frame differ from the references."""
+        """Return the mean square difference over pixels and channels between images (K, N, 3) of each frame and the references."""
         means = np.concatenate([one.mean(axis=0) for one in images])
         weights = self.weights[:, None] * np.isfinite(means)
         squares = np.where(np.isfinite(means), means - self.references, 0.0) ** 2
@@ -163,13 +164,13 @@ class FreshPictures:
 
     @property
     def weights(self) -> np.ndarray:
-        """How much each pixel counts, (N,), of all frames one after the other; at most 1."""
+        """Weight of each pixel, (N,), of all frames concatenated; at most 1."""
         factors = np.concatenate([frame.factors[:, 0] for frame in self.frames])
         return factors / max(float(factors.max(initial=0.0)), 1e-300)
 
     @property
     def references(self) -> np.ndarray:
-        """The reference of each pixel, (N, 3)."""
+        """Reference of each pixel, (N, 3)."""
         return np.concatenate([frame.reference for frame in self.frames]).astype(np.float64)
 
     def memory(self, images: Sequence[Array]) -> list[np.ndarray]:
@@ -192,15 +193,15 @@ class FreshPictures:
         return PixelBatch(self._problem, sample).request(self._spp, seed, _GROUPS)
 
     def _losses(self, frame: _Frame, images: np.ndarray) -> np.ndarray:
-        """The pseudo-values (K, N) of pixels, or of the view (K, 1) where the loss needs whole images."""
+        """Return the pseudo-values (K, N) of pixels, or (K, 1) of the view if the loss needs full images."""
         candidates = [images.mean(axis=0), *paired_losses.leave_one_out(images)]
-        whole, *others = (self._values(frame, image) for image in candidates)
-        found = paired_losses.pseudo_values(whole, np.stack(others))
+        total, *others = (self._values(frame, image) for image in candidates)
+        pseudo = paired_losses.pseudo_values(total, np.stack(others))
         if not self.sampled:
-            return found
-        # The parts are what was drawn: pairs of pixels, or views.
-        drawn = 1 if frame.view is not None else found.shape[1] // 2
-        return found.reshape(len(found), drawn, -1).sum(axis=2)
+            return pseudo
+        # The parts are the sampling units: pairs of pixels, or views.
+        drawn = 1 if frame.view is not None else pseudo.shape[1] // 2
+        return pseudo.reshape(len(pseudo), drawn, -1).sum(axis=2)
 
     def _values(self, frame: _Frame, image: np.ndarray) -> np.ndarray:
         problem, array = self._problem, self._problem.renderer.array
@@ -213,7 +214,7 @@ class FreshPictures:
 
 
 def is_finite(first: Picture, other: Picture) -> bool:
-    """Return whether `other` is finite wherever `first` is, but for very few pixels."""
+    """Return whether `other` is finite wherever `first` is, except at very few pixels."""
     broken, known = 0, 0
     for a, b in zip(first.images, other.images, strict=True):
         at_first, here = (np.isfinite(images.sum(axis=(0, 2))) for images in (a, b))
@@ -223,26 +224,26 @@ def is_finite(first: Picture, other: Picture) -> bool:
 
 
 def _power_of_two(number: int) -> int:
-    """Return the greatest that is not above `number`; 1 for less than 1."""
+    """Return the largest power of two <= `number`, at least 1."""
     return 1 << (max(number, 1).bit_length() - 1)
 
 
 def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], bool]:
-    """The pixels that are looked at, at most about `allowed` of them, and whether they are a sample."""
+    """Return the tested pixels, at most about `allowed`, and whether they are a sample."""
     count, total = len(problem.views), problem.pixels
     if total <= _FEW_PIXELS:
-        return [_whole(problem, view) for view in range(count)], False
+        return [_full_view(problem, view) for view in range(count)], False
     generator = np.random.default_rng(key.uint32())
     known = problem.renderer.parameters()
     rigid = any(known[parameter.key].rigid for parameter in problem.parameters)
     if not problem.loss.pixelwise or (rigid and count > 1):
         many = max(1, min(count, allowed * count // total))
         chosen = np.sort(generator.choice(count, many, replace=False))
-        return [_whole(problem, int(view)) for view in chosen], many < count
-    return [_listed(problem, None if total <= allowed else allowed, generator)], total > allowed
+        return [_full_view(problem, int(view)) for view in chosen], many < count
+    return [_pixel_list(problem, None if total <= allowed else allowed, generator)], total > allowed
 
 
-def _whole(problem: Problem, view: int) -> _Frame:
+def _full_view(problem: Problem, view: int) -> _Frame:
     height, width = problem.sizes[view]
     seen = problem.views[view]
     reference = np.asarray(seen.reference, np.float32).reshape(-1, 3)
@@ -251,8 +252,8 @@ def _whole(problem: Problem, view: int) -> _Frame:
     return _Frame(view, np.full(height * width, view), np.arange(height * width), reference, factors)
 
 
-def _listed(problem: Problem, count: int | None, generator: np.random.Generator) -> _Frame:
-    """Pairs of neighbouring pixels, evenly over all pixels of all views; None for all pixels."""
+def _pixel_list(problem: Problem, count: int | None, generator: np.random.Generator) -> _Frame:
+    """Return pairs of neighbouring pixels, stratified over all pixels of all views; None for all pixels."""
     sizes = np.array([height * width for height, width in problem.sizes])
     starts = np.cumsum([0, *sizes])
     place = np.arange(starts[-1])

@@ -1,4 +1,4 @@
-"""Every run checks itself: fresh pictures of its start and its end, and of what its control variates remember."""
+"""Verification of a run at its end: new images of its start and end, and comparison with its control variates."""
 
 from __future__ import annotations
 
@@ -34,35 +34,36 @@ if TYPE_CHECKING:
 __all__ = ["Memory", "Verify", "compare_memory"]
 
 _SHARE = 0.004
-"""Share of the run's paths that one fresh picture traces; there are at most four."""
+"""Fraction of the run's paths for one new image; there are at most four."""
 _LEVEL = 1e-4
 """False positive rate of each test."""
 _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
 _SCORE, _OF_RESIDUAL, _OF_PICTURE = 4.5, 0.1, 0.02
-"""Least score of a memory's error; its least share of the mean square residual; its least size, in units of the picture's."""
+"""Smallest score of a control variate's error; its smallest fraction of the mean square residual; its smallest size relative to the
+image."""
 _FEW_PIXELS, _OF_FEW, _OF_TRUTH = 96, 0.2, 4.0
-"""Number of pixels below which a residual is judged pixel by pixel, too, which counts the references' noise. Its least size then, in
-units of the picture's, and where the truth is known the least ratio of its mean square to that at the truth."""
+"""Number of pixels below which the residual is also judged pixel by pixel, which includes the references' noise; its smallest size
+relative to the image in this case; its smallest mean square relative to that at the true values, if these are known."""
 _WORTH_A_LINE = 1.25
-"""Ratio of the last loss to that of earlier parameters from which on a warning says that these are kept."""
+"""Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
 _FIRST_CANDIDATE = 64
-"""The step after which the first candidate is taken; the next ones after twice as many steps each."""
+"""Step after which the first candidate is taken; the interval doubles each time."""
 _EARLIER, _STILL = 0.75, 0.85
-"""Share of the steps up to which an earlier picture counts as such; ratio of the last loss to its, above which a run no longer improves."""
+"""Fraction of the steps up to which an earlier image counts; ratio of the last loss to its loss above which a run no longer improves."""
 _CANDIDATES, _END = 1, 2
-"""Numbers of the sets of random numbers."""
+"""Indices of the sets of random numbers."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What a fresh picture says about remembered images.
+    """Comparison of a control variate with a new image.
 
     Attributes:
-        error: root mean square of what the difference shares between neighbouring pixels.
-        picture: root mean square of the fresh picture.
-        residual: root mean square difference of the fresh picture from the references, without noise.
-        score: of `error`; see `paired_losses.SystematicDifference`.
+        error: root mean square of the difference that neighbouring pixels share.
+        picture: root mean square of the new image.
+        residual: root mean square difference of the new image from the references, without noise.
+        score: score of `error`; see `paired_losses.SystematicDifference`.
     """
 
     error: float
@@ -72,7 +73,7 @@ class Memory:
 
     @property
     def disagrees(self) -> bool:
-        """Whether the error is beyond noise, and a share of the residual that misleads a descent."""
+        """Whether the error exceeds noise, and is a fraction of the residual that misleads the optimisation."""
         if not math.isfinite(self.error):
             return True
         relevant = self.error**2 > _OF_RESIDUAL * self.residual**2 and self.error > _OF_PICTURE * self.picture
@@ -81,11 +82,11 @@ class Memory:
 
 @dataclass
 class Verify(Hook):
-    """Judges a run at its end by fresh pictures, and keeps the best parameters that they verify.
+    """Hook that verifies a run at its end by new images, and returns the best parameters.
 
-    Of the start, of parameters after 64, 128, 256, … steps, and of the end, those of the least loss are `Result.parameters`. Another point
-    than the end is taken only where its loss is lower beyond noise. Each picture traces 0.4 % of the run's paths, or 8,000 paths in a
-    short run. Nothing here changes a step.
+    Candidates are the start, the parameters after 64, 128, 256, … steps, and the end. The one with the least loss becomes
+    `Result.parameters`; another one than the end must be significantly better. Each image uses 0.4 % of the run's paths, or about 8,000
+    paths in a short run. The steps are not affected.
     """
 
     _pictures: FreshPictures | None = field(default=None, init=False)
@@ -99,7 +100,7 @@ class Verify(Hook):
             FreshPictures(run.problem, run.seed, 0, _END).images(run.full())
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
-        """See `Hook.on_step`."""
+        """Render a candidate at steps 64, 128, 256, …"""
         del record
         run, ratio = descent.run, descent.run.step / _FIRST_CANDIDATE
         if ratio < 1 or run.step % _FIRST_CANDIDATE or math.log2(ratio) % 1 or _other_meshes(run.problem):
@@ -107,15 +108,15 @@ class Verify(Hook):
         if self._pictures is None:
             self._pictures = FreshPictures(run.problem, run.seed, 0, _CANDIDATES)
         values = run.full()
-        found = _Earlier.of(run.step, self._pictures, values)
-        self._earlier = [*self._earlier[-1:], found]
-        loss = found.loss
+        earlier = _Earlier.of(run.step, self._pictures, values)
+        self._earlier = [*self._earlier[-1:], earlier]
+        loss = earlier.loss
         known = descent.state.candidate
         if known is None or loss < known.loss:
             descent.state.candidate = Candidate(run.step, loss, values)
 
     def on_result(self, descent: Descent, result: Result) -> Result:
-        """See `Hook.on_result`."""
+        """Verify the result, unless the run was interrupted, terminated or pruned."""
         if result.stopped in (INTERRUPTED, TERMINATED, PRUNED) or not result.steps:
             return result
         started = time.perf_counter()
@@ -134,43 +135,46 @@ class Verify(Hook):
             places["start"] = first, result.initial
         candidate = descent.state.candidate
         if candidate is not None and not _other_meshes(problem) and not candidate.loss >= last.loss[0]:
-            found = pictures.picture(candidate.parameters)
-            if _is_worse(pictures, found, last):
-                places[f"step {candidate.step}"] = found, candidate.parameters
+            candidate_picture = pictures.picture(candidate.parameters)
+            if _is_worse(pictures, candidate_picture, last):
+                places[f"step {candidate.step}"] = candidate_picture, candidate.parameters
         best = min(places, key=lambda name: places[name][0].loss[0], default="end")
         memory = _memory(descent, pictures, last)
         disagrees = memory is not None and memory.disagrees
-        kept = places[best][0] if places else last
+        best_picture = places[best][0] if places else last
         lines = self._residual(problem, result, last)
         # A Gauss-Newton step solves for all unknowns, so a run of few steps is no unfinished one.
         few = result.steps < (FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else FEW_STEPS)
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
             lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds)
-        lines += _lines(first, last, best, kept.loss[0], memory if disagrees else None, worse)
-        told: dict[str, Any] = {
+        lines += _lines(first, last, best, best_picture.loss[0], memory if disagrees else None, worse)
+        verification: dict[str, Any] = {
             "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
             "start": _numbers(*first.loss),
             "end": _numbers(*last.loss),
             "best": best,
-            "best_loss": _numbers(*kept.loss),
+            "best_loss": _numbers(*best_picture.loss),
             "paths": pictures.paths,
         }
         if memory is not None:
-            told["memory"] = {"error": _number(memory.error), "picture": _number(memory.picture)}
+            verification["memory"] = {"error": _number(memory.error), "picture": _number(memory.picture)}
         return replace(
             result,
             parameters=dict(places[best][1]) if places else result.parameters,
             last=result.parameters,
             standard_error={} if places else result.standard_error,
-            verification=told,
+            verification=verification,
             warnings=[*result.warnings, *lines],
         )
 
     def _residual(self, problem: Problem, result: Result, end: Picture) -> list[str]:
-        """The warning that the pictures have stopped to improve, and still differ from the references by more than noise.
+        """Return a warning if the images no longer improve, and still differ from the references by more than noise.
 
-        `end`: the last picture, of other random numbers than those of earlier steps.
+        Args:
+            problem: problem of the run.
+            result: result of the run.
+            end: the last image, with random numbers independent of those of earlier steps.
         """
         earlier = next((one for one in reversed(self._earlier) if one.step <= _EARLIER * result.steps), None)
         if self._pictures is None or earlier is None:
@@ -182,21 +186,21 @@ class Verify(Hook):
         residual = last.residual
         if not (np.isfinite(residual).all() and np.isfinite(earlier.residual).all()):
             return []
-        found = paired_losses.systematic(residual, weights, earlier.residual)
+        shared = paired_losses.systematic(residual, weights, earlier.residual)
         total = max(float(weights.sum()) * 3, 1e-300)
         size = math.sqrt(float((weights[:, None] * references**2).sum()) / total)
-        error = math.sqrt(max(found.mean_square, 0.0))
-        if not found.score > _SCORE or error <= _OF_PICTURE * size:
+        error = math.sqrt(max(shared.mean_square, 0.0))
+        if not shared.score > _SCORE or error <= _OF_PICTURE * size:
             if np.count_nonzero(weights) >= _FEW_PIXELS:
                 return []
             others = np.concatenate(end.images, axis=1) - references
-            found = paired_losses.repeated(last.residuals, others, weights)
-            error = math.sqrt(max(found.mean_square, 0.0))
-            if not found.score > _SCORE or error <= _OF_FEW * size:
+            shared = paired_losses.repeated(last.residuals, others, weights)
+            error = math.sqrt(max(shared.mean_square, 0.0))
+            if not shared.score > _SCORE or error <= _OF_FEW * size:
                 return []
-            if problem.has_truth and found.mean_square <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
+            if problem.has_truth and shared.mean_square <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
                 return []
-        noise = math.sqrt(max(float((weights[:, None] * residual**2).sum()) / total - found.mean_square, 0.0))
+        noise = math.sqrt(max(float((weights[:, None] * residual**2).sum()) / total - shared.mean_square, 0.0))
         cause = (
             "light, depth or something else that is not among the unknowns may be wrong, or another start leads further"
         )
@@ -211,12 +215,12 @@ class Verify(Hook):
 
 @dataclass(frozen=True)
 class _Earlier:
-    """A fresh picture of an earlier step.
+    """A new image of an earlier step.
 
     Attributes:
-        step: how many steps were done.
-        loss: without noise.
-        residuals: (K, N, 3), independent images minus the references.
+        step: number of completed steps.
+        loss: loss without noise.
+        residuals: independent images minus the references, (K, N, 3).
     """
 
     step: int
@@ -225,18 +229,18 @@ class _Earlier:
 
     @property
     def residual(self) -> np.ndarray:
-        """(N, 3), the picture minus the references."""
+        """Return the mean image minus the references, (N, 3)."""
         return self.residuals.mean(axis=0)
 
     @classmethod
     def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> _Earlier:
         """Render the parameters of a step."""
-        found = pictures.picture(values)
-        return cls(step, found.loss[0], np.concatenate(found.images, axis=1) - pictures.references)
+        picture = pictures.picture(values)
+        return cls(step, picture.loss[0], np.concatenate(picture.images, axis=1) - pictures.references)
 
 
 def _at_truth(problem: Problem, pictures: FreshPictures, result: Result) -> float:
-    """The mean square difference of the picture at the truth from the references."""
+    """Return the mean square difference between the images at the true values and the references."""
     truth = {**result.parameters, **{key: value for key, value in problem.truth.items() if key in result.parameters}}
     return pictures.residual(pictures.images(truth))
 
@@ -244,9 +248,9 @@ def _at_truth(problem: Problem, pictures: FreshPictures, result: Result) -> floa
 def compare_memory(
     pictures: FreshPictures, memory: list[np.ndarray], fresh: list[np.ndarray], residual: Picture
 ) -> Memory:
-    """Return what fresh images (K, N, 3) say about remembered ones (N, 3) of the same parameters, frame by frame.
+    """Compare new images (K, N, 3) with control variates (N, 3) of the same parameters, frame by frame.
 
-    `residual`: the picture whose distance from the references the error is compared with.
+    `residual` is the image whose distance from the references serves as scale.
     """
     weights = pictures.weights
     means = np.concatenate([images.mean(axis=0) for images in fresh])
@@ -254,7 +258,7 @@ def compare_memory(
     finite: np.ndarray = np.isfinite(np.sum(means, axis=1, keepdims=True))[:, 0]
     if not np.isfinite(differences[finite]).all():
         return Memory(math.inf, 0.0, 0.0, math.inf)
-    found = paired_losses.systematic(np.where(finite[:, None], differences, 0.0), weights * finite)
+    shared = paired_losses.systematic(np.where(finite[:, None], differences, 0.0), weights * finite)
     total = max(float((weights * finite).sum()) * 3, 1e-300)
 
     def product(images: list[np.ndarray], subtracted: np.ndarray | float) -> float:
@@ -263,29 +267,29 @@ def compare_memory(
         products = np.where(np.isfinite(one * other), one * other, 0.0) * (weights * finite)[:, None]
         return math.sqrt(max(float(products.sum()) / total, 0.0))
 
-    error = math.sqrt(max(found.mean_square, 0.0))
-    return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), found.score)
+    error = math.sqrt(max(shared.mean_square, 0.0))
+    return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), shared.score)
 
 
 def _memory(descent: Descent, pictures: FreshPictures, last: Picture) -> Memory | None:
-    """What a fresh picture says about the images that the estimator's state remembers; the worst of several, None for none.
+    """Compare the control variates of the estimator's state with a new image; returns the worst of several, None for none.
 
-    Images that workers remember are judged in runs with a run folder only, whose last checkpoint collects them anyway.
+    Those in workers are compared only in runs with a run folder, whose last checkpoint collects them anyway.
     """
     problem, state = descent.run.problem, descent.state.estimator
     if problem.executor.variant is not None:
         if descent.run.folder is None:
             return None
         state = problem.executor.collect(state)
-    found = [
+    memories = [
         compare_memory(pictures, pictures.memory(images), pictures.images(parameters), last)
         for parameters, images in remembered(state)
     ]
-    return max(found, key=lambda memory: (memory.disagrees, memory.score), default=None)
+    return max(memories, key=lambda memory: (memory.disagrees, memory.score), default=None)
 
 
 def _is_worse(pictures: FreshPictures, first: Picture, other: Picture) -> bool:
-    """Whether the loss of `other` is above that of `first` beyond noise; a picture that is not finite is worse."""
+    """Return whether the loss of `other` is significantly above that of `first`; an image that is not finite is worse."""
     if not is_finite(first, other):
         return True
     (finite,) = np.nonzero(np.isfinite(np.sum(first.losses + other.losses, axis=0)))
@@ -294,38 +298,38 @@ def _is_worse(pictures: FreshPictures, first: Picture, other: Picture) -> bool:
     a, b = first.losses[:, finite], other.losses[:, finite]
     change = paired_losses.difference(a, b, pictures.sampled)
     if not pictures.sampled and not math.isfinite(change.standard_error):
-        return not change.value <= 0  # numbers that overflow
+        return not change.value <= 0  # the standard error has overflowed
     least = _LEAST_CHANGE * abs(float(a.mean(axis=0).sum()))
     return change.value > least and change.exceeds_noise(_LEVEL)
 
 
 def _other_meshes(problem: Problem) -> bool:
-    """Whether meshes get other triangles on the way, so that parameters of different steps have different shapes."""
+    """Return whether meshes are remeshed, so that parameters of different steps have different shapes."""
     planned = any(unknown.remeshing is not None for unknown in problem.unknowns.values())
     return planned or problem.remeshed_from is not None
 
 
-def _lines(first: Picture, last: Picture, best: str, kept_loss: float, memory: Memory | None, worse: bool) -> list[str]:
-    """The warnings, one sentence each."""
-    found = []
+def _lines(first: Picture, last: Picture, best: str, best_loss: float, memory: Memory | None, worse: bool) -> list[str]:
+    """Return the warnings, one sentence each."""
+    lines = []
     if worse:
-        kept = {"end": "no earlier parameters can be kept", "start": "the result holds the initial parameters"}
-        words = kept.get(best, f"the result holds the parameters of {best}")
-        found.append(
+        outcomes = {"end": "no earlier parameters can be kept", "start": "the result holds the initial parameters"}
+        words = outcomes.get(best, f"the result holds the parameters of {best}")
+        lines.append(
             f"the final picture is worse than the initial one: loss {_loss(last)}, {_loss(first)} at the start; {words}; "
             "try a lower learning_rate, more samples per pixel, or another method"
         )
-    elif best != "end" and kept_loss * _WORTH_A_LINE < last.loss[0]:
-        found.append(
+    elif best != "end" and best_loss * _WORTH_A_LINE < last.loss[0]:
+        lines.append(
             f"the final picture is worse than that of {best}: the result holds the parameters of {best}; try a lower learning_rate"
         )
     if memory is not None:
         share = f"{memory.error / memory.picture:.0%} of the picture" if memory.picture > 0 else "not finite"
-        found.append(
+        lines.append(
             f"the control variate differs from a fresh picture by {formatting.number(memory.error)} ({share}), so the reported loss "
             "is wrong; try --method plain, or the control variate's space = primary"
         )
-    return found
+    return lines
 
 
 def _loss(picture: Picture) -> str:

@@ -1,4 +1,4 @@
-"""Hooks that warn of parameters without influence, numbers left at their bounds, and faulty meshes."""
+"""Hooks that warn of parameters without influence, numbers at their bounds, and faulty meshes."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 
 _NEAR = 0.01
-"""Of a range with two ends: so near to one of them counts as there."""
+"""Distance to a bound, relative to the range, below which a number counts as at the bound."""
 
 
 class BoundsWatch(Hook):
-    """Warns of single numbers that began inside of a range with two ends, and end next to one of these.
+    """Hook that warns of numbers that started inside of a bounded range and end next to one of its bounds.
 
-    There, a derivative may vanish or be mostly noise, so that a descent that overshot does not come back.
+    A derivative may vanish there or be mostly noise, so an optimisation that overshot does not return.
     """
 
     def warnings(self, descent: Descent) -> list[str]:
-        run, found = descent.run, []
+        run, lines = descent.run, []
         for key, unknown in run.problem.unknowns.items() if run.stopped else ():
             first, (low, high) = unknown.initial, unknown.bounds
             if first.size != 1 or low is None or high is None:
@@ -37,19 +37,20 @@ class BoundsWatch(Hook):
             last, near = float(arrays.numpy(run.parameters[key]).item()), _NEAR * (high - low)
             for bound in (low, high):
                 if abs(last - bound) <= near < abs(float(first.item()) - bound):
-                    found.append(
-                        f"parameter {key}: ended at {last:.3g}, next to its bound {bound:g}: where that is not to be expected, "
+                    lines.append(
+                        f"parameter {key}: ended at {last:.3g}, next to its bound {bound:g}: if this is unexpected, "
                         "try another seed or a lower learning_rate"
                     )
-        return found
+        return lines
 
 
 _STEPS = 5
 
 
 class InfluenceWatch(Hook):
-    """Warns of parameters whose gradient was exactly zero in each of the first five steps. Parameters that wait for a later step are left
-    out: nothing was estimated of them.
+    """Hook that warns of parameters whose gradient was exactly zero in each of the first five steps.
+
+    Parameters of a block that is not estimated yet are excluded.
     """
 
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
@@ -67,12 +68,11 @@ class InfluenceWatch(Hook):
 
 
 _EVERY, _TRIANGLES = 25, 100
-"""Steps between two looks for self-intersections: so many, or one for so many triangles, where that is more."""
+"""Steps between two tests for self-intersections: the first number, or the number of triangles divided by the second if larger."""
 
 
 class MeshWatch(Hook):
-    """Warns of meshes that no picture shows any more, of those that pass through themselves, and at the end of those that fold over, where
-    they did not at the start."""
+    """Hook that warns of meshes that no image shows any more, and of new self-intersections and folds."""
 
     def __init__(self) -> None:
         self._seen: set[str] = set()
@@ -81,7 +81,7 @@ class MeshWatch(Hook):
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
         run = descent.run
         for key, faces in run.problem.faces.items() if applied else ():
-            # None of estimators that have losses alone, or directions in its place.
+            # None for estimators of losses only, or of directions instead of gradients.
             gradient = estimate.gradient.get(key)
             shown = gradient is not None and arrays.number(memory.square(gradient)) > 0.0
             if shown:
@@ -95,19 +95,19 @@ class MeshWatch(Hook):
                 run.warnings.append(f"step {run.step}: {line}")
 
     def warnings(self, descent: Descent) -> list[str]:
-        run, found = descent.run, []
+        run, lines = descent.run, []
         for key in run.problem.faces if run.stopped else ():
             before, after, joined = _joined(run, key)
             if (count := folds(after, joined)) > folds(before, joined):
-                found.append(
+                lines.append(
                     f"{key}: the mesh folds over at {count} edges: a lower learning rate, or a larger λ of LargeSteps, keeps it smooth"
                 )
             if line := self._crosses(run, key):
-                found.append(line)
-        return found
+                lines.append(line)
+        return lines
 
     def _crosses(self, run: Run, key: str) -> str:
-        """The line on a mesh that passes through itself; "" where it does not, did so no less at the start, or the line was written."""
+        """Return the warning about new self-intersections of a mesh; "" if there are none, or it was issued."""
         if key in self._crossing or run.problem.unknowns[key].given.self_intersection == "ignore":
             return ""
         before, after, joined = _joined(run, key)
@@ -122,7 +122,7 @@ class MeshWatch(Hook):
 
 
 def _joined(run: Run, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3) at the start and now, and the faces (F, 3), without seams."""
+    """Return the vertices (V, 3) at the start and now, and the faces (F, 3), without seams."""
     start, end = (
         np.asarray(x).reshape(-1, 3) for x in (run.problem.unknowns[key].initial, arrays.numpy(run.parameters[key]))
     )
