@@ -1,4 +1,4 @@
-"""Problems made by code, ready to run, their truth known."""
+"""Gallery: problems made by code, with known true values."""
 
 from unrender.gallery.catalogue import names, options, problem, summary
 from unrender.gallery.fields import Option

@@ -1,7 +1,7 @@
-"""`ajar`: a room whose only light comes from the corridor, through a door ajar; its paint and a potted plant are unknown.
+"""Problem `ajar`: unknown paint and a potted plant in a room that is lit only from the corridor, through a door ajar.
 
-After Balint et al. 2023, Fig. 6, and the scene of Veach that it builds on. Nearly every emitter sample is lost in the wall: what arrives
-has passed the gap, mostly after a bounce in the corridor, and few samples see any of it.
+After Balint et al. 2023, Fig. 6, and Veach's scene on which it is based. Nearly every emitter sample is occluded by the wall. Light
+passes the gap, mostly after a bounce in the corridor, and few samples see it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LEAVES = 7
 class Ajar:
     """The paint of a wall and the textures of a potted plant, in a room lit through a door ajar.
 
-    One view; three unknown reflectances of texture_resolution² texels, from grey, with LargeSteps.
+    One view. Three unknown reflectances of texture_resolution² texels, initially grey, with LargeSteps.
     """
 
     resolution: int = fields.resolution(96)
@@ -35,7 +35,7 @@ class Ajar:
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The room: x in [-1.5, 1.5], y in [0, 2], z in [-1, 2]; the corridor beyond x = -1.5; the camera looks along -z."""
+        """Return the room: x in [-1.5, 1.5], y in [0, 2], z in [-1, 2]; the corridor is at x < -1.5; the camera looks along -z."""
         grey, white = parts.diffuse(0.5), parts.twosided(parts.diffuse(0.7))
         size = self.texture_resolution
         wall = {"type": "diffuse", "reflectance": textures.bitmap(textures.photograph("coffee", size))}
@@ -55,7 +55,7 @@ class Ajar:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The three textures, grey at first."""
+        """Return the three textures, initially grey."""
         return (
             Parameter("back.bsdf.reflectance.data", initial=0.4, preconditioner=LargeSteps(2.0)),
             Parameter("pot.bsdf.brdf_0.reflectance.data", initial=0.4, preconditioner=LargeSteps(2.0)),
@@ -70,26 +70,26 @@ _ANGLE = np.radians(28)  # by which the door stands open, into the corridor
 
 
 def _doorway(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The wall at x = -1.5 around the doorway, and the door, hinged at its near edge."""
+    """Return the wall at x = -1.5 around the doorway, and the door, hinged at its near edge."""
     low, high = _OPENING
     pieces = {
         "left_far": ((low - 1) / 2, 1.0, (low + 1) / 2, 1.0),
         "left_near": ((high + 2) / 2, 1.0, (2 - high) / 2, 1.0),
         "left_above": ((low + high) / 2, (_DOOR_HEIGHT + 2) / 2, (high - low) / 2, (2 - _DOOR_HEIGHT) / 2),
     }
-    found: dict[str, Any] = {
+    items: dict[str, Any] = {
         name: parts.rectangle((-1.5, y, z), (0, 0, -half), (0, tall, 0), bsdf)
         for name, (z, y, half, tall) in pieces.items()
     }
     width = high - low
     direction = np.array([-np.sin(_ANGLE), 0.0, -np.cos(_ANGLE)])
     centre = np.array([-1.5, _DOOR_HEIGHT / 2, high]) + direction * width / 2
-    found["door"] = parts.rectangle(centre, direction * width / 2, (0, _DOOR_HEIGHT / 2, 0), bsdf)
-    return found
+    items["door"] = parts.rectangle(centre, direction * width / 2, (0, _DOOR_HEIGHT / 2, 0), bsdf)
+    return items
 
 
 def _corridor(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The corridor, x in [-3.5, -1.5], with a lamp below its ceiling, behind the door."""
+    """Return the corridor, x in [-3.5, -1.5], with a lamp below its ceiling behind the door."""
     return {
         "beyond": parts.rectangle((-3.5, 1, 0.5), (0, 0, -1.5), (0, 1, 0), bsdf),
         "corridor_far": parts.rectangle((-2.5, 1, -1), (1, 0, 0), (0, 1, 0), bsdf),
@@ -106,7 +106,7 @@ def _pot_profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _glaze(resolution: int) -> np.ndarray:
-    """Terracotta with a cream zigzag and a blue rim."""
+    """Return terracotta with a cream zigzag and a blue rim."""
     u, v = textures.grid(resolution)
     clay, cream, blue = np.array([0.6, 0.24, 0.12]), np.array([0.85, 0.78, 0.6]), np.array([0.1, 0.2, 0.5])
     zigzag = np.abs(v - 0.55 - 0.15 * np.abs(((8 * u) % 1) - 0.5) * 2)
@@ -115,7 +115,7 @@ def _glaze(resolution: int) -> np.ndarray:
 
 
 def _rosette(rows: int, columns: int) -> np.ndarray:
-    """Leaves around one stem, as one sheet: its radius falls between the leaves, its tips bend down. (rows, columns + 1, 3)."""
+    """Return leaves around a stem as one sheet, (rows, columns + 1, 3): the radius decreases between leaves, the tips bend down."""
     angle = np.linspace(-np.pi, np.pi, columns + 1)[None, :]
     reach = np.linspace(0.02, 1, rows)[:, None]
     lobe = np.abs(np.cos(_LEAVES / 2 * angle)) ** 0.8

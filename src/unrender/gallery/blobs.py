@@ -1,4 +1,4 @@
-"""Closed meshes around implicit surfaces: bodies of rounded parts that flow into one another, and what two outlines have in common."""
+"""Closed meshes around implicit surfaces: blended bodies of rounded parts, and intersections of extruded outlines."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class Ellipsoid:
 
     Attributes:
         centre: (3,).
-        radii: (3,), along x, y and z before it is tilted.
-        tilt: in degrees about z.
+        radii: along x, y and z before the tilt, (3,).
+        tilt: rotation about z in degrees.
     """
 
     centre: tuple[float, float, float]
@@ -24,12 +24,12 @@ class Ellipsoid:
 
     @property
     def axes(self) -> np.ndarray:
-        """(3, 3), its columns the half-axes."""
+        """Half-axes as columns, (3, 3)."""
         c, s = np.cos(np.radians(self.tilt)), np.sin(np.radians(self.tilt))
         return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) * np.array(self.radii)
 
     def depth(self, points: np.ndarray) -> np.ndarray:
-        """Of points (N, 3), (N,): positive inside, about the distance to its surface near that."""
+        """Return the depth of points (N, 3), (N,): positive inside, approximately the distance near the surface."""
         local = (points - np.array(self.centre)) @ np.linalg.inv(self.axes).T
         length = np.linalg.norm(local, axis=1)
         slope = np.linalg.norm(local @ np.linalg.inv(self.axes), axis=1) / np.maximum(length, 1e-9)
@@ -37,7 +37,7 @@ class Ellipsoid:
 
 
 def united(parts: Sequence[Ellipsoid], blend: float) -> Callable[[np.ndarray], np.ndarray]:
-    """The depth in the union of parts, rounded over `blend` where they meet."""
+    """Return the depth function of the union of parts, rounded over `blend` where they meet."""
 
     def depth(points: np.ndarray) -> np.ndarray:
         return blend * np.logaddexp.reduce([part.depth(points) / blend for part in parts])
@@ -48,12 +48,12 @@ def united(parts: Sequence[Ellipsoid], blend: float) -> Callable[[np.ndarray], n
 def around(
     depth: Callable[[np.ndarray], np.ndarray], low: Sequence[float], high: Sequence[float], spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mesh where a depth is 0, by marching cubes: positions (V, 3) and faces (F, 3), facing outward.
+    """Return the mesh where a depth is 0, by marching cubes: positions (V, 3) and faces (F, 3), facing outward.
 
     Args:
-        depth: of points (N, 3), (N,), positive inside; negative on the box's sides.
+        depth: function of points (N, 3) that returns (N,), positive inside; negative on the sides of the box.
         low, high: corners of the box.
-        spacing: of the grid.
+        spacing: spacing of the grid.
     """
     from skimage import measure
 

@@ -1,7 +1,7 @@
-"""`box2` and `box10`: where flat squares lie, from a picture in which no square touches its place.
+"""Problems `box2` and `box10`: positions of flat squares, from an image in which no square overlaps its true position.
 
-The plateau task of Fischer and Ritschel 2023, as in Wang et al., section 4. A square that does not overlap its place in the reference
-can be moved a little without any effect on the loss: its derivative is zero, and only by looking farther can one tell where to go.
+The plateau task of Fischer and Ritschel 2023, as in Wang et al., section 4. Small motions of a square that does not overlap its true
+position do not change the loss. Its derivative is zero, and only larger motions show the direction.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
 _GREY = 0.4
-"""Of the wall behind."""
+"""Colour of the wall."""
 
 _CELL = 0.45
-"""Places are cells of a grid of 4 by 4."""
+"""Positions are cells of a 4 by 4 grid."""
 
 _FAR = 10.0
-"""Where the camera is: so far off that squares one before the other neither look larger nor show a shadow."""
+"""Position of the camera, so distant that squares at different depths have equal size and show no shadow."""
 
 
 @dataclass(frozen=True)
 class _Square:
-    """One square: its colour, and its place in the truth and at the start, (column, row) in cells from the picture's middle."""
+    """A square: its colour, and its true and initial position, (column, row) in cells from the middle of the image."""
 
     colour: tuple[float, float, float]
     truth: tuple[float, float]
     start: tuple[float, float]
 
 
-# No two differ from the wall in the same way: the squares' contrasts are axes of RGB space, of either sign. So a square
-# gains nothing by lying on another one's place: only its own attracts it.
+# The squares' contrasts to the wall are axes of RGB space, of either sign. So a square does not reduce the loss at the position of
+# another square: only its own position attracts it.
 _FIVE = (
     _Square((0.8, _GREY, _GREY), (-1.5, 0.5), (-0.5, 1.5)),
     _Square((0.0, _GREY, _GREY), (0.5, 1.5), (1.5, 0.5)),
@@ -50,10 +50,10 @@ _ONE = (_Square((0.85, 0.5, 0.1), (0.7, 0.6), (-0.9, -0.7)),)
 @register(name="box2", position=15)
 @dataclass(frozen=True)
 class Box2:
-    """Where one square lies: two numbers, from a start that does not overlap the place sought.
+    """The position of a square: two numbers, initially without overlap with the true position.
 
-    One view; the unknowns are x and y of the square's translation, kept where the picture shows it whole. A plateau: the loss does not
-    change, but for pixels that the square's edges share, until it overlaps its place.
+    One view. The unknowns are x and y of the square's translation, bounded to the image. A plateau: until the square overlaps its true
+    position, the loss changes only at pixels that the square's edges share.
     """
 
     resolution: int = fields.resolution(48)
@@ -62,21 +62,21 @@ class Box2:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """See `_scene`."""
+        """Return the scene, see `_scene`."""
         return _scene(_ONE, 0.2, self.resolution)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The square's place, from the other side of the picture."""
+        """Return the square's position, initially on the other side of the image."""
         return _parameters(_ONE, 0.2)
 
 
 @register(name="box10", position=16)
 @dataclass(frozen=True)
 class Box10:
-    """Where five squares lie: ten numbers, from starts that do not overlap the places sought.
+    """The positions of five squares: ten numbers, initially without overlap with the true positions.
 
-    One view; the unknowns are x and y of each square's translation, kept where the picture shows it whole. A plateau in every coordinate,
-    and a square that crosses another one hides it.
+    One view. The unknowns are x and y of each square's translation, bounded to the image. Every coordinate has a plateau, and squares can
+    occlude each other.
     """
 
     resolution: int = fields.resolution(48)
@@ -85,16 +85,16 @@ class Box10:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """See `_scene`."""
+        """Return the scene, see `_scene`."""
         return _scene(_FIVE, 0.18, self.resolution)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The squares' places, each from one that no square of the reference takes."""
+        """Return the squares' positions, initially at cells that no square of the reference occupies."""
         return _parameters(_FIVE, 0.18)
 
 
 def _scene(squares: tuple[_Square, ...], half: float, resolution: int) -> dict[str, Any]:
-    """A grey wall z = 0, x and y in [-1, 1] seen, lit as the camera sees it: what is seen are the colours themselves."""
+    """Return a grey wall z = 0, visible for x and y in [-1, 1], lit from the camera's direction, so that the image shows the colours."""
     return {
         "type": "scene",
         "camera": parts.camera((0, 0, _FAR), (0, 0, 0), 2 * np.degrees(np.arctan(1 / _FAR)), resolution),
@@ -111,13 +111,13 @@ def _scene(squares: tuple[_Square, ...], half: float, resolution: int) -> dict[s
 
 def _parameters(squares: tuple[_Square, ...], half: float) -> tuple[Parameter, ...]:
     reach = 0.98 - half
-    found = []
+    unknowns = []
     for number, square in enumerate(squares):
         truth = _place(square.truth)
         for axis, here, there in zip("xy", truth, _place(square.start), strict=True):
             bounds = (-reach - here, reach - here)
-            found += staging.unknown(f"box_{number}", "translation", {axis: there - here}, bounds)
-    return tuple(found)
+            unknowns += staging.unknown(f"box_{number}", "translation", {axis: there - here}, bounds)
+    return tuple(unknowns)
 
 
 def _place(cell: tuple[float, float]) -> np.ndarray:

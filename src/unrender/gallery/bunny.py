@@ -1,6 +1,6 @@
-"""`bunny`: where an animal stands and which way it looks.
+"""Problem `bunny`: position and direction of an animal.
 
-After Wang et al., section 4: the task without a plateau, where a descent on the picture as it is can succeed as well.
+After Wang et al., section 4: the task without a plateau, which gradients of the unsmoothed loss can solve as well.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from unrender.scene.parameter import Parameter
 @register(name="bunny", position=19)
 @dataclass(frozen=True)
 class Bunny:
-    """Where an animal stands and which way it looks: three numbers, from a start that overlaps the reference.
+    """The position and direction of an animal: three numbers, initially overlapping the reference.
 
-    One view; the unknowns are x and z of its translation and its rotation about the vertical. No plateau: it starts a fraction of its
-    size away and turned by a third of a right angle. What makes it hard is that the three trade against one another in the
-    silhouette. The animal is made by code, or comes from a file.
+    One view. The unknowns are x and z of its translation, and its rotation about the vertical. There is no plateau: it starts a fraction
+    of its size away, rotated by 30 degrees. The difficulty is that the three are correlated in the silhouette. The animal is made by
+    code, or read from a file.
     """
 
     resolution: int = fields.resolution(48)
@@ -36,7 +36,7 @@ class Bunny:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The animal: 1 along its longest side, on the floor y = 0 at the origin, the sun at the camera's left."""
+        """Return the animal, 1 along its longest side, on the floor y = 0 at the origin, with the sun at the camera's left."""
         fur = parts.twosided(parts.diffuse(0.75, 0.6, 0.45))
         made = mesh_files.standing(self.mesh, fur) if self.mesh else meshes.sheets("bunny", _animal(self.detail), fur)
         return {
@@ -48,7 +48,7 @@ class Bunny:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Place and direction, from the truth."""
+        """Return position and direction relative to the truth."""
         return (
             *staging.unknown("bunny", "translation", {"x": -0.22, "z": 0.25}, bounds=(-0.6, 0.6)),
             *staging.unknown("bunny", "rotation", {"y": np.radians(30.0)}),
@@ -56,7 +56,7 @@ class Bunny:
 
 
 def _animal(detail: int) -> list[meshes.Sheet]:
-    """A sitting hare that looks along +x and a little to the camera: body, haunch, chest, head, muzzle, two ears, a tail."""
+    """Return a sitting hare that looks along +x and slightly to the camera: body, haunch, chest, head, muzzle, two ears, a tail."""
 
     def ball(centre: tuple[float, ...], radii: tuple[float, ...], tilt: float = 0.0) -> meshes.Sheet:
         c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
@@ -77,6 +77,6 @@ def _animal(detail: int) -> list[meshes.Sheet]:
 
 
 def _turned(points: np.ndarray) -> np.ndarray:
-    """Points turned about y, +x towards the camera, by 35 degrees."""
+    """Rotate points about y by 35 degrees, from +x towards the camera."""
     c, s = np.cos(np.radians(35)), np.sin(np.radians(35))
     return points @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]).T

@@ -1,4 +1,4 @@
-"""`camera`: where three cameras stood and which way they looked, from their pictures of a known scene."""
+"""Problem `camera`: poses of three cameras, from their images of a known scene."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from unrender.scene.parameter import Parameter
 _PLACES = {"left": (-1.95, 1.36, 1.95), "middle": (0.15, 1.89, 2.55), "right": (2.18, 1.06, 1.5)}
 _TARGET = (0.0, 0.35, 0.0)
 _TURN, _SHIFT = np.radians(2.0), 0.02
-"""How far off the start is: an angle, and a share of the distance to the target."""
+"""Initial error: an angle, and a distance relative to that of the target."""
 _START = {
     "left": ((0.6, -0.5, 0.62), (-0.5, 0.8, 0.33)),
     "middle": ((-0.8, 0.3, 0.52), (0.4, 0.6, -0.69)),
     "right": ((0.1, 0.9, -0.42), (0.7, -0.1, 0.7)),
 }
-"""Directions: the axis of the turn, and of the shift."""
+"""Directions of the rotation axis and of the shift."""
 
 
 @register(name="camera", position=27)
 @dataclass(frozen=True)
 class Camera:
-    """The poses of three cameras, from their pictures of a known scene.
+    """The poses of three cameras, from their images of a known scene.
 
-    Three views; the unknowns are the translation and the rotation vector of each camera, (3,) each, 18 numbers. They start 2 degrees and
-    2 % of the distance off. What is hard is that a turn and a shift to the side do nearly the same: only the depth of the scene tells
-    them apart.
+    Three views. The unknowns are the translation and the rotation vector of each camera, (3,) each, 18 numbers. Initial errors are 2
+    degrees and 2 % of the distance. The difficulty is that a rotation and a sideways shift have nearly the same effect: only the depth of
+    the scene distinguishes them.
     """
 
     resolution: int = fields.resolution(48)
@@ -41,7 +41,7 @@ class Camera:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """Things of several heights on a patterned floor before a patterned wall, under two suns."""
+        """Return objects of several heights on a patterned floor, before a patterned wall, under two suns."""
         floor = {"type": "diffuse", "reflectance": textures.bitmap(_pattern(3.0, 0.7))}
         wall = {"type": "diffuse", "reflectance": textures.bitmap(_pattern(4.0, 2.1))}
         return {
@@ -63,13 +63,13 @@ class Camera:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Each camera turned and shifted in a direction of its own."""
-        found = []
+        """Return each camera rotated and shifted in a different direction."""
+        unknowns = []
         for name, (shift, axis) in _START.items():
             distance = float(np.linalg.norm(np.subtract(_PLACES[name], _TARGET)))
-            found.append(Parameter(f"{name}.translation", initial=_SHIFT * distance * _unit(shift)))
-            found.append(Parameter(f"{name}.rotation", initial=_TURN * _unit(axis)))
-        return tuple(found)
+            unknowns.append(Parameter(f"{name}.translation", initial=_SHIFT * distance * _unit(shift)))
+            unknowns.append(Parameter(f"{name}.rotation", initial=_TURN * _unit(axis)))
+        return tuple(unknowns)
 
 
 def _unit(v: tuple[float, float, float]) -> np.ndarray:
@@ -77,7 +77,7 @@ def _unit(v: tuple[float, float, float]) -> np.ndarray:
 
 
 def _pattern(frequency: float, phase: float) -> np.ndarray:
-    """Soft stripes and spots of three colours, (64, 64, 3)."""
+    """Return smooth stripes and spots of three colours, (64, 64, 3)."""
     x, y = textures.grid(64)
     first = 0.5 + 0.5 * np.sin(2 * np.pi * (frequency * x + 0.7 * np.sin(5 * y)) + phase)
     second = 0.5 + 0.5 * np.sin(2 * np.pi * frequency * 0.8 * y + 3 * x + phase)

@@ -1,4 +1,4 @@
-"""The gallery's problems by name."""
+"""Look-up of gallery problems by name."""
 
 from __future__ import annotations
 
@@ -18,39 +18,38 @@ _KIND = "gallery problem"
 
 
 def names() -> list[str]:
-    """The names of all registered problems; the first is the one to begin with."""
+    """Return the names of all registered problems; the first one is the easiest start."""
     return list(registry.components(_KIND))
 
 
 def summary(name: str) -> str:
-    """One line: what is to be recovered, and from what. Raises `InputError` for an unknown name."""
+    """Return one line: what is recovered, and from what. Raises `InputError` for an unknown name."""
     return (_specification(name).__doc__ or "").split("\n")[0]
 
 
 def options(name: str) -> list[Option]:
-    """What `problem(name, ...)` may be asked for. Raises `InputError` for an unknown name."""
+    """Return the options of `problem(name, ...)`. Raises `InputError` for an unknown name."""
     return fields.of(_specification(name))
 
 
 @exclusive("gallery.problem")
 def problem(name: str, **options: Any) -> Problem:
-    """A problem made by code, its truth known wherever there is one: its scene, its references (rendered now), where the descent starts.
+    """Return a problem made by code, with known true values if there are any: scene, references (rendered now) and initial values.
 
         problem("indirect-room", resolution=64, texture_resolution=64)
 
     Args:
         name: one of `names()`.
-        options: see `options(name)`. All have loss, those that are rendered resolution (pixels along a side),
-            reference_spp and max_depth, and those of unknown textures texture_resolution; the defaults take seconds on two CPU
-            cores, a GPU wants larger ones.
+        options: see `options(name)`. All problems have loss, rendered ones resolution (pixels along a side), reference_spp and max_depth,
+            and those with unknown textures texture_resolution. Defaults take seconds on two CPU cores; a GPU can use larger ones.
 
-    References take up to a minute to render, and are kept in the cache folder (`backend.cache`).
+    References take up to a minute to render, and are stored in the cache folder (`backend.cache`).
 
     Returns:
-        the problem. Its references hold noise of their own, which `reference_spp` lowers.
+        The problem. Its references have noise, which a larger `reference_spp` reduces.
 
     Raises:
-        InputError: the name or an option is unknown, or an option is out of its range.
+        InputError: the name or an option is unknown, or an option is out of range.
         VariantError: Mitsuba cannot run on this machine.
     """
     specification = fields.fill(name, _specification(name), options)

@@ -1,7 +1,7 @@
-"""`caustic`: the tiles of a floor under two lamps whose light comes out through balls of glass.
+"""Problem `caustic`: the tiles of a floor under two lamps inside of glass balls.
 
-Where the adaptive sampling of pixels fails (its Fig. 7). Emitter samples are lost at the glass, a path finds a lamp by chance and is bright
-when it does: a few samples per pixel say next to nothing of where gradients are large or noisy.
+Adaptive pixel sampling fails here (Fig. 7 of its paper). The glass blocks emitter samples. A path hits a lamp rarely, and is bright when
+it does, so a few samples per pixel contain almost no information about large or noisy gradients.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
 _RADIUS, _HEIGHT = 0.34, 0.85
-"""Of the balls, and of their middles above the floor."""
+"""Radius of the balls, and height of their centres above the floor."""
 
 _LAMPS = {"left": (-0.58, -0.15, (1.0, 0.85, 0.65)), "right": (0.58, 0.05, (0.75, 0.9, 1.0))}
-"""x and z of their middles, and tint."""
+"""x and z of their centres, and tint."""
 
 
 @register(name="caustic", position=12)
 @dataclass(frozen=True)
 class Caustic:
-    """The texture of a floor that two lamps light through balls of glass, in caustics.
+    """The texture of a floor that two lamps light through glass balls, in caustics.
 
-    One view; one unknown reflectance (texture_resolution², 3), from grey, with LargeSteps. Paths of at least 4 segments reach the lamps,
-    few of those that set out; a panel that can be sampled lights the whole floor a little. What the gradient rests on are samples that
-    come seldom: the fewer there are of each pixel in a step, the smaller steps it takes.
+    One view. One unknown reflectance (texture_resolution², 3), initially grey, with LargeSteps. Only paths of at least 4 segments reach
+    the lamps, and few of them do; a panel that can be sampled lights the floor a little. The gradient depends on rare samples. Fewer
+    samples of each pixel in a step lead to smaller steps.
     """
 
     resolution: int = fields.resolution(64)
@@ -42,7 +42,10 @@ class Caustic:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The floor: x in [-1.3, 1.3], z in [-0.9, 0.9] at y = 0; the lamps' tubes reach from their balls' equators up, out of sight."""
+        """Return the floor: x in [-1.3, 1.3], z in [-0.9, 0.9] at y = 0.
+
+        The lamps' tubes extend upwards from the balls' equators, out of view.
+        """
         tiles = {"type": "diffuse", "reflectance": textures.bitmap(_mosaic(self.texture_resolution))}
         return {
             "type": "scene",
@@ -60,12 +63,12 @@ class Caustic:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The texture, grey at first."""
+        """Return the texture, initially grey."""
         return (Parameter("floor.bsdf.reflectance.data", initial=0.4, preconditioner=LargeSteps(1.0)),)
 
 
 def _lamp(middle: np.ndarray, tint: tuple[float, float, float]) -> dict[str, Any]:
-    """A disc that shines down a black tube, which a ball of glass closes: all its light passes the glass."""
+    """Return a disc light in a black tube that a glass ball closes: all its light passes through the glass."""
     tube, length, disc = 1.01 * _RADIUS, 0.6, 0.3
     points = meshes.lathe(np.full(2, tube), np.array([0, length]), 48) + middle
     down = mi.ScalarTransform4f().translate((middle + [0, length, 0]).tolist()).rotate([1, 0, 0], 90)
@@ -92,7 +95,7 @@ def _lamp(middle: np.ndarray, tint: tuple[float, float, float]) -> dict[str, Any
 
 
 def _mosaic(resolution: int) -> np.ndarray:
-    """Rings of light and dark tiles in four colours: (resolution, resolution, 3)."""
+    """Return rings of light and dark tiles in four colours, (resolution, resolution, 3)."""
     u, v = textures.grid(resolution)
     colours = np.array([[0.75, 0.7, 0.6], [0.12, 0.35, 0.6], [0.7, 0.38, 0.15], [0.15, 0.5, 0.4]])
     x, y = np.floor(8 * u) - 3.5, np.floor(8 * v) - 3.5

@@ -1,7 +1,8 @@
-"""`chalice`: the roughness of a metal cup under small, bright lamps, the hard case of finite differences.
+"""Problem `chalice`: the roughness of a metal cup under small, bright lamps, a hard case for finite differences.
 
-After Balint et al. 2023, Fig. 9. A sharp light sees the lobe's edge: a small change of roughness moves it across whole pixels, the
-relative change of a sample is large, and roughness decides the sampling besides. Differences of gradients are then as noisy as gradients.
+After Balint et al. 2023, Fig. 9. A small light samples the edge of the lobe. A small change of roughness moves this edge across several
+pixels, so the relative change of a sample is large, and roughness also affects the sampling. Differences of gradients are then as noisy
+as gradients.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ _LIGHTS = ((-1.4, 2.6, 1.6), (1.5, 2.2, 1.2), (0.2, 2.9, 2.2), (-1.9, 1.2, 0.4),
 @register(name="chalice", position=7)
 @dataclass(frozen=True)
 class Chalice:
-    """The roughness map of a metal chalice under small sharp lights.
+    """The roughness map of a metal chalice under small, bright lights.
 
-    Two views; one unknown, the roughness (texture_resolution², 1), from one value, with LargeSteps.
+    Two views. One unknown, the roughness (texture_resolution², 1), initially constant, with LargeSteps.
     """
 
     resolution: int = fields.resolution(96)
@@ -35,7 +36,7 @@ class Chalice:
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The chalice: 1.5 high, on a table y = 0, around the y axis; six lamps the size of a coin above and about it."""
+        """Return the chalice, 1.5 high, on a table y = 0 around the y axis, with six lamps of the size of a coin above and around it."""
         return {
             "type": "scene",
             "camera_0": parts.camera((0.0, 1.5, 3.6), (0, 0.75, 0), 30.0, self.resolution),
@@ -49,12 +50,12 @@ class Chalice:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The roughness, even at first."""
+        """Return the roughness, initially constant."""
         return (Parameter("chalice.bsdf.brdf_0.roughness.data", initial=0.65, preconditioner=LargeSteps(2.0)),)
 
 
 def _lamp(place: np.ndarray) -> dict[str, Any]:
-    """A coin-sized square that faces the middle of the chalice."""
+    """Return a coin-sized square light that faces the centre of the chalice."""
     towards = np.array([0, 0.75, 0]) - place
     towards /= np.linalg.norm(towards)
     right = np.cross([0.0, 1.0, 0.0], towards)
@@ -64,7 +65,7 @@ def _lamp(place: np.ndarray) -> dict[str, Any]:
 
 
 def _profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radius and height of foot, stem with a knot, and bowl."""
+    """Return radius and height of foot, stem with a knot, and bowl."""
     from scipy.interpolate import PchipInterpolator
 
     height = np.linspace(0, 1, rows)

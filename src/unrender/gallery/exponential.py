@@ -1,4 +1,4 @@
-"""`exponential`: the toy problem of Balint et al. 2023, Fig. 2, which needs no renderer."""
+"""Problem `exponential`: the toy problem of Balint et al. 2023, Fig. 2, without a renderer."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _MEAN, _START = 2.0, 1.5
 @register(name="exponential", position=13)
 @dataclass(frozen=True)
 class Exponential:
-    """The rate of an exponential distribution, from its mean: one number, no renderer.
+    """The rate of an exponential distribution from its mean: one number, no renderer.
 
-    The mean is 2, the rate 0.5, the start 1.5.
+    The mean is 2, the true rate 0.5, the initial rate 1.5.
     """
 
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def problem(self, name: str) -> Problem:
-        """The problem: a picture of one pixel that shows the mean."""
+        """Return the problem, with an image of one pixel that contains the mean."""
         return Problem(
             ExponentialRenderer(1 / _MEAN),
             [Parameter(RATE, initial=_START)],

@@ -1,4 +1,4 @@
-"""What a gallery problem may be asked for: the typed fields of its specification, and their checks."""
+"""Options of gallery problems: typed fields of their specifications, with checks."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _LONGEST_SIDE = 1 << 13
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a gallery problem.
+    """An option of a gallery problem.
 
     Attributes:
-        name: the keyword.
-        kind: `int`, or `Loss`, which may be given by its name.
-        default: its value where none is given.
-        about: one line for people.
+        name: keyword.
+        kind: `int`, or `Loss`, which can be passed by name.
+        default: default value.
+        about: description in one line.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Option:
 
 
 def integer(default: int, about: str, at_least: int = 1, at_most: int = 2**31 - 1) -> Any:
-    """A dataclass field: a whole number in [at_least, at_most]."""
+    """Return a dataclass field: an integer in [at_least, at_most]."""
 
     def check(owner: str, name: str, value: Any) -> int:
         number = checks.integer(owner, name, value, at_least)
@@ -46,22 +46,22 @@ def integer(default: int, about: str, at_least: int = 1, at_most: int = 2**31 - 
 
 
 def resolution(default: int) -> Any:
-    """The field `resolution`."""
+    """Return the field `resolution`."""
     return integer(default, "pixels along a side of each view", at_least=4, at_most=_LONGEST_SIDE)
 
 
 def texture_resolution(default: int) -> Any:
-    """The field `texture_resolution`."""
+    """Return the field `texture_resolution`."""
     return integer(default, "texels along a side of each unknown map", at_least=2, at_most=_LONGEST_SIDE)
 
 
 def reference_spp(default: int) -> Any:
-    """The field `reference_spp`."""
+    """Return the field `reference_spp`."""
     return integer(default, "samples per pixel of the reference images", at_most=1 << 24)
 
 
 def max_depth(default: int, at_least: int) -> Any:
-    """The field `max_depth`."""
+    """Return the field `max_depth`."""
     return integer(default, "longest light path in segments", at_least=at_least, at_most=1 << 20)
 
 
@@ -75,25 +75,25 @@ def _check_loss(owner: str, name: str, value: Any) -> Loss:
 
 
 LOSS = {"kind": Loss, "about": "L1, L2, RelativeL2, Huber, Perceptual or another registered loss", "check": _check_loss}
-"""The metadata of the field `loss`."""
+"""Metadata of the field `loss`."""
 
 
 def of(specification: type) -> list[Option]:
-    """The options that a specification has, in its order."""
+    """Return the options of a specification, in order."""
     return [
         Option(f.name, f.metadata["kind"], f.default, f.metadata["about"]) for f in dataclasses.fields(specification)
     ]
 
 
-def fill(name: str, specification: type, given: Mapping[str, Any]) -> Any:
-    """The specification with these options, the others at their defaults.
+def fill(name: str, specification: type, options: Mapping[str, Any]) -> Any:
+    """Return the specification with these options, and defaults for the others.
 
-    Raises `InputError` for one that is unknown (with the nearest known one) or out of its range.
+    Raises `InputError` for an unknown option (with the nearest known one), or one out of range.
     """
     fields = {f.name: f for f in dataclasses.fields(specification)}
     owner = f"gallery problem {name}"
     taken = {}
-    for key, value in given.items():
+    for key, value in options.items():
         if key not in fields:
             hint = did_you_mean(key, fields) or f"; it has {', '.join(fields)}"
             raise InputError(f"{owner}: no option {key}{hint}")

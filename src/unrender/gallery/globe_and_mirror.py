@@ -1,7 +1,7 @@
-"""`globe-and-mirror`: the texture of a globe in a glass ball, whose back is seen in a mirror, from one picture.
+"""Problem `globe-and-mirror`: the texture of a globe in a glass ball, whose back is visible in a mirror, from one image.
 
-The earth under glass of the adaptive sampling of pixels (its Fig. 9), one large picture. Light reaches the globe through two refractions,
-and what the mirror shows of it through as many and a reflection.
+The earth under glass of adaptive pixel sampling (Fig. 9 of its paper), with one large image. Light reaches the globe through two
+refractions; its mirror image needs a reflection in addition.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from unrender.scene.parameter import Parameter
 _GLOBE, _INNER, _OUTER = 0.72, 0.92, 1.0
 """Radii of the globe and of the two sides of the glass."""
 _EYE, _MIRROR = np.array([1.4, 0.8, 6.0]), np.array([-2.1, 0.1, -1.5])
-"""Where the camera and the middle of the mirror are."""
+"""Positions of the camera and of the mirror's centre."""
 
 
 @register(name="globe-and-mirror", position=32)
 @dataclass(frozen=True)
 class GlobeAndMirror:
-    """The texture of a globe within glass, whose back shows in a mirror, from one picture.
+    """The texture of a globe inside of glass, whose back is visible in a mirror, from one image.
 
-    One view; an unknown reflectance of texture_resolution² texels, from grey, with LargeSteps. A part of the back is seen in neither way.
-    Paths from the mirror to the globe and on to the light have 7 segments.
+    One view. An unknown reflectance of texture_resolution² texels, initially grey, with LargeSteps. A part of the back is not visible at
+    all. Paths from the mirror to the globe and on to the light have 7 segments.
     """
 
     resolution: int = fields.resolution(64)
@@ -39,7 +39,8 @@ class GlobeAndMirror:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The globe around the origin, the mirror behind it at its left, turned so that the camera sees the globe in its middle."""
+        """Return the globe around the origin, with the mirror behind it at its left, oriented so that the camera sees the globe in its
+        centre."""
         normal = _unit(_unit(_EYE - _MIRROR) + _unit(-_MIRROR))
         right = _unit(np.cross([0.0, 1.0, 0.0], normal))
         up = np.cross(normal, right)
@@ -56,7 +57,7 @@ class GlobeAndMirror:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The texture, grey at first."""
+        """Return the texture, initially grey."""
         return (Parameter("globe.bsdf.reflectance.data", initial=0.5, preconditioner=LargeSteps(1.0)),)
 
 

@@ -1,8 +1,7 @@
-"""`glossy-room`: a metal tile and a gilded ball, recovered from the highlights and reflections of many small lights.
+"""Problem `glossy-room`: a metal tile and a gilded ball, recovered from the highlights and reflections of many small lights.
 
-A rough surface under a broad light looks much like a smooth one: what tells roughness is how the reflections of small,
-bright things are blurred. So the room is dim and holds twelve small lights, tinted in turn, and each texel is seen from
-several sides, by a few pixels each.
+Under a large light, a rough surface resembles a smooth one. Roughness shows in the blur of reflections of small, bright objects. So the
+room is dim and contains twelve small, tinted lights, and each texel is visible from several directions, in a few pixels each.
 """
 
 from __future__ import annotations
@@ -34,8 +33,7 @@ _TINTS = [(35.0, 31.0, 28.0), (28.0, 31.0, 35.0), (35.0, 35.0, 35.0)]
 class GlossyRoom:
     """Base colour, roughness and metallic maps of a metal tile and a gilded ball, from their highlights.
 
-    Several views; four unknowns of texture_resolution² texels: base colour and roughness of the tile, metallic and
-    roughness of the ball.
+    Several views. Four unknowns of texture_resolution² texels: base colour and roughness of the tile, metallic and roughness of the ball.
     """
 
     resolution: int = fields.resolution(128)
@@ -46,7 +44,7 @@ class GlossyRoom:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The room: x in [-2.2, 2.2], y in [0, 3], z in [-1.5, 4.5]; the cameras at z = 4, looking along -z."""
+        """Return the room: x in [-2.2, 2.2], y in [0, 3], z in [-1.5, 4.5], with cameras at z = 4 that look along -z."""
         wall = parts.diffuse(0.2)
         places = np.linspace(-1.5, 1.5, self.views) if self.views > 1 else [0.0]
         return {
@@ -71,7 +69,7 @@ class GlossyRoom:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The four maps, each from one value."""
+        """Return the four maps, initially constant."""
         return (
             Parameter("tile.bsdf.base_color.data", initial=0.5),
             Parameter("tile.bsdf.roughness.data", initial=0.4, preconditioner=LargeSteps(2.0)),
@@ -89,14 +87,14 @@ def _light(number: int) -> dict[str, Any]:
 
 
 def _tile_points(steps: int) -> np.ndarray:
-    """A tile that leans back and bulges towards the cameras: points (steps, steps, 3)."""
+    """Return a tile that leans back and bulges towards the cameras: points (steps, steps, 3)."""
     y, x = np.meshgrid(np.linspace(-1, 1, steps), np.linspace(-1, 1, steps), indexing="ij")
     bulge = 0.28 * (1 - x**2) * (1 - 0.6 * y**2)
     return np.stack([-0.7 + 0.7 * x, 0.95 + 0.9 * y, -0.45 - 0.25 * y + bulge], axis=-1)
 
 
 def _ball_frame(centre: parts.Vector, radius: float) -> Any:
-    """A sphere's frame with its pole towards +y and the middle of its texture's first copy towards +z."""
+    """Return a sphere's frame with its pole at +y and the centre of its texture's first copy at +z."""
     turn = mi.ScalarTransform4f().rotate([1, 0, 0], -90) @ mi.ScalarTransform4f().rotate([0, 0, 1], 180)
     return mi.ScalarTransform4f().translate(list(centre)) @ turn @ mi.ScalarTransform4f().scale(radius)
 
@@ -116,7 +114,7 @@ def _ball_material(resolution: int) -> dict[str, Any]:
     u, v = textures.grid(resolution)
     dots = 1 - textures.ramp(np.hypot((4 * u) % 1 - 0.5, (3 * v) % 1 - 0.5), 0.25, 0.35)
     stripes = textures.ramp(np.sin(4 * np.pi * (u - v)), -0.5, 0.5)
-    repeat = (2, 1.5)  # one copy on the side that the cameras see, down to a little below the equator
+    repeat = (2, 1.5)  # one copy on the side that the cameras see, ending a little below the equator
     return {
         "type": "principled",
         "base_color": parts.colour(0.85, 0.55, 0.2),

@@ -1,8 +1,7 @@
-"""`indirect-room`: a photograph on the back wall of a closed room that is lit by nothing but its ceiling.
+"""Problem `indirect-room`: a photograph on the back wall of a closed room that is lit only via its ceiling.
 
-A lamp on the floor points up, in a shade that is black inside. The ceiling alone sees it: from anywhere else no emitter
-can be sampled, and at few samples per pixel the picture is mostly noise. With the L1 loss that noise also biases the
-gradient of a plain loop.
+A lamp on the floor points up, in a shade that is black inside. Only the ceiling sees it. From anywhere else no emitter can be sampled,
+and with few samples per pixel the image is mostly noise. With the L1 loss this noise also biases the gradient of a plain loop.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from unrender.scene.parameter import Parameter
 class IndirectRoom:
     """A photograph on the back wall of a room that is lit only by light bounced off its ceiling.
 
-    One view; one unknown, the wall's reflectance (texture_resolution², 3), from grey, with LargeSteps.
+    One view. One unknown, the wall's reflectance (texture_resolution², 3), initially grey, with LargeSteps.
     """
 
     resolution: int = fields.resolution(128)
@@ -32,7 +31,7 @@ class IndirectRoom:
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The room: x and y in [-1, 1], z in [-1, 2.2]; the camera inside, looking along -z."""
+        """Return the room: x and y in [-1, 1], z in [-1, 2.2], with the camera inside, looking along -z."""
         picture = textures.bitmap(textures.photograph("astronaut", self.texture_resolution))
         room = parts.room(parts.diffuse(0.75), parts.diffuse(0.6, 0.08, 0.06), parts.diffuse(0.12, 0.42, 0.1))
         return {
@@ -44,5 +43,5 @@ class IndirectRoom:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The wall's texture, grey at first, smoothed by LargeSteps as in the paper's own reconstruction (Fig. 9)."""
+        """Return the wall's texture, initially grey, with LargeSteps as in the paper's reconstruction (Fig. 9)."""
         return (Parameter("back.bsdf.reflectance.data", initial=0.5, preconditioner=LargeSteps(2.0)),)

@@ -1,7 +1,7 @@
-"""`lamp`: how bright and of what colour a lamp is, and what is painted on the wall beside it, both at once.
+"""Problem `lamp`: brightness and colour of a lamp together with a mural on the wall next to it.
 
-Light and albedo multiply: a mural twice as dark under a lamp twice as bright looks the same. What tells them apart here
-is the bulb, which the camera sees, and the plaster and the floor, whose albedos are known.
+Light and albedo multiply: a mural of half the albedo under a lamp of twice the radiance looks the same. They are distinguished by the
+bulb, which the camera sees, and by the plaster and the floor, whose albedos are known.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from unrender.losses import Loss, RelativeL2
 from unrender.scene.parameter import Parameter
 
 _BULB = np.array([0.86, 1.68, -0.25])
-"""The middle of the bulb."""
+"""Centre of the bulb."""
 
 
 @register(name="lamp", position=4)
 @dataclass(frozen=True)
 class Lamp:
-    """The radiance of a hanging lamp and the mural that it lights, together.
+    """The radiance of a hanging lamp together with the mural that it lights.
 
-    One view; two unknowns: the lamp's colour (3,), from dim white, and the mural (texture_resolution², 3), from grey.
+    One view. Two unknowns: the lamp's colour (3,), initially dim white, and the mural (texture_resolution², 3), initially grey.
     """
 
     resolution: int = fields.resolution(128)
@@ -35,7 +35,7 @@ class Lamp:
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The room: x in [-1.6, 1.6], y in [0, 2.2], z in [-1.2, 2.6]; the camera at its front, looking along -z."""
+        """Return the room: x in [-1.6, 1.6], y in [0, 2.2], z in [-1.2, 2.6], with the camera at its front, looking along -z."""
         plaster = parts.diffuse(0.7)
         mural = textures.bitmap(textures.photograph("coffee", self.texture_resolution))
         return {
@@ -63,7 +63,7 @@ class Lamp:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The lamp's radiance, whose scale asks for a learning rate of its own, and the mural."""
+        """Return the lamp's radiance, whose scale needs its own learning rate, and the mural."""
         return (
             Parameter("bulb.emitter.radiance.value", initial=20.0, learning_rate=0.5),
             Parameter("mural.bsdf.reflectance.data", initial=0.5),
@@ -71,7 +71,7 @@ class Lamp:
 
 
 def _shade_points(columns: int) -> np.ndarray:
-    """A cone, closed at the top, that ends level with the middle of the bulb."""
+    """Return a cone, closed at the top, whose lower edge is level with the centre of the bulb."""
     radius = np.array([0.34, 0.3, 0.26, 0.22, 0.18, 0.14, 0.07, 1e-3])
     height = np.array([0.0, 0.06, 0.12, 0.18, 0.24, 0.3, 0.31, 0.31])
     return meshes.lathe(radius, height, columns) + _BULB

@@ -1,4 +1,4 @@
-"""Meshes that a user gives as files: an option of gallery problems, and the file brought to a standard size and place."""
+"""Mesh files from the user as an option of gallery problems, normalised in size and position."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _KINDS = (".ply", ".obj")
 
 
 def option(about: str) -> Any:
-    """A dataclass field: the path of a PLY or OBJ file, or "" for none."""
+    """Return a dataclass field: the path of a PLY or OBJ file, or "" for none."""
     return field(default="", metadata={"kind": str, "about": about, "check": _check})
 
 
 def standing(path: str, bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The file as a Mitsuba dictionary: 1 along its longest side, its lowest point at y = 0, its middle over the origin.
+    """Return the file as a Mitsuba dictionary: longest side 1, lowest point at y = 0, centred over the origin.
 
-    Raises `InputError` where it cannot be read or has no extent.
+    Raises `InputError` if it cannot be read or has no extent.
     """
     low, high = _extent(path)
     scale = 1 / float(np.max(high - low))
@@ -32,9 +32,9 @@ def standing(path: str, bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 def centred(path: str, bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The file as a Mitsuba dictionary: 2 along its longest side, the middle of its bounding box at the origin.
+    """Return the file as a Mitsuba dictionary: longest side 2, centre of its bounding box at the origin.
 
-    Raises `InputError` where it cannot be read or has no extent.
+    Raises `InputError` if it cannot be read or has no extent.
     """
     low, high = _extent(path)
     return _placed(path, bsdf, 2 / float(np.max(high - low)), (low + high) / 2)

@@ -1,4 +1,4 @@
-"""Meshes made in code: sheets of quadrilaterals over grids, flat, bulged, turned on a lathe or swept along a path; spheres of triangles."""
+"""Procedural meshes: smooth sheets over grids (flat, bulged, surfaces of revolution, sweeps), and spheres of triangles."""
 
 from __future__ import annotations
 
@@ -16,14 +16,13 @@ __all__ = ["Sheet", "ellipsoid", "icosphere", "lathe", "sheet", "sheets", "surfa
 
 
 def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool = False) -> Any:
-    """A smooth mesh through a grid of points.
+    """Return a smooth mesh through a grid of points.
 
     Args:
-        name: the mesh's id.
-        positions: (rows, columns, 3); u runs from 0 to 1 along columns, v from 0 to 1 along rows. The front is where
-            columns × rows points to.
-        bsdf: its material.
-        closed: whether the last column lies on the first one (with u = 1 there).
+        name: id of the mesh.
+        positions: (rows, columns, 3); u runs from 0 to 1 along columns, v from 0 to 1 along rows. The front faces columns × rows.
+        bsdf: material.
+        closed: whether the last column coincides with the first one (with u = 1 there).
 
     Returns:
         `mitsuba.Mesh` with normals and texture coordinates; an entry of a scene dictionary.
@@ -33,12 +32,12 @@ def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool =
 
 @dataclass(frozen=True)
 class Sheet:
-    """One of several that make a mesh.
+    """One of several sheets that form a mesh.
 
     Attributes:
-        positions: (rows, columns, 3), as for `sheet`.
-        closed: whether the last column lies on the first one.
-        origin: (u, v) of its first corner; both grow by 1 from there.
+        positions: (rows, columns, 3), as in `sheet`.
+        closed: whether the last column coincides with the first one.
+        origin: (u, v) of its first corner; both increase by 1 from there.
     """
 
     positions: np.ndarray
@@ -47,12 +46,12 @@ class Sheet:
 
 
 def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
-    """Several sheets as one smooth mesh, so that they move as one shape; where they pass through one another, nothing is cut.
+    """Return several sheets as one smooth mesh, so that they move as one shape. Intersecting sheets are not cut.
 
     Args:
-        name: the mesh's id.
-        pieces: at least one; texture coordinates run from 0 to 1 on each, unless it has another origin.
-        bsdf: its material.
+        name: id of the mesh.
+        pieces: at least one sheet; texture coordinates run from 0 to 1 on each, unless it has another origin.
+        bsdf: material.
 
     Returns:
         `mitsuba.Mesh` with normals and texture coordinates; an entry of a scene dictionary.
@@ -68,7 +67,7 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
         coordinates.append(np.stack([u, v], -1).reshape(-1, 2) + np.array(piece.origin))
         normals.append(_normals(piece.positions, piece.closed).reshape(-1, 3))
         count += rows * columns
-    # With normals of its own: Mitsuba's have a crease at the seam.
+    # Explicit normals, because those of Mitsuba have a crease at the seam.
     points, corners, uv = (np.concatenate(of) for of in (positions, faces, coordinates))
     return mesh_layout.build(name, points, corners, np.concatenate(normals), uv, load_described(bsdf))
 
@@ -76,14 +75,14 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
 def triangles(
     name: str, positions: np.ndarray, faces: np.ndarray, bsdf: dict[str, Any], coordinates: np.ndarray | None = None
 ) -> Any:
-    """A smooth mesh of triangles, whose normals follow its vertices when these move.
+    """Return a smooth mesh of triangles, whose normals follow its vertices when these move.
 
     Args:
-        name: the mesh's id.
+        name: id of the mesh.
         positions: (V, 3).
-        faces: (F, 3), vertex numbers, counter-clockwise seen from outside.
-        bsdf: its material.
-        coordinates: (V, 2), of a texture; None for none.
+        faces: vertex indices (F, 3), counter-clockwise seen from outside.
+        bsdf: material.
+        coordinates: texture coordinates, (V, 2); None for none.
 
     Returns:
         `mitsuba.Mesh` with normals; an entry of a scene dictionary.
@@ -92,17 +91,17 @@ def triangles(
 
 
 def surface(mesh: Any) -> Surface:
-    """That of a loaded mesh."""
+    """Return the surface of a loaded mesh."""
     points, faces = np.array(mesh_layout.positions(mesh)), np.array(mesh_layout.faces(mesh))
     return Surface(points.reshape(-1, 3), faces.reshape(-1, 3))
 
 
 def lathe(radius: np.ndarray, height: np.ndarray, columns: int) -> np.ndarray:
-    """The points of a profile turned about the y axis: (rows, columns + 1, 3), closed, facing away from the axis.
+    """Revolve a profile about the y axis: (rows, columns + 1, 3), closed, facing away from the axis.
 
     Args:
-        radius, height: (rows,), of the profile, from bottom to top.
-        columns: how many steps around; u = 0.5 looks towards +z, u = 0.75 towards +x, and the seam towards -z.
+        radius, height: profile from bottom to top, (rows,).
+        columns: number of steps around the axis; u = 0.5 is at +z, u = 0.75 at +x, and the seam at -z.
     """
     angle = np.linspace(-np.pi, np.pi, columns + 1)
     return np.stack(
@@ -116,12 +115,12 @@ def lathe(radius: np.ndarray, height: np.ndarray, columns: int) -> np.ndarray:
 
 
 def sweep(path: np.ndarray, radius: float | np.ndarray, columns: int) -> np.ndarray:
-    """The points of a circle swept along a path in a plane z = constant: (rows, columns + 1, 3), closed, open at its ends.
+    """Sweep a circle along a path in a plane z = constant: (rows, columns + 1, 3), closed, with open ends.
 
     Args:
-        path: (rows, 3), all z alike; no two consecutive points the same.
-        radius: of the circle, one or (rows,); less than the path's radius of curvature.
-        columns: how many steps around.
+        path: (rows, 3), with equal z; consecutive points must differ.
+        radius: radius of the circle, one number or (rows,); less than the path's radius of curvature.
+        columns: number of steps around the circle.
     """
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -133,23 +132,23 @@ def sweep(path: np.ndarray, radius: float | np.ndarray, columns: int) -> np.ndar
 
 
 def ellipsoid(axes: np.ndarray, centre: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """The points of a sphere under a linear map: (rows, columns + 1, 3), closed, facing outward.
+    """Return a linearly mapped sphere: (rows, columns + 1, 3), closed, facing outward.
 
     Args:
-        axes: (3, 3), its columns the half-axes that x, y and z go to, right-handed; the poles lie along the second.
+        axes: half-axes as columns, to which x, y and z are mapped, (3, 3), right-handed; the poles are on the second.
         centre: (3,).
-        rows, columns: of the grid, from pole to pole and around.
+        rows, columns: size of the grid, from pole to pole and around.
     """
     latitude = np.linspace(-np.pi / 2, np.pi / 2, rows)
-    # Not quite to the poles, where a sheet has no normal.
+    # The grid ends before the poles, where a sheet has no normal.
     return lathe(np.maximum(np.cos(latitude), 1e-3), np.sin(latitude), columns) @ np.asarray(axes, float).T + centre
 
 
 def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """The unit sphere as triangles of nearly equal size: positions (10 · 4ˢ + 2, 3) and faces (20 · 4ˢ, 3), facing outward.
+    """Return the unit sphere as triangles of nearly equal size: positions (10 · 4ˢ + 2, 3) and faces (20 · 4ˢ, 3), facing outward.
 
     Args:
-        subdivisions: s, how often each triangle of the icosahedron is cut into four.
+        subdivisions: s, number of subdivisions of the icosahedron.
     """
     from scipy.spatial import ConvexHull
 
@@ -174,27 +173,27 @@ def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unrolled(directions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A sphere of triangles with texture coordinates by longitude and latitude, cut along the seam at -z and at the poles.
+    """Add texture coordinates by longitude and latitude to a sphere of triangles, cut along the seam at -z and at the poles.
 
     Args:
-        directions: (V, 3), unit, as of `icosphere`.
+        directions: unit directions (V, 3), as from `icosphere`.
         faces: (F, 3).
 
     Returns:
-        of which direction each vertex is a copy (W,), faces (F, 3) of these vertices, and their coordinates (W, 2): u grows with the
-        longitude, past 1 at the seam, v with the latitude.
+        The direction index of each new vertex (W,), faces (F, 3), and texture coordinates (W, 2): u increases with longitude, beyond 1 at
+        the seam, v with latitude.
     """
     x, y, z = directions.T
     u, v = np.arctan2(x, z) / (2 * np.pi) + 0.5, 0.5 + np.arcsin(np.clip(y, -1, 1)) / np.pi
     corners = u[faces]
     corners = np.where((np.ptp(corners, axis=1) > 0.5)[:, None] & (corners < 0.5), corners + 1, corners)
     at_pole = np.abs(y[faces]) > 1 - 1e-9
-    beside = np.sum(np.where(at_pole, 0, corners), axis=1) / np.maximum(np.sum(~at_pole, axis=1), 1)
-    corners = np.where(at_pole, beside[:, None], corners)
+    mean_corner = np.sum(np.where(at_pole, 0, corners), axis=1) / np.maximum(np.sum(~at_pole, axis=1), 1)
+    corners = np.where(at_pole, mean_corner[:, None], corners)
     table = np.concatenate([faces.reshape(-1, 1), np.round(corners.reshape(-1, 1), 9)], axis=1)
-    kept, which = np.unique(table, axis=0, return_inverse=True)
-    of = kept[:, 0].astype(np.int64)
-    return of, which.reshape(-1, 3), np.stack([kept[:, 1], v[of]], -1)
+    unique, which = np.unique(table, axis=0, return_inverse=True)
+    of = unique[:, 0].astype(np.int64)
+    return of, which.reshape(-1, 3), np.stack([unique[:, 1], v[of]], -1)
 
 
 def _normals(positions: np.ndarray, closed: bool) -> np.ndarray:

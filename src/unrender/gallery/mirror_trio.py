@@ -1,7 +1,7 @@
-"""`mirror-trio`: how rough a mirror is, from what it shows of three dull things in front of it.
+"""Problem `mirror-trio`: the roughness of a mirror, from its reflection of three diffuse objects.
 
-The variance experiment of the adaptive sampling of pixels (its Fig. 3). One number is unknown, and only the pixels that see the mirror
-tell of it; among them the edges of what is mirrored, and the lamps' bright blurs, tell most.
+The variance experiment of adaptive pixel sampling (Fig. 3 of its paper). One number is unknown, and only pixels of the mirror contain
+information about it, most of all the edges of reflections and the blurred reflections of lamps.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
 _ALPHA = 0.06
-"""The mirror's roughness in truth."""
+"""True roughness of the mirror."""
 
 _LAMPS = {
     "warm": ((-1.9, 1.9, 0.0), (21.0, 17.0, 12.0)),
     "cool": ((1.9, 2.0, 0.1), (12.0, 16.0, 21.0)),
     "near": ((0.3, 1.8, 3.2), (17.0, 15.0, 12.5)),
 }
-"""Place and radiance: at either side of the things, so that their backs are lit too, and near the camera, seen in the mirror."""
+"""Position and radiance: at both sides of the objects, to light their backs, and near the camera, visible in the mirror."""
 
 
 @register(name="mirror-trio", position=8)
 @dataclass(frozen=True)
 class MirrorTrio:
-    """The roughness of a mirror behind three diffuse objects, from a picture of which it fills a part.
+    """The roughness of a mirror behind three diffuse objects, from an image of which it covers a part.
 
-    One view; one unknown, the alpha of a rough conductor, a number. Path gradients see it well; what is hard is to draw the few pixels
-    that hold them, some of which are noisy besides.
+    One view. One unknown, the alpha of a rough conductor, a number. Path gradients reach it well. The difficulty is to sample the few
+    informative pixels, some of which are also noisy.
     """
 
     resolution: int = fields.resolution(64)
@@ -43,7 +43,7 @@ class MirrorTrio:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The things stand on a floor y = 0 around z = 0, the mirror at z = -1 before a wall; the camera at z = 4."""
+        """Return the objects on a floor y = 0 around z = 0, the mirror at z = -1 before a wall, and the camera at z = 4."""
         silver = {"type": "roughconductor", "material": "Ag", "alpha": _ALPHA, "distribution": "ggx"}
         cone = meshes.lathe(*_cone(48), 64) + np.array([-0.02, 0.0, 0.15])
         return {
@@ -72,12 +72,12 @@ class MirrorTrio:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The roughness, that of satin at first; from 0.25 on the loss falls the other way."""
+        """Return the roughness, initially satin; from 0.25 on the loss decreases in the wrong direction."""
         return (Parameter("mirror.bsdf.alpha.value", initial=0.15, bounds=(0.01, 1.0)),)
 
 
 def _lamp(place: np.ndarray, radiance: parts.Vector) -> dict[str, Any]:
-    """A square that faces the things."""
+    """Return a square light that faces the objects."""
     towards = np.array([0, 0.5, 0]) - place
     towards /= np.linalg.norm(towards)
     right = np.cross([0.0, 1.0, 0.0], towards)

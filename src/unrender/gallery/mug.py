@@ -1,8 +1,8 @@
-"""`mug`: how far a cup is turned about its axis, from a picture that shows its handle.
+"""Problem `mug`: the rotation of a cup about its axis, from an image that shows its handle.
 
-After Wang et al., section 4. All but the handle is a solid of revolution, so while the handle is hidden behind the cup, a turn changes
-nothing in the picture. With a label to be recovered, too, it is a pose that calls for perturbed renders and a texture that calls for
-paths: see `estimators/hybrid.py`.
+After Wang et al., section 4. All but the handle is a surface of revolution, so a rotation does not change the image while the handle is
+hidden behind the cup. With an unknown label, the pose needs perturbed renders and the texture needs path gradients: see
+`estimators/hybrid.py`.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
 _SIDE = np.radians(105.0)
-"""Where the handle is in truth: 0 is towards the camera, a right angle to its right."""
+"""True angle of the handle: 0 faces the camera, a right angle is to the camera's right."""
 
 _HIDDEN = np.radians(158.0)
-"""Where it is at the start."""
+"""Initial angle of the handle."""
 
 _LABEL_WIDTH, _LABEL_HEIGHTS = np.radians(100.0), (0.24, 0.86)
-"""Of the label: the angle that it goes around, from and to which height."""
+"""Angle that the label covers, and its lower and upper height."""
 
 _LABEL = "mug.bsdf.brdf_0.bsdf_1.reflectance.data"
 
 _CUP, _ELSEWHERE = (0.0, 0.0), (0.0, 2.0)
-"""Origins of texture coordinates: of the cup, and of what has no label."""
+"""Origins of texture coordinates: of the cup, and of parts without a label."""
 
 
 @register(name="mug", position=17)
 @dataclass(frozen=True)
 class Mug:
-    """How far a cup is turned: one angle, its handle hidden behind it at the start.
+    """The rotation of a cup: one angle, with the handle initially hidden behind it.
 
-    One view; the unknown is the rotation about the vertical and, with `label`, also a texture (label², 3) on the cup's front, from grey. A
-    plateau, and a pit: the picture stays the same until the handle comes out
-    from behind the cup; then the loss rises, on the wrong side for good, on the right side for some 15 degrees, where the handle does
-    not yet lie over its place. A smoothing of about 25 degrees or more (σ) sees beyond.
+    One view. The unknown is the rotation about the vertical and, with `label`, also a texture (label², 3) on the cup's front, initially
+    grey. A plateau with a barrier: the image does not change until the handle appears from behind the cup. Then the loss increases: on
+    the wrong side permanently, on the right side for about 15 degrees, until the handle overlaps its true position. A smoothing of about
+    25 degrees or more (σ) overcomes both.
     """
 
     resolution: int = fields.resolution(48)
@@ -51,7 +51,7 @@ class Mug:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The cup: 1 high, on a table y = 0, around the y axis; the camera and the sun, which is higher, in front of it."""
+        """Return the cup, 1 high, on a table y = 0 around the y axis, with the camera and the higher sun in front of it."""
         pieces, glaze = _pieces(), parts.diffuse(0.75, 0.3, 0.15)
         if self.label:
             glaze = _labelled(glaze, pieces[0].positions, self.label)
@@ -66,30 +66,30 @@ class Mug:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The angle; counted from the truth. The label, grey at first."""
+        """Return the angle relative to the truth, and the label, initially grey."""
         angle = staging.unknown("mug", "rotation", {"y": _HIDDEN - _SIDE})
         return (*angle, Parameter(_LABEL, initial=0.4)) if self.label else tuple(angle)
 
 
 def _turn(angle: float) -> np.ndarray:
-    """The rotation about y that takes +z to +x at a right angle."""
+    """Return the rotation about y that maps +z to +x at a right angle."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 def _labelled(glaze: dict[str, Any], cup: np.ndarray, texels: int) -> dict[str, Any]:
-    """The glaze with a label, which faces the camera in truth.
+    """Return the glaze with a label, which faces the camera in the true scene.
 
     Args:
-        glaze: the material around it.
-        cup: of `_pieces()`.
-        texels: along a side.
+        glaze: material around the label.
+        cup: the cup from `_pieces()`.
+        texels: number of texels along a side.
     """
     outside = np.arange(len(cup)) <= np.argmax(cup[:, 0, 1])
     rows = np.flatnonzero(outside & (cup[:, 0, 1] >= _LABEL_HEIGHTS[0]) & (cup[:, 0, 1] <= _LABEL_HEIGHTS[1]))
     bottom, top = rows[[0, -1]] / (len(cup) - 1)
     width = _LABEL_WIDTH / (2 * np.pi)
-    left = 0.5 - _SIDE / (2 * np.pi) - width / 2  # u = 0.5 looks to the handle
+    left = 0.5 - _SIDE / (2 * np.pi) - width / 2  # u = 0.5 is at the handle
     to = mi.ScalarTransform4f
     inside = to().scale([1 / width, 1 / (top - bottom), 1]) @ to().translate([-left, -bottom, 0])
     upright = to().translate([0, 1, 0]) @ to().scale([1, -1, 1])
@@ -107,8 +107,10 @@ def _labelled(glaze: dict[str, Any], cup: np.ndarray, texels: int) -> dict[str, 
 
 
 def _pieces() -> list[meshes.Sheet]:
-    """Cup, handle (towards +z) and saucer. The saucer reaches farther than the handle, so that the middle of the mesh's bounding box,
-    about which poses turn, lies on the axis."""
+    """Return cup, handle (towards +z) and saucer.
+
+    The saucer extends farther than the handle, so that the centre of the mesh's bounding box, about which poses rotate, is on the axis.
+    """
     cup = [(0, 0.03), (0.2, 0.03), (0.3, 0.04), (0.34, 0.12), (0.4, 0.5), (0.44, 0.98), (0.425, 1), (0.41, 0.98)]
     cup += [(0.37, 0.5), (0.31, 0.15), (0.25, 0.1), (0, 0.1)]
     saucer = [(0, 0.005), (0.5, 0.005), (0.88, 0.075), (0.9, 0.09), (0.87, 0.09), (0.5, 0.03), (0, 0.03)]
@@ -123,7 +125,7 @@ def _pieces() -> list[meshes.Sheet]:
 
 
 def _lathe(knots: list[tuple[float, float]], rows: int) -> np.ndarray:
-    """A profile of straight lines through the knots, evenly sampled, turned."""
+    """Return a polyline profile, evenly sampled, as a surface of revolution."""
     corners = np.array(knots)
     corners[:, 0] = np.maximum(corners[:, 0], 1e-3)
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])

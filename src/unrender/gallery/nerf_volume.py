@@ -1,6 +1,6 @@
-"""`nerf-volume`: a thing of surfaces, fitted by a volume that glows and absorbs. After Balint et al. 2023, Figs 7 and 8.
+"""Problem `nerf-volume`: an object with surfaces, fitted by a volume that emits and absorbs. After Balint et al. 2023, Figs 7 and 8.
 
-The paper's Fig. 8 is of a sparser volume: `balls` has small balls far from each other.
+The paper's Fig. 8 shows a sparser volume: `balls` has small balls far from each other.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from unrender.scene.view import View
 @register(name="nerf-volume", position=25)
 @dataclass(frozen=True)
 class NerfVolume:
-    """A toy of coloured balls and blocks, seen from all around, fitted by a volume that emits and absorbs.
+    """A toy of coloured balls and blocks, seen from all sides, fitted by a volume that emits and absorbs.
 
-    Several views; the unknowns are extinction (grid_resolution³, 1) and emitted radiance (grid_resolution³, 3), from a thin grey
-    glow. Their truth is unknown: the toy has surfaces, and what it shows depends on the direction.
+    Several views. The unknowns are extinction (grid_resolution³, 1) and emitted radiance (grid_resolution³, 3), initially a thin grey
+    glow. There is no true value: the toy has surfaces, and its appearance depends on the direction.
     """
 
     resolution: int = fields.resolution(32)
@@ -40,26 +40,26 @@ class NerfVolume:
     )
 
     def scene(self) -> dict[str, Any]:
-        """The volume, in the cube [-1, 1]³, as the descent starts with it."""
+        """Return the initial volume in the cube [-1, 1]³."""
         size = (self.grid_resolution,) * 3
         density, glow = volumes.grid(np.full((*size, 1), 0.5)), volumes.grid(np.full((*size, 3), 0.4))
         return self._stage() | {"volume": volumes.cube({"type": "emissive", "sigma_t": density, "emission": glow})}
 
     def target(self) -> dict[str, Any]:
-        """The toy in its place, or the balls, in the sun."""
+        """Return the toy, or the balls, in place of the volume, in the sun."""
         return (
             self._stage() | (_balls(self.balls) if self.balls else _toy()) | {"sun": staging.sun((0.5, 0.8, 0.4), 0.9)}
         )
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Both grids; extinction has the wider range, and the larger steps."""
+        """Return both grids; extinction has the wider range, and larger steps."""
         return (
             Parameter("volume.interior_medium.sigma_t.data", learning_rate=0.2),
             Parameter("volume.interior_medium.emission.data"),
         )
 
     def problem(self, name: str) -> Problem:
-        """The problem: the volume's scene, whose light is seen directly, and the toy's pictures by Mitsuba's own `path` integrator."""
+        """Return the problem: the volume's scene, with direct emission only, and references of the toy by Mitsuba's `path` integrator."""
         true = load(self.target)
         pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
         views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
@@ -85,7 +85,7 @@ def _toy() -> dict[str, Any]:
 
 
 def _balls(count: int) -> dict[str, Any]:
-    """Balls that fill a hundredth of the cube, however many they are; the toy fills some thirteenth."""
+    """Return balls that fill a hundredth of the cube for any count; the toy fills about a thirteenth."""
     random = np.random.default_rng(8)
     radius = float((0.01 * 8 / (count * np.pi * 4 / 3)) ** (1 / 3))
     reach = min(0.85, 0.98 - radius)

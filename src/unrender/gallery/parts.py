@@ -1,4 +1,4 @@
-"""Pieces that the gallery's scenes share: the camera, surfaces, lights, as Mitsuba dictionaries."""
+"""Shared parts of gallery scenes, as Mitsuba dictionaries: camera, surfaces, lights."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Vector = Sequence[float] | np.ndarray
 
 
 def camera(origin: Vector, target: Vector, fov: float, resolution: int) -> dict[str, Any]:
-    """A pinhole camera, y upwards, with a square film and a box filter: each pixel's samples are its own.
+    """Return a pinhole camera, y upwards, with a square film and a box filter, so that pixels share no samples.
 
     Args:
-        origin: where it stands.
-        target: what is in the middle of its picture.
+        origin: position of the camera.
+        target: point in the centre of the image.
         fov: full angle in degrees.
         resolution: pixels along a side.
     """
@@ -36,12 +36,12 @@ def camera(origin: Vector, target: Vector, fov: float, resolution: int) -> dict[
 
 
 def rectangle(centre: Vector, right: Vector, up: Vector, bsdf: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """A rectangle that faces `right` × `up`; a texture on it stands upright for who looks at its face.
+    """Return a rectangle that faces `right` × `up`; a texture is upright when viewed from its front.
 
     Args:
-        centre: its middle.
-        right, up: from the middle to the middle of two edges; perpendicular.
-        bsdf: its material.
+        centre: centre of the rectangle.
+        right, up: vectors from the centre to the midpoints of two edges; perpendicular.
+        bsdf: material.
         more: further entries, such as an emitter.
     """
     x, y = np.asarray(right, float), np.asarray(up, float)
@@ -53,31 +53,31 @@ def rectangle(centre: Vector, right: Vector, up: Vector, bsdf: dict[str, Any], *
 
 
 def colour(*rgb: float) -> dict[str, Any]:
-    """A colour in linear RGB; one number is grey."""
+    """Return a colour in linear RGB; one number is grey."""
     return {"type": "rgb", "value": list(rgb) if len(rgb) == 3 else [rgb[0]] * 3}
 
 
 def diffuse(*rgb: float) -> dict[str, Any]:
-    """A diffuse material, seen from one side."""
+    """Return a one-sided diffuse material."""
     return {"type": "diffuse", "reflectance": colour(*rgb)}
 
 
 def twosided(bsdf: dict[str, Any]) -> dict[str, Any]:
-    """The material, on both sides."""
+    """Return the material on both sides."""
     return {"type": "twosided", "bsdf": bsdf}
 
 
 def light(*rgb: float) -> dict[str, Any]:
-    """An area light of that radiance."""
+    """Return an area light of this radiance."""
     return {"type": "area", "radiance": colour(*rgb)}
 
 
 def room(walls: dict[str, Any], left: dict[str, Any], right: dict[str, Any]) -> dict[str, Any]:
-    """A closed room, x and y in [-1, 1], z in [-1, 2.2], its walls facing inward.
+    """Return a closed room, x and y in [-1, 1], z in [-1, 2.2], with walls that face inward.
 
     Args:
-        walls: the material of back, front, floor and ceiling.
-        left, right: of the other two.
+        walls: material of back, front, floor and ceiling.
+        left, right: materials of the other two.
     """
     return {
         "back": rectangle((0, 0, -1), (1, 0, 0), (0, 1, 0), walls),
@@ -90,16 +90,15 @@ def room(walls: dict[str, Any], left: dict[str, Any], right: dict[str, Any]) -> 
 
 
 def uplight(place: Vector, radiance: Sequence[float], name: str = "lamp") -> dict[str, Any]:
-    """A lamp that shines at the ceiling: a small square light at the bottom of a wide box that is open above.
+    """Return a lamp that lights the ceiling: a small square light at the bottom of a wide box that is open at the top.
 
-    From an edge of the light over the opposite edge of the box, light reaches a ceiling 2 above it at most
-    2 (half + opening) / height - half = 0.94 aside of the lamp's axis: no wall that is farther sees any of it. The sides
-    are seen from outside only; inside they are black.
+    Light leaves over the edge of the box and reaches a ceiling 2 above it within 2 (half + opening) / height - half = 0.94 of the lamp's
+    axis, so walls farther away get none of it. The sides are visible from outside only; inside they are black.
 
     Args:
-        place: the middle of the light.
+        place: centre of the light.
         radiance: RGB.
-        name: what its pieces' names begin with.
+        name: prefix of the parts' names.
     """
     x, y, z = (float(v) for v in place)
     half, opening, height = 0.03, 0.115, 0.3
@@ -118,20 +117,20 @@ def uplight(place: Vector, radiance: Sequence[float], name: str = "lamp") -> dic
 
 
 CLEAR = ((0.12, 0.25, 0.6), (0.65, 0.7, 0.75), (0.2, 0.18, 0.15))
-"""Of zenith, horizon, and what is below it: noon over bare ground."""
+"""Radiance of zenith, horizon, and below the horizon: noon over bare ground."""
 
 
 def picture(
     sun: Vector, radius: float, radiance: Vector, colours: Sequence[Vector] = CLEAR, rows: int = 128
 ) -> np.ndarray:
-    """A sky with a sun: (rows, 2 rows, 3) float32 radiance, the zenith in its first row.
+    """Return a sky with a sun: (rows, 2 rows, 3) float32 radiance, with the zenith in its first row.
 
     Args:
-        sun: direction to the sun, of length 1.
-        radius: of the sun, an angle in radians; a texel belongs to it where its middle does.
+        sun: unit direction to the sun.
+        radius: angular radius of the sun in radians; a texel belongs to it if its centre does.
         radiance: RGB of the sun.
-        colours: RGB radiance of zenith, horizon, and what is below it.
-        rows: of the picture.
+        colours: RGB radiance of zenith, horizon, and below the horizon.
+        rows: number of rows.
     """
     columns = 2 * rows
     theta = np.pi * (np.arange(rows)[:, None] + 0.5) / rows
@@ -149,5 +148,5 @@ def picture(
 
 
 def environment(values: np.ndarray) -> dict[str, Any]:
-    """The light of a picture, the y axis upwards, as a Mitsuba dictionary."""
+    """Return an environment map, with the y axis upwards, as a Mitsuba dictionary."""
     return {"type": "envmap", "bitmap": mi.Bitmap(values), "to_world": mi.ScalarTransform4f()}

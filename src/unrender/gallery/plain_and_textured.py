@@ -1,7 +1,8 @@
-"""`plain-and-textured`: the one colour of a waste bin and the picture on a cushion, in one room.
+"""Problem `plain-and-textured`: the colour of a waste bin and the texture of a cushion, in one room.
 
-The case for several resolutions in the adaptive sampling of pixels (its Fig. 5). Each pixel of the bin moves the same three numbers, each
-pixel of the cushion numbers of its own: judged one by one, both seem to deserve as many samples, while the bin needs next to none.
+The case for several resolutions in adaptive pixel sampling (Fig. 5 of its paper). All pixels of the bin depend on the same three numbers,
+whereas the pixels of the cushion depend on different ones. Judged individually, both seem to deserve as many samples, although the bin
+needs almost none.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from unrender.scene.parameter import Parameter
 @register(name="plain-and-textured", position=10)
 @dataclass(frozen=True)
 class PlainAndTextured:
-    """The colour of a bin and the texture of a cushion in a box of a room, found together.
+    """The colour of a bin together with the texture of a cushion, in a room.
 
-    One view; two unknown reflectances, (3,) and (texture_resolution², 3), from grey, the texture with LargeSteps.
+    One view. Two unknown reflectances, (3,) and (texture_resolution², 3), initially grey, the texture with LargeSteps.
     """
 
     resolution: int = fields.resolution(64)
@@ -33,7 +34,7 @@ class PlainAndTextured:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The room of `parts.room`, a lamp in its ceiling, bin and cushion on its floor y = -1."""
+        """Return the room of `parts.room` with a lamp in its ceiling, and bin and cushion on its floor y = -1."""
         cover = {
             "type": "diffuse",
             "reflectance": textures.bitmap(textures.photograph("chelsea", self.texture_resolution)),
@@ -53,7 +54,7 @@ class PlainAndTextured:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Both reflectances, grey at first."""
+        """Return both reflectances, initially grey."""
         return (
             Parameter("bin.bsdf.brdf_0.reflectance.value", initial=0.5),
             Parameter("cushion.bsdf.brdf_0.reflectance.data", initial=0.5, preconditioner=LargeSteps(1.0)),
@@ -61,15 +62,15 @@ class PlainAndTextured:
 
 
 def _bin(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radius and height of a bin with a rim, open above, without a bottom that anyone could see."""
+    """Return radius and height of a bin with a rim, open at the top, without a visible bottom."""
     t = np.linspace(0, 1, rows)
     return 0.26 + 0.1 * t + 0.03 * textures.ramp(t, 0.9, 0.94), 0.85 * t
 
 
 def _cushion(steps: int) -> np.ndarray:
-    """A pillow that leans back, turned a little to the left: points (steps, steps, 3)."""
+    """Return a pillow that leans back, rotated a little to the left: points (steps, steps, 3)."""
     y, x = np.meshgrid(np.linspace(-1, 1, steps), np.linspace(-1, 1, steps), indexing="ij")
-    # Thin seams that draw in between the corners.
+    # Thin seams that curve inwards between the corners.
     bulge = 0.22 * np.sqrt(np.clip((1 - x**2) * (1 - y**2), 0, None))
     x, y = x * (1 - 0.08 * (1 - y**2)), y * (1 - 0.08 * (1 - x**2))
     flat = np.stack([0.47 * x, 0.47 * y, bulge], -1)

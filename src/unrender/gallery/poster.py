@@ -1,7 +1,7 @@
-"""`poster`: the grey texture of a poster in direct light, many unknowns that hardly touch one another.
+"""Problem `poster`: the grey texture of a poster in direct light, with many nearly independent unknowns.
 
-TEXTURE of Wang et al., section 4: what shows how derivatives from perturbed renders fare as dimensions grow, and why no n × n matrix
-may be formed. Path gradients, which cost the same for any number of texels, solve it with ease.
+TEXTURE of Wang et al., section 4. It shows how derivatives from perturbed renders scale with the dimension, and why an n × n matrix must
+not be formed. Path gradients, whose cost does not depend on the number of texels, solve it easily.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from unrender.scene.parameter import Parameter
 @register(name="poster", position=20)
 @dataclass(frozen=True)
 class Poster:
-    """The grey texture of a poster that a lamp lights directly.
+    """The grey texture of a poster in direct light.
 
-    One view; one unknown, the reflectance (texture_resolution², 1), from one grey: 1024 numbers by default. The loss is a convex
-    quadratic in them, smooth and without a plateau; their number is what is hard where derivatives come from perturbations. Texels are
-    not blended: with as many pixels each has its own, and the Hessian is diagonal.
+    One view. One unknown, the reflectance (texture_resolution², 1), initially constant: 1024 numbers by default. The loss is a convex
+    quadratic, smooth and without a plateau. Their number is the difficulty for derivatives from perturbations. Texels are not
+    interpolated: with as many pixels, each texel has its own, and the Hessian is diagonal.
     """
 
     resolution: int = fields.resolution(64)
@@ -34,9 +34,9 @@ class Poster:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The poster: x and y in [-1, 1] at z = 0, filling the picture; the lamp before it, above the camera's field."""
+        """Return the poster, x and y in [-1, 1] at z = 0, filling the image, with the lamp before it, above the field of view."""
         picture = textures.photograph("astronaut", self.texture_resolution).mean(axis=2, keepdims=True)
-        # Texels are squares. Between texels blended into one another no picture tells the finest pattern from the grey that it averages to.
+        # Texels are squares. With interpolation, no image would distinguish the finest pattern from its mean grey.
         texels = textures.bitmap(picture.astype(np.float32)) | {"filter_type": "nearest"}
         paint = {"type": "diffuse", "reflectance": texels}
         down = np.array([0.0, -0.6, -0.8])
@@ -54,5 +54,5 @@ class Poster:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The texture, grey at first."""
+        """Return the texture, initially grey."""
         return (Parameter("poster.bsdf.reflectance.data", initial=0.5),)

@@ -1,4 +1,4 @@
-"""`quad`: the smooth quadratic of Wang et al., section 4, which needs no renderer."""
+"""Problem `quad`: the smooth quadratic of Wang et al., section 4, without a renderer."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _START = (1.5, 1.0)
 class Quad:
     """The minimum of 5 x₀² + 5 x₁² + 7.5 x₀ x₁, a narrow smooth valley: no renderer, no noise.
 
-    Two unknowns, x (2,); the minimum is 0 at 0, the start (1.5, 1). With L2, the default, the loss is the polynomial itself. Its Hessian
-    has eigenvalues 17.5 and 2.5, along (1, 1) and (1, −1): seven to one, so that steepest descent zigzags and Newton's method is there
-    in one step.
+    Two unknowns, x (2,). The minimum is 0 at 0, the start is (1.5, 1). With L2, the default, the loss is the polynomial itself. Its
+    Hessian has eigenvalues 17.5 and 2.5, along (1, 1) and (1, −1). At this ratio of seven, steepest descent zigzags, whereas Newton's
+    method needs one step.
     """
 
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def problem(self, name: str) -> Problem:
-        """The problem: a picture of one pixel that should be black."""
+        """Return the problem, with a black image of one pixel as reference."""
         return Problem(
             QuadraticRenderer(_MATRIX, np.zeros(2)),
             [Parameter(POINT, initial=np.array(_START))],

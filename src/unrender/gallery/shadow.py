@@ -1,7 +1,7 @@
-"""`shadow`: where a ball floats that no camera sees, from its shadow on the floor.
+"""Problem `shadow`: the position of a floating ball outside of the image, from its shadow on the floor.
 
-After Wang et al., section 4. What casts a shadow gets no gradient through it, since visibility is a step; and where the shadow does not
-overlap its place in the reference, even the true loss is flat.
+After Wang et al., section 4. A shadow caster gets no path gradient from its shadow, because visibility is discontinuous. Where the shadow
+does not overlap its true position, even the true loss is flat.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ _SUN = np.array([0.4, 1.0, -0.25])
 _HEIGHT = 4.0
 _RADIUS = 0.32
 _TRUTH, _START = (0.4, -0.3), (-0.45, 0.35)
-"""Of the middle of the shadow: x and z."""
+"""True centre of the shadow: x and z."""
 _REACH = 0.6
-"""How far the shadow may be from the middle of the picture in x and in z."""
+"""Largest distance of the shadow from the centre of the image, in x and in z."""
 
 
 @register(name="shadow", position=18)
 @dataclass(frozen=True)
 class Shadow:
-    """Where a ball outside the picture is: two numbers, from its shadow, which starts beside the one sought.
+    """The position of a ball outside of the image: two numbers, from its shadow, which initially does not overlap the true one.
 
-    One view; the unknowns are x and z of the ball's translation, kept where all of its shadow is in the picture. A plateau: the loss does
-    not change until the shadows overlap. The renderer's path gradient is zero everywhere.
+    One view. The unknowns are x and z of the ball's translation, bounded so that its shadow is in the image. A plateau: the loss does not
+    change until the shadows overlap. The renderer's path gradient is zero everywhere.
     """
 
     resolution: int = fields.resolution(48)
@@ -41,7 +41,7 @@ class Shadow:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The floor y = 0; the camera below the ball, looking straight down, so that the shadow looks the same wherever it is."""
+        """Return the floor y = 0, with the camera below the ball, looking straight down, so that the shadow's shape does not change."""
         above = (0, 3.2, 0)
         x, z = np.array(_TRUTH) + _HEIGHT * _SUN[[0, 2]] / _SUN[1]
         return {
@@ -59,8 +59,8 @@ class Shadow:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The ball's place above the floor, from the truth."""
-        found: list[Parameter] = []
+        """Return the ball's position above the floor, relative to the truth."""
+        unknowns: list[Parameter] = []
         for axis, truth, start in zip("xz", _TRUTH, _START, strict=True):
-            found += staging.unknown("ball", "translation", {axis: start - truth}, (-_REACH - truth, _REACH - truth))
-        return tuple(found)
+            unknowns += staging.unknown("ball", "translation", {axis: start - truth}, (-_REACH - truth, _REACH - truth))
+        return tuple(unknowns)

@@ -1,6 +1,6 @@
-"""`shadow-art`: one body that casts two given shadows.
+"""Problem `shadow-art`: one body that casts two given shadows.
 
-After Mitra and Pauly 2009, "Shadow Art". No camera sees the body: all that is known of it is where it keeps light from two walls.
+After Mitra and Pauly 2009, "Shadow Art". No camera sees the body, only its shadows on two walls.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _SPACING = 0.05
 @register(name="shadow-art", position=29)
 @dataclass(frozen=True)
 class ShadowArt:
-    """One body whose shadows are a heart on one wall and a fir tree on the other, by moving every vertex of a sphere.
+    """A body whose shadows are a heart on one wall and a fir tree on the other, by moving every vertex of a sphere.
 
-    Two views, each of a wall with the shadow of one sun; the unknown is the sphere's vertex positions, (3 V,) with V = 10 ·
-    4^subdivisions + 2. No picture shows the body. Many bodies cast these shadows, and none is the truth: its errors are those of the
-    pictures. What is hard is that gradients come from the edges of shadows alone, and that each vertex serves two of them.
+    Two views, each of a wall with the shadow of one sun. The unknown is the sphere's vertex positions, (3 V,) with V = 10 ·
+    4^subdivisions + 2. No image shows the body. Many bodies cast these shadows, so there is no true value; errors are those of the
+    images. The difficulty is that gradients come from shadow boundaries only, and that each vertex affects two of them.
     """
 
     resolution: int = fields.resolution(64)
@@ -41,27 +41,30 @@ class ShadowArt:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The sphere between two suns and two walls."""
+        """Return the sphere between two suns and two walls."""
         points, faces = meshes.icosphere(self.subdivisions)
         return self._stage() | {"sphere": meshes.triangles("sphere", _RADIUS * points, faces, _clay())}
 
     def target(self) -> dict[str, Any]:
-        """The same with a body in place of the sphere: all that casts no light but on the two outlines."""
+        """Return the same scene with a body in place of the sphere: the largest body with the two outlines."""
         points, faces = blobs.around(_depth, (-1.2, -1.2, -1.2), (1.2, 1.2, 1.2), _SPACING)
         return self._stage() | {"body": meshes.triangles("body", points, faces, _clay())}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The vertices, where the sphere has them."""
+        """Return the vertices of the sphere."""
         return (Parameter("sphere.vertex_positions"),)
 
     def problem(self, name: str) -> Problem:
-        """The problem: the sphere's scene, and the pictures of the two shadows by Mitsuba's own `path` integrator."""
+        """Return the problem: the sphere's scene, and references of the two shadows by Mitsuba's `path` integrator."""
         true = load(self.target)
         views = [View(reference(true, view, self.reference_spp, self.max_depth), view) for view in range(2)]
         return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name)
 
     def _stage(self) -> dict[str, Any]:
-        """Each camera stands between the body and a wall, and looks at the wall; each sun shines on one wall alone."""
+        """Return suns, walls and cameras.
+
+        Each camera is between the body and a wall, and faces the wall; each sun lights one wall only.
+        """
         wall, half = parts.diffuse(0.7, 0.65, 0.55), 1.7
         return {
             "type": "scene",
@@ -79,20 +82,20 @@ def _clay() -> dict[str, Any]:
 
 
 def _depth(points: np.ndarray) -> np.ndarray:
-    """In what the two outlines have in common, swept along z and x."""
+    """Return the depth in the intersection of the two outlines, extruded along z and x."""
     x, y, z = points.T
     return np.minimum(_heart(x, y), _fir(z, y))
 
 
 def _heart(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Positive inside the curve (a² + b² − 1)³ = a² b³, y from -1 to 1; about a distance near it."""
+    """Return a depth, positive inside of the curve (a² + b² − 1)³ = a² b³, y from -1 to 1; approximately a distance near it."""
     a, b = 1.16 * x, 1.1 * y + 0.12
     value = np.square(a) * b**3 - (np.square(a) + np.square(b) - 1) ** 3
     return 0.2 * np.cbrt(value)
 
 
 def _fir(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Three tiers on a trunk, y from -1 to 1."""
+    """Return the depth in three tiers on a trunk, y from -1 to 1."""
     tiers = [
         np.minimum((top - y) * slope - np.abs(x), y - foot)
         for top, foot, slope in ((1.0, 0.3, 0.75), (0.6, -0.2, 0.8), (0.2, -0.7, 0.8))

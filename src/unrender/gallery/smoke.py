@@ -1,7 +1,7 @@
-"""`smoke`: density and colour of a cloud of smoke, seen from all around.
+"""Problem `smoke`: density and colour of a cloud of smoke, seen from all sides.
 
-After Nicolet et al. 2023, Figs 5 and 11. Most of the cube is empty, some of it dense: light is scattered many times there, and where
-the descent has emptied a voxel, collisions alone would never tell that smoke is missing.
+After Nicolet et al. 2023, Figs 5 and 11. Most of the cube is empty, and some of it dense, with multiple scattering. In a voxel that the
+optimisation has emptied, collisions alone would never show that smoke is missing.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from unrender.scene.parameter import Parameter
 @register(name="smoke", position=24)
 @dataclass(frozen=True)
 class Smoke:
-    """Density and colour of a cloud of smoke under a bright sky, seen from all around.
+    """Density and colour of a cloud of smoke under a bright sky, seen from all sides.
 
-    Several views; the unknowns are extinction (grid_resolution³, 1) and albedo (grid_resolution³, 3), from a thin grey fog.
+    Several views. The unknowns are extinction (grid_resolution³, 1) and albedo (grid_resolution³, 3), initially a thin grey fog.
     """
 
     resolution: int = fields.resolution(32)
@@ -34,7 +34,7 @@ class Smoke:
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The smoke, in the cube [-1, 1]³."""
+        """Return the smoke in the cube [-1, 1]³."""
         density, colour = _smoke(self.grid_resolution)
         medium = {
             "type": "heterogeneous",
@@ -50,7 +50,7 @@ class Smoke:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Both grids; extinction has the wider range, and the larger steps."""
+        """Return both grids; extinction has the wider range, and larger steps."""
         return (
             Parameter("smoke.interior_medium.sigma_t.data", initial=0.4, learning_rate=0.1),
             Parameter("smoke.interior_medium.albedo.data", initial=0.6),
@@ -58,7 +58,8 @@ class Smoke:
 
 
 def _smoke(resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Extinction (Z, Y, X, 1), from 0 to 6 or so, and albedo (Z, Y, X, 3): a plume that rises and spreads, ochre below and blue above."""
+    """Return extinction (Z, Y, X, 1), from 0 to about 6, and albedo (Z, Y, X, 3): a rising and spreading plume, ochre below, blue
+    above."""
     x, y, z = volumes.positions(resolution)
     lean = 0.25 * np.sin(2 * y)
     radius = np.hypot(x - lean, z) / (0.55 + 0.25 * y)
@@ -71,7 +72,7 @@ def _smoke(resolution: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sky() -> np.ndarray:
-    """A latitude-longitude picture, the zenith in its first row: bright and warm on one side, dim and blue on the other."""
+    """Return a latitude-longitude image with the zenith in its first row: bright and warm on one side, dim and blue on the other."""
     rows = 32
     theta = np.pi * (np.arange(rows)[:, None] + 0.5) / rows
     phi = 2 * np.pi * (np.arange(2 * rows)[None, :] + 0.5) / (2 * rows)

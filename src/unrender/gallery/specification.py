@@ -1,7 +1,7 @@
-"""From a specification, the true scene and the parameters to recover, to a problem with references and truth.
+"""Construction of a problem with references and true values from a specification: true scene and unknown parameters.
 
-Reference images are cached between processes. The key of an image is all that decides it: the numbers and the structure of the loaded
-scene, the sensor, samples, path length, and the versions of what renders it. A file that cannot be read is rendered anew and replaced.
+Reference images are cached between processes. The key of an image contains everything that determines it: numbers and structure of the
+loaded scene, sensor, samples, path length, and software versions. A file that cannot be read is rendered again and replaced.
 """
 
 from __future__ import annotations
@@ -38,35 +38,35 @@ from unrender.scene.view import View
 _FORMAT = 2
 _NAME = "reference"
 _ADDRESS = re.compile(r"\bobject_\d+|0x[0-9a-f]+|\[\d{9,}\]")
-"""Parts of a scene's description that differ from one load to the next."""
+"""Parts of a scene's description that differ between loads."""
 _SAMPLER = re.compile(r"^\s*(sample_count|samples_per_wavefront|wavefront_size) = .*\n", re.MULTILINE)
-"""What a rendering leaves behind in a sampler, and the next one sets."""
+"""State that a rendering leaves in a sampler, and that the next one sets."""
 
 
 def recall(scene: Any, sensor: int, spp: int, max_depth: int, render: Callable[[], np.ndarray]) -> np.ndarray:
-    """The image of the cache, else what `render` returns, which is kept there.
+    """Return the cached image, or the result of `render`, which is then cached.
 
     Args:
-        scene: a loaded Mitsuba scene.
-        sensor, spp, max_depth: how it is rendered.
-        render: makes the image, (H, W, 3) float32.
+        scene: loaded Mitsuba scene.
+        sensor, spp, max_depth: rendering settings.
+        render: function that returns the image, (H, W, 3) float32.
     """
     place = cache.folder(cache.REFERENCES)
     if place is None:
         return render()
     path = place / f"{digest(scene, sensor, spp, max_depth)}.npz"
     width, height = scene.sensors()[sensor].film().crop_size()
-    found = _read(path, (int(height), int(width), 3))
-    if found is None:
-        found = render()
-        with contextlib.suppress(InputError):  # a full disk: the image is there all the same
-            files.write_arrays(path, {_NAME: found})
+    image = _read(path, (int(height), int(width), 3))
+    if image is None:
+        image = render()
+        with contextlib.suppress(InputError):  # on a full disk the image is just not cached
+            files.write_arrays(path, {_NAME: image})
             cache.trim(place, cache.LARGEST[cache.REFERENCES])
-    return found
+    return image
 
 
 def digest(scene: Any, sensor: int, spp: int, max_depth: int) -> str:
-    """A name for the image: SHA-256 of what decides it."""
+    """Return a name for the image: the SHA-256 of everything that determines it."""
     state = hashlib.sha256()
     versions = [f"{name} {metadata.version(name)}" for name in ("mitsuba", "drjit")]
     facts = [
@@ -97,25 +97,25 @@ def _bytes(value: Any) -> bytes:
 
 
 def _read(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
-    """The image, or None where there is none that can be used."""
+    """Return the image, or None if there is no usable one."""
     if not path.exists():
         return None
     try:
-        found = bounded_files.read_float_arrays(path, path.parent).get(_NAME)
+        image = bounded_files.read_float_arrays(path, path.parent).get(_NAME)
     except InputError:
         return None
-    if found is None or found.shape != shape or found.dtype != np.float32:
+    if image is None or image.shape != shape or image.dtype != np.float32:
         return None
     with contextlib.suppress(OSError):
-        os.utime(path)  # used just now
-    return found
+        os.utime(path)  # marks it as recently used
+    return image
 
 
 _LANES = 1 << 21
-"""Paths per pass of a reference: as many as fit a small machine's memory."""
+"""Paths per pass of a reference, within the memory of a small machine."""
 
 _REFERENCE = Key(seed=0x9A11E47)
-"""The source of the references' seeds: none of a run whose seeds count from 0."""
+"""Base of the references' seeds, distinct from those of runs, which count from 0."""
 
 
 class Specification(Protocol):
@@ -133,38 +133,38 @@ class Specification(Protocol):
 
     @property
     def max_depth(self) -> int:
-        """Longest light path in segments."""
+        """Maximum path length in segments."""
         ...
 
     @property
     def loss(self) -> Loss:
-        """Between rendered and reference images."""
+        """Loss between rendered and reference images."""
         ...
 
     def scene(self) -> dict[str, Any]:
-        """The true scene as a Mitsuba dictionary, a new one at each call. Called after a variant is set."""
+        """Return the true scene as a new Mitsuba dictionary. Called after a variant is set."""
         ...
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The unknown parameters with their initial values."""
+        """Return the unknown parameters with their initial values."""
         ...
 
 
 @runtime_checkable
 class ProblemSource(Protocol):
-    """A gallery problem that makes its problem itself: one without a renderer, or with references of another scene."""
+    """A gallery problem with its own construction: without a renderer, or with references of another scene."""
 
     def problem(self, name: str) -> Problem:
-        """The problem with these options and this name."""
+        """Return the problem with these options and this name."""
         ...
 
 
 def build_problem(name: str, specification: Specification) -> Problem:
-    """The problem: truth from the scene, one view per sensor, references by Mitsuba's own integrators.
+    """Return the problem: true values from the scene, one view per sensor, references by Mitsuba's integrators.
 
     Args:
-        name: of the problem.
-        specification: with its options.
+        name: name of the problem.
+        specification: specification with its options.
     """
     ensure()
     renderer = MitsubaRenderer(specification.scene, specification.max_depth)
@@ -179,12 +179,10 @@ def build_problem(name: str, specification: Specification) -> Problem:
 
 
 def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
-    """A reference image by Mitsuba's `path` integrator, or `volpath` where there are media: (H, W, 3) float32. Unbiased.
+    """Return a reference image by Mitsuba's `path` integrator, or `volpath` with media: (H, W, 3) float32. Unbiased.
 
-    By the film's reconstruction filter.
-
-    `spp` samples or a few more, in equal passes, as many as memory requires. Equal arguments give equal images, which are kept
-    in the cache folder (`backend.cache`).
+    It uses the film's reconstruction filter, and `spp` samples or slightly more, in as many equal passes as memory requires. Equal
+    arguments give equal images, which are stored in the cache folder (`backend.cache`).
     """
     with phases.phase("reference images") as advance:
         return recall(scene, sensor, spp, max_depth, lambda: _render(scene, sensor, spp, max_depth, advance))
@@ -197,7 +195,7 @@ def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable
     width, height = (int(size) for size in camera.film().crop_size())
     numbers, take = "independent", -(-spp // -(-spp * width * height // _LANES))
     if not volumes:
-        # As good as 1.4 to 14 times as many independent samples on the gallery; in media, hardly better.
+        # Equivalent to 1.4 to 14 times as many independent samples on the gallery; in media, hardly better.
         numbers, take = "multijitter", _grid(take)
     sampler = mi.load_dict({"type": numbers, "sample_count": take})
     sampler.set_samples_per_wavefront(take)
@@ -218,6 +216,6 @@ def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable
 
 
 def _grid(count: int) -> int:
-    """The least number of cells, at least `count`, of a grid of n by n or n by n + 1."""
+    """Return the smallest number of cells, at least `count`, of a grid of n by n or n by n + 1."""
     side = math.isqrt(count)
     return next(cells for cells in (side * side, side * (side + 1), (side + 1) ** 2) if cells >= count)

@@ -1,4 +1,4 @@
-"""`sphere-to-bunny`: the shape of an animal, from pictures all around it under light that is known, by moving the vertices of a sphere."""
+"""Problem `sphere-to-bunny`: the shape of an animal, from images from all sides under known light, by moving the vertices of a sphere."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ _BLEND = 0.02
 @register(name="sphere-to-bunny", position=28)
 @dataclass(frozen=True)
 class SphereToBunny:
-    """The shape of a sitting hare with two long ears, from pictures all around it, by moving every vertex of a sphere.
+    """The shape of a sitting hare with two long ears, from images from all sides, by moving every vertex of a sphere.
 
-    Several views; the unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2. The light is known: a sky and a
-    sun. Where a vertex belongs is not defined; errors are distances between surfaces. What is hard is that the ears have to grow out of
-    a sphere that does not have them, and that the gap between them shows in few pictures.
+    Several views. The unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2. The light is known: a sky and a
+    sun. True positions of vertices are undefined; errors are distances between surfaces. The difficulty is that the ears must grow out of
+    a sphere, and that few images show the gap between them.
     """
 
     resolution: int = fields.resolution(64)
@@ -55,22 +55,22 @@ class SphereToBunny:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The sphere under the sky and the sun."""
+        """Return the sphere under the sky and the sun."""
         points, faces = meshes.icosphere(self.subdivisions)
         return self._stage() | {"sphere": meshes.triangles("sphere", _CENTRE + _RADIUS * points, faces, _fur())}
 
     def target(self) -> dict[str, Any]:
-        """The same with the animal in place of the sphere."""
+        """Return the same scene with the animal in place of the sphere."""
         if self.mesh:
             return self._stage() | {"body": mesh_files.centred(self.mesh, _fur())}
         return self._stage() | {"body": meshes.triangles("body", *_animal(), _fur())}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The vertices, where the sphere has them."""
+        """Return the vertices of the sphere."""
         return (Parameter("sphere.vertex_positions", remeshing=(self.remesh_at,) if self.remesh_at else None),)
 
     def problem(self, name: str) -> Problem:
-        """The problem: the sphere's scene, the animal's pictures by Mitsuba's own `path` integrator, and its surface."""
+        """Return the problem: the sphere's scene, references of the animal by Mitsuba's `path` integrator, and its surface."""
         true = load(self.target)
         pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
         views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
@@ -81,7 +81,7 @@ class SphereToBunny:
     def _stage(self) -> dict[str, Any]:
         angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
         heights = np.where(np.arange(self.views) % 2 == 0, 0.4, 2.0)
-        fov = 44.0 if self.mesh else 36.0  # a file may fill all of its box
+        fov = 44.0 if self.mesh else 36.0  # a mesh from a file may fill its bounding box
         return {
             "type": "scene",
             **{

@@ -1,7 +1,7 @@
-"""`sphere-to-mesh`: the shape of a body, from pictures all around it, by moving the vertices of a sphere.
+"""Problem `sphere-to-mesh`: the shape of a body, from images from all sides, by moving the vertices of a sphere.
 
-After Wang et al., Fig. 5. Where a vertex belongs is not defined, only what surface all of them make: many arrangements give the same
-pictures, and none is the truth.
+After Wang et al., Fig. 5. True positions of vertices are undefined, only their surface is: many vertex distributions give the same
+images.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
 _RADIUS = 0.7
-"""Of the sphere; the body fits into a ball of radius 1 or so."""
+"""Radius of the sphere; the body fits into a ball of radius about 1."""
 
 
 @register(name="sphere-to-mesh", position=21)
 @dataclass(frozen=True)
 class SphereToMesh:
-    """The shape of a body seen from all around, by moving every vertex of a sphere.
+    """The shape of a body seen from all sides, by moving every vertex of a sphere.
 
-    Several views; the unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2, from a sphere at the body's
-    middle. Their truth is unknown: vertices may slide along the surface. What is hard is their number, that most of what pictures tell
-    of a shape is in its silhouettes and shadows, and that nothing keeps the mesh smooth but large steps (`strength`).
+    Several views. The unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2, initially a sphere at the body's
+    centre. There is no true value: vertices may slide along the surface. The difficulty is their number, that most information about a
+    shape is in its silhouettes and shadows, and that only large steps (`strength`) keep the mesh smooth.
     """
 
     resolution: int = fields.resolution(48)
@@ -45,24 +45,25 @@ class SphereToMesh:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The sphere floating over a floor, under a sun, the cameras looking down: on its dark side too, the floor shows its outline."""
+        """Return the sphere floating over a floor, under a sun, with cameras that look down, so that the floor shows its dark side's
+        outline."""
         points, faces = meshes.icosphere(self.subdivisions)
         return self._stage() | {"sphere": meshes.triangles("sphere", _RADIUS * points, faces, _clay())}
 
     def target(self) -> dict[str, Any]:
-        """The same with the body in place of the sphere."""
+        """Return the same scene with the body in place of the sphere."""
         if self.mesh:
             return self._stage() | {"body": mesh_files.centred(self.mesh, _clay())}
         points, faces = meshes.icosphere(5)
         return self._stage() | {"body": meshes.triangles("body", _body(points), faces, _clay())}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The vertices, where the sphere has them."""
+        """Return the vertices of the sphere."""
         smooth = LargeSteps(float(self.strength)) if self.strength else None
         return (Parameter("sphere.vertex_positions", preconditioner=smooth),)
 
     def problem(self, name: str) -> Problem:
-        """The problem: the sphere's scene, and the body's pictures by Mitsuba's own `path` integrator."""
+        """Return the problem: the sphere's scene, and references of the body by Mitsuba's `path` integrator."""
         true = load(self.target)
         pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
         views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
@@ -89,7 +90,7 @@ def _clay() -> dict[str, Any]:
 
 
 def _body(directions: np.ndarray) -> np.ndarray:
-    """A pear with a bent neck and a dent in its side, from the unit sphere: (V, 3)."""
+    """Return a pear with a bent neck and a dent in its side, from unit directions: (V, 3)."""
     x, y, z = directions.T
     neck = textures.ramp(y, -0.1, 0.9)
     width = 0.78 - 0.42 * neck - 0.18 * np.exp(-((x - 0.9) ** 2 + (y + 0.2) ** 2 + z**2) / 0.12)

@@ -1,7 +1,7 @@
-"""`spiral`: a glossy ribbon wound into a spiral, its colour, metalness and roughness unknown all at once.
+"""Problem `spiral`: a glossy spiral ribbon with unknown colour, metalness and roughness.
 
-After Balint et al. 2023, Fig. 1. The three trade against one another: a darker metal and a rougher dielectric look alike from one
-side. The ribbon is lit by two lamps in shades, off the ceiling and the upper walls, and by its own windings: every sample is noisy.
+After Balint et al. 2023, Fig. 1. The three are correlated: from one side, a darker metal and a rougher dielectric look alike. Two shaded
+lamps light the ribbon via the ceiling and the upper walls, and it reflects itself: every sample is noisy.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _TURNS = 2.5
 @register(name="spiral", position=5)
 @dataclass(frozen=True)
 class Spiral:
-    """Base colour, metalness and roughness of a glossy spiral ribbon, all at once, by indirect light.
+    """Base colour, metalness and roughness of a glossy spiral ribbon, together, by indirect light.
 
-    One view; five unknown numbers, or three maps of texture_resolution² texels, each from one value.
+    One view. Five unknown numbers, or three maps of texture_resolution² texels, initially constant.
     """
 
     resolution: int = fields.resolution(96)
@@ -34,7 +34,8 @@ class Spiral:
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The room: x and y in [-1, 1], z in [-1, 2.2]; the spiral around the y axis, the camera inside, looking along -z."""
+        """Return the room: x and y in [-1, 1], z in [-1, 2.2], with the spiral around the y axis, and the camera inside, looking along
+        -z."""
         return {
             "type": "scene",
             "camera": parts.camera((0, 0.55, 2.1), (0, -0.12, 0), 36.0, self.resolution),
@@ -45,14 +46,14 @@ class Spiral:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Colour, metalness and roughness."""
+        """Return colour, metalness and roughness."""
         leaf = "value" if self.texture_resolution == 1 else "data"
         start = {"base_color": 0.5, "metallic": 0.3, "roughness": 0.6}
         return tuple(Parameter(f"spiral.bsdf.brdf_0.{name}.{leaf}", initial=value) for name, value in start.items())
 
 
 def _ribbon(rows: int, columns: int) -> np.ndarray:
-    """A ribbon that climbs and narrows as it turns: points (rows, columns, 3)."""
+    """Return a ribbon that climbs and narrows as it winds: points (rows, columns, 3)."""
     across, along = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(0, 1, columns), indexing="ij")
     angle = 2 * np.pi * _TURNS * along
     radius = 0.62 - 0.32 * along
@@ -61,7 +62,7 @@ def _ribbon(rows: int, columns: int) -> np.ndarray:
 
 
 def _lacquer(resolution: int) -> dict[str, Any]:
-    """Copper, or at more than one texel copper and blue enamel in bands, ever rougher along the ribbon's width."""
+    """Return copper or, for more than one texel, bands of copper and blue enamel with roughness increasing along the ribbon's width."""
     copper, blue = np.array([0.85, 0.42, 0.2]), np.array([0.08, 0.25, 0.5])
     if resolution == 1:
         unknown: dict[str, Any] = {"base_color": parts.colour(*copper), "metallic": 0.8, "roughness": 0.3}

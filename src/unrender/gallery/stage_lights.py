@@ -1,4 +1,4 @@
-"""`stage-lights`: where a spotlight aims, where a softbox hangs and how a projector is turned, from one picture of a stage."""
+"""Problem `stage-lights`: the direction of a spotlight, the position of a softbox and the rotation of a projector, from one image."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _START: dict[str, tuple[str, dict[str, float]]] = {
 @register(name="stage-lights", position=33)
 @dataclass(frozen=True)
 class StageLights:
-    """Where a spotlight aims, a softbox hangs and a projector looks, from one picture of a stage.
+    """The direction of a spotlight, the position of a softbox and the rotation of a projector, from one image of a stage.
 
-    One view; seven unknowns: two angles of the spotlight, whose turn about its own axis does not show, the softbox's translation, and two
-    angles of the projector. None of the lights is seen itself.
+    One view. Seven unknowns: two angles of the spotlight, whose rotation about its own axis has no effect, the softbox's translation, and
+    two angles of the projector. None of the lights is visible itself.
     """
 
     resolution: int = fields.resolution(48)
@@ -36,7 +36,8 @@ class StageLights:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The stage: x in [-2, 2], z in [-1.5, 2], a backdrop at z = -1.5, two blocks; the camera at its front, looking along -z."""
+        """Return the stage: x in [-2, 2], z in [-1.5, 2], a backdrop at z = -1.5, two blocks, and the camera at its front, looking along
+        -z."""
         place = mi.ScalarTransform4f
         picture = textures.bitmap(textures.photograph("coffee", 8))
         return {
@@ -76,8 +77,8 @@ class StageLights:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The lights' poses, from where a rough guess would put them."""
-        found: list[Parameter] = []
+        """Return the lights' poses, initially a rough guess."""
+        unknowns: list[Parameter] = []
         for light, (part, start) in _START.items():
-            found += staging.unknown(light, part, start)
-        return tuple(found)
+            unknowns += staging.unknown(light, part, start)
+        return tuple(unknowns)

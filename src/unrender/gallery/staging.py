@@ -1,6 +1,6 @@
-"""What the problems of unknown poses share: a sun, unknown coordinates.
+"""Shared parts of problems with unknown poses: a sun, and unknown coordinates.
 
-Their lights come from one direction each: direct light without noise, so that what a render shows of a pose is noisy at edges alone.
+Their lights come from one direction each. Direct light has no noise, so renders of a pose are noisy at edges only.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ __all__ = ["sun", "unknown"]
 
 
 def sun(towards: parts.Vector, *rgb: float) -> dict[str, Any]:
-    """Light from one direction.
+    """Return light from one direction.
 
     Args:
-        towards: where it comes from; any length.
+        towards: direction towards the light, of any length.
         rgb: radiance of a white surface that faces it; one number is grey.
     """
     direction = -np.asarray(towards, float)
@@ -30,12 +30,12 @@ def sun(towards: parts.Vector, *rgb: float) -> dict[str, Any]:
 def unknown(
     shape: str, part: str, start: dict[str, float], bounds: tuple[float, float] | None = None
 ) -> list[Parameter]:
-    """Coordinates of the pose of a shape or light, which are 0 in the true scene.
+    """Return coordinates of the pose of a shape or light, which are 0 in the true scene.
 
     Args:
-        shape: the id of the shape or light.
+        shape: id of the shape or light.
         part: "translation" or "rotation".
-        start: {"x" | "y" | "z": where the descent starts}; what is not named stays as it is.
-        bounds: of each.
+        start: {"x" | "y" | "z": initial value}; other coordinates are known.
+        bounds: bounds of each coordinate.
     """
     return [Parameter(f"{shape}.{part}.{axis}", initial=value, bounds=bounds) for axis, value in start.items()]

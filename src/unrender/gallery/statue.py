@@ -1,4 +1,4 @@
-"""`statue`: the shape of a bust and the texture on it, together, from pictures all around it."""
+"""Problem `statue`: the shape of a bust and its texture together, from images from all sides."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ _PROFILE = (
 @register(name="statue", position=30)
 @dataclass(frozen=True)
 class Statue:
-    """The shape of a bust and the pattern of its stone together, from pictures all around it, from a grey sphere.
+    """The shape of a bust together with the pattern of its stone, from images from all sides, starting with a grey sphere.
 
-    Several views; the unknowns are the sphere's vertex positions, (3 V,), and the reflectance of its texture, (H, 2 H, 3). The light is
-    known: a sky and a sun. Vertices may slide along the surface and take the texture along, so of the texture there is no truth; the
-    error of the shape is the distance between surfaces. What is hard is that either unknown explains some of what the other does.
+    Several views. The unknowns are the sphere's vertex positions, (3 V,), and the reflectance of its texture, (H, 2 H, 3). The light is
+    known: a sky and a sun. Vertices may slide along the surface with the texture, so the texture has no true value; the error of the
+    shape is the distance between surfaces. The difficulty is that each unknown can explain a part of the other.
     """
 
     resolution: int = fields.resolution(64)
@@ -47,20 +47,20 @@ class Statue:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The grey sphere under the sky and the sun."""
+        """Return the grey sphere under the sky and the sun."""
         grey = np.full((self.texture_resolution, 2 * self.texture_resolution, 3), 0.5, np.float32)
         return self._stage() | {"statue": _body(lambda directions: _RADIUS * directions, self.subdivisions, grey)}
 
     def target(self) -> dict[str, Any]:
-        """The bust of veined stone."""
+        """Return the bust of veined stone."""
         return self._stage() | {"statue": _body(_bust, _FINE, _stone(4 * self.texture_resolution))}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Vertices and texture, as the grey sphere has them."""
+        """Return vertices and texture of the grey sphere."""
         return Parameter("statue.vertex_positions"), Parameter("statue.bsdf.brdf_0.reflectance.data")
 
     def problem(self, name: str) -> Problem:
-        """The problem: the sphere's scene, the bust's pictures by Mitsuba's own `path` integrator, and its surface."""
+        """Return the problem: the sphere's scene, references of the bust by Mitsuba's `path` integrator, and its surface."""
         true = load(self.target)
         pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
         views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
@@ -91,7 +91,7 @@ def _body(place: Any, subdivisions: int, texture: np.ndarray) -> Any:
 
 
 def _bust(directions: np.ndarray) -> np.ndarray:
-    """Head, neck and shoulders, with a nose, from the unit sphere: (V, 3)."""
+    """Return head, neck and shoulders with a nose, from unit directions: (V, 3)."""
     from scipy.interpolate import PchipInterpolator
 
     x, y, z = directions.T
@@ -107,7 +107,7 @@ def _bust(directions: np.ndarray) -> np.ndarray:
 
 
 def _stone(rows: int) -> np.ndarray:
-    """Bands and veins of two colours, (rows, 2 rows, 3) reflectance, the same at both ends of each row."""
+    """Return bands and veins of two colours, (rows, 2 rows, 3) reflectance, periodic in each row."""
     u, v = np.meshgrid((np.arange(2 * rows) + 0.5) / (2 * rows), (np.arange(rows) + 0.5) / rows)
     around = 2 * np.pi * u
     veins = 0.5 + 0.5 * np.sin(3 * around + 9 * v + 1.5 * np.sin(2 * around + 14 * v))

@@ -1,7 +1,7 @@
-"""`sun-glossy`: the paint under the lacquer of a wooden doll, in the sun.
+"""Problem `sun-glossy`: the paint under the lacquer of a wooden doll, in the sun.
 
-The comparison of losses of the adaptive sampling of pixels (its Fig. 4). The lacquer mirrors the sun: a few pixels are many times brighter
-than the others, and nearly all that L2 sees, while a relative loss sees the shade as well.
+The comparison of losses for adaptive pixel sampling (Fig. 4 of its paper). The lacquer reflects the sun: a few pixels are many times
+brighter than the others and dominate L2, whereas a relative loss includes the shaded side.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _SUN = np.array([0.5, 0.55, 0.67]) / np.linalg.norm([0.5, 0.55, 0.67])
 @register(name="sun-glossy", position=9)
 @dataclass(frozen=True)
 class SunGlossy:
-    """The painted albedo of a glossy doll under a sky with a small bright sun, seen from all around.
+    """The painted albedo of a glossy doll under a sky with a small bright sun, seen from all sides.
 
-    Several views; one unknown, the diffuse reflectance (texture_resolution², 3) of a rough plastic, from grey, with LargeSteps. Losses of
-    interest: L2 and RelativeL2.
+    Several views. One unknown, the diffuse reflectance (texture_resolution², 3) of a rough plastic, initially grey, with LargeSteps.
+    Losses of interest are L2 and RelativeL2.
     """
 
     resolution: int = fields.resolution(64)
@@ -38,7 +38,7 @@ class SunGlossy:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The doll: 1.7 high, on the ground y = 0, around the y axis, its face towards +z."""
+        """Return the doll, 1.7 high, on the ground y = 0 around the y axis, facing +z."""
         angles = 0.35 + 2 * np.pi * np.arange(self.views) / self.views
         lacquer = {
             "type": "roughplastic",
@@ -59,12 +59,12 @@ class SunGlossy:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The paint, grey at first."""
+        """Return the paint, initially grey."""
         return (Parameter("doll.bsdf.diffuse_reflectance.data", initial=0.4, preconditioner=LargeSteps(1.0)),)
 
 
 def _profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radius and height of body, waist and head, closed at the top."""
+    """Return radius and height of body, waist and head, closed at the top."""
     from scipy.interpolate import PchipInterpolator
 
     knots = np.array(
@@ -77,7 +77,7 @@ def _profile(rows: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _painting(resolution: int) -> np.ndarray:
-    """A face in a scarf, an apron with flowers, a skirt with dots, without a seam in u: (resolution, resolution, 3), v = 1 first."""
+    """Return a face in a scarf, an apron with flowers and a skirt with dots, seamless in u: (resolution, resolution, 3), v = 1 first."""
     u, v = textures.grid(resolution)
     v = 1 - v**1.5  # height, as the profile's rows have it
     skirt, scarf, skin, white = ([0.65, 0.06, 0.05], [0.85, 0.5, 0.06], [0.85, 0.62, 0.45], [0.85, 0.83, 0.75])

@@ -1,7 +1,7 @@
-"""`sunlit-vase`: the glaze of a vase that stands in the sun, seen from all around.
+"""Problem `sunlit-vase`: the glaze of a vase in the sun, seen from all sides.
 
-The sun is small and a thousand times brighter than the sky: the lit side of the vase is easy, its shaded side is lit by
-the sky and by what the ground gives back, while most emitter samples go to the sun and are lost.
+The sun is small and a thousand times brighter than the sky. The lit side of the vase is easy. The sky and the ground light its shaded
+side, while most emitter samples go to the sun and are occluded.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _SUN_RADIUS = np.radians(2.5)
 @register(name="sunlit-vase", position=3)
 @dataclass(frozen=True)
 class SunlitVase:
-    """The painted glaze of a vase under a sky with a small bright sun, seen from all around.
+    """The painted glaze of a vase under a sky with a small bright sun, seen from all sides.
 
-    Several views; one unknown, the base colour (texture_resolution², 3), from grey.
+    Several views. One unknown, the base colour (texture_resolution², 3), initially grey.
     """
 
     resolution: int = fields.resolution(128)
@@ -45,7 +45,7 @@ class SunlitVase:
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The vase: 1.7 high, on the ground y = 0, around the y axis."""
+        """Return the vase, 1.7 high, on the ground y = 0 around the y axis."""
         angles = np.pi / 6 + 2 * np.pi * np.arange(self.views) / self.views
         gravel = textures.bitmap(textures.photograph("gravel", 128), repeat=(10, 10))
         return {
@@ -62,22 +62,22 @@ class SunlitVase:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The glaze, grey at first."""
+        """Return the glaze, initially grey."""
         return (Parameter("vase.bsdf.brdf_0.base_color.data", initial=0.5),)
 
 
 def vase(texture_resolution: int) -> dict[str, Any]:
-    """The vase alone, with its true glaze."""
+    """Return the vase with its true glaze."""
     return meshes.sheet("vase", _vase_points(96, 96), _glaze(texture_resolution), closed=True)
 
 
 def _sky() -> np.ndarray:
-    """Return the sky and its sun: see `parts.picture`."""
+    """Return the sky with its sun, see `parts.picture`."""
     return parts.picture(SUN, _SUN_RADIUS, (620.0, 560.0, 460.0))
 
 
 def _vase_points(rows: int, columns: int) -> np.ndarray:
-    """A profile with a foot, a belly, a neck and a lip, turned about the y axis."""
+    """Return a profile with a foot, a belly, a neck and a lip, as a surface of revolution."""
     height = np.linspace(0, 1, rows)
     knots = np.array(
         [
@@ -104,7 +104,7 @@ def _glaze(resolution: int) -> dict[str, Any]:
 
 
 def _painting(resolution: int) -> np.ndarray:
-    """Bands, a zigzag, dots and petals on terracotta, without a seam in u: (resolution, resolution, 3), v = 1 first."""
+    """Return bands, a zigzag, dots and petals on terracotta, seamless in u: (resolution, resolution, 3), v = 1 first."""
     u, v = textures.grid(resolution)
     v = 1 - v
     clay, ink, cream, blue = (
@@ -139,26 +139,26 @@ _FIELD_OF_VIEW = 30.0
 _DISTANCE, _MIDDLE = 4.4, 0.85
 _TEXELS, _MAX_DEPTH = 64, 5
 _WHITE = 0.98
-"""Of the brightest pixel but one in a thousand."""
+"""Quantile of the pixels' brightness that is mapped to white: all but one in a thousand."""
 
 
 def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int = 256, seed: int = 0) -> Path:
-    """Render photographs of a glazed vase under the sky, as a camera that goes around it would take them.
+    """Render photographs of a glazed vase under the sky, as from a camera that moves around it.
 
-    The folder then holds `images/00.png`, ... (8-bit sRGB; the alpha channel is 1 on the vase) and `transforms.json`, poses and angle of
-    view as NeRF has them. One exposure serves all: one pixel in a thousand is white.
+    The folder contains `images/00.png`, ... (8-bit sRGB; the alpha channel is 1 on the vase) and `transforms.json` with poses and field
+    of view in NeRF's format. All have one exposure, at which one pixel in a thousand is white.
 
     Args:
-        folder: where to write; it must not exist, or be empty.
-        views: photographs, >= 3: once around, from heights between the foot of the vase and above its lip.
-        size: of a photograph, (size, size) pixels, >= 8.
+        folder: output folder; it must be missing or empty.
+        views: number of photographs, >= 3, once around, from heights between the foot of the vase and above its lip.
+        size: size of a photograph, (size, size) pixels, >= 8.
         spp: samples per pixel.
-        seed: of the renders.
+        seed: seed of the renders.
 
     Returns: the folder.
 
     Raises:
-        InputError: an argument out of its range, or a folder that holds something or cannot be written.
+        InputError: an argument is out of range, or the folder is not empty or not writable.
     """
     for name, value, least in (("views", views, 3), ("size", size, 8), ("spp", spp, 1), ("seed", seed, 0)):
         checks.integer("photographs", name, value, at_least=least)
@@ -198,5 +198,5 @@ def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int =
 
 
 def _photographed_sky() -> np.ndarray:
-    """A sky whose sun is veiled, so that shadows are soft."""
+    """Return a sky with a veiled sun, for soft shadows."""
     return parts.picture(SUN, 0.3, (14.0, 12.5, 10.5))

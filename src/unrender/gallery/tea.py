@@ -1,7 +1,7 @@
-"""`tea`: what a glass is filled with, in a room that is lit by its ceiling alone.
+"""Problem `tea`: the medium in a glass ball, in a room that is lit only via its ceiling.
 
-After Nicolet et al. 2023, section 6. Glass bends every ray, so no emitter can be sampled from inside the tea, and the light comes by
-detours: the picture is noise at few samples.
+After Nicolet et al. 2023, section 6. Glass refracts every ray, so no emitter can be sampled from inside of the tea, and light is
+indirect: with few samples the image is noise.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from unrender.scene.parameter import Parameter
 @register(name="tea", position=23)
 @dataclass(frozen=True)
 class Tea:
-    """Extinction and albedo of the tea in a ball of glass, in a room lit only by light bounced off its ceiling.
+    """Extinction and albedo of the tea in a glass ball, in a room lit only by light bounced off its ceiling.
 
-    One view; two unknowns (3,), of which the extinction is a tenth of that in inverse units of length.
+    One view. Two unknowns (3,); the extinction is a tenth of that in inverse units of length.
     """
 
     resolution: int = fields.resolution(32)
@@ -29,10 +29,10 @@ class Tea:
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The room of `indirect-room`, without its picture; the ball stands before the back wall."""
+        """Return the room of `indirect-room` without its photograph, with the ball before the back wall."""
         tea = {
             "type": "homogeneous",
-            "scale": 10.0,  # Mitsuba takes colours up to 1 only
+            "scale": 10.0,  # Mitsuba limits colours to 1
             "sigma_t": parts.colour(0.25, 0.4, 0.7),
             "albedo": parts.colour(0.9, 0.72, 0.3),
             "sample_emitters": False,
@@ -53,7 +53,7 @@ class Tea:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Thin and grey at first."""
+        """Return both unknowns, initially thin and grey."""
         return (
             Parameter("tea.interior_medium.sigma_t.value.value", initial=0.15),
             Parameter("tea.interior_medium.albedo.value.value", initial=0.6),

@@ -1,6 +1,6 @@
-"""Pictures as textures: photographs that every installation of scikit-image carries, and patterns from formulas.
+"""Images as textures: photographs from scikit-image's installation, and procedural patterns.
 
-Textures are float32, linear, and stored as they are (`raw`): Mitsuba does not differentiate 8-bit bitmaps.
+Textures are float32, linear, and stored unchanged (`raw`), because Mitsuba does not differentiate 8-bit bitmaps.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from unrender.core.errors import InputError
 from unrender.io.images import srgb_to_linear
 
 Photograph = Literal["astronaut", "chelsea", "coffee", "rocket", "brick", "gravel", "grass"]
-"""Those that lie inside scikit-image's wheel, so that nothing is downloaded."""
+"""Photographs in scikit-image's wheel, which need no download."""
 
 DARKEST, BRIGHTEST = 0.04, 0.9
-"""Reflectances of real paints: none is black, none reflects all."""
+"""Range of reflectances of real paints."""
 
 
 def photograph(name: Photograph, resolution: int) -> np.ndarray:
-    """The middle square of a photograph as reflectance: float32 (resolution, resolution, 3), linear, in [0.04, 0.9]."""
+    """Return the central square of a photograph as reflectance: float32 (resolution, resolution, 3), linear, in [0.04, 0.9]."""
     picture = _read(name)
     if picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=2)
@@ -36,22 +36,21 @@ def photograph(name: Photograph, resolution: int) -> np.ndarray:
 
 
 def _read(name: Photograph) -> np.ndarray:
-    """The photograph as its file has it. scikit-image itself takes a second to import."""
+    """Return the photograph from its file. Importing scikit-image would take a second."""
     from PIL import Image
 
-    found = find_spec("skimage")
-    if found is None or not found.submodule_search_locations:
+    package = find_spec("skimage")
+    if package is None or not package.submodule_search_locations:
         raise InputError(
             "gallery: scikit-image is not installed, whose photographs are needed: pip install scikit-image"
         )
-    path = Path(found.submodule_search_locations[0]) / "data" / f"{name}.{'jpg' if name == 'rocket' else 'png'}"
+    path = Path(package.submodule_search_locations[0]) / "data" / f"{name}.{'jpg' if name == 'rocket' else 'png'}"
     with Image.open(path, formats=["PNG", "JPEG"]) as image:
         return np.asarray(image)
 
 
 def _resized(picture: np.ndarray, resolution: int) -> np.ndarray:
-    """(side, side, 3) at another resolution, linearly interpolated, and first blurred where it gets smaller: what
-    `skimage.transform.resize` does."""
+    """Resample (side, side, 3) linearly, with smoothing before a reduction, as `skimage.transform.resize` does."""
     from scipy import ndimage
 
     factor = picture.shape[0] / resolution
@@ -63,25 +62,24 @@ def _resized(picture: np.ndarray, resolution: int) -> np.ndarray:
 
 
 def grid(resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Texture coordinates (u, v) of texel centres: two arrays (resolution, resolution) in (0, 1), u along columns."""
+    """Return texture coordinates (u, v) of texel centres: two arrays (resolution, resolution) in (0, 1), u along columns."""
     centres = (np.arange(resolution) + 0.5) / resolution
     u, v = np.meshgrid(centres, centres)
     return u, v
 
 
 def ramp(x: np.ndarray, low: float | np.ndarray, high: float | np.ndarray) -> np.ndarray:
-    """A smooth step of `x` from 0 at `low` to 1 at `high`."""
+    """Return a smooth step of `x` from 0 at `low` to 1 at `high`."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3 - 2 * t)
 
 
 def bitmap(values: np.ndarray, repeat: tuple[float, float] | None = None) -> dict[str, Any]:
-    """A trainable texture of values (H, W, C) or (H, W): the Mitsuba dictionary.
+    """Return a differentiable texture of values (H, W, C) or (H, W) as a Mitsuba dictionary.
 
     Args:
-        values: the first row lies at the top (v = 1), or at v = 0 with `repeat`.
-        repeat: how often the texture fits into u and v from 0 to 1; every other copy is mirrored, so that no seam
-            shows.
+        values: the first row is at the top (v = 1), or at v = 0 with `repeat`.
+        repeat: number of copies in u and v from 0 to 1; every other copy is mirrored, so that there are no seams.
     """
     pixels = np.ascontiguousarray(values if values.ndim == 3 else values[..., None], dtype=np.float32)
     if repeat is None:

@@ -1,4 +1,4 @@
-"""`three-bodies`: the colour of one body, the roughness of the second, the density of the third. After Nicolet et al. 2023, Fig. 2."""
+"""Problem `three-bodies`: the colour of one ball, the roughness of another, the density of a third. After Nicolet et al. 2023, Fig. 2."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from unrender.scene.parameter import Parameter
 class ThreeBodies:
     """Albedo, roughness and extinction of three balls: of paint, of metal and of fog.
 
-    One view; the unknowns are a reflectance (3,), a roughness () and an extinction (3,), a quarter of that in inverse units of length.
+    One view. The unknowns are a reflectance (3,), a roughness () and an extinction (3,), a quarter of that in inverse units of length.
     """
 
     resolution: int = fields.resolution(48)
@@ -25,12 +25,12 @@ class ThreeBodies:
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """Three balls of radius 0.6 on the floor y = -0.6, between two lamps."""
+        """Return three balls of radius 0.6 on the floor y = -0.6, between two lamps."""
         tiles = {"type": "checkerboard", "color0": parts.colour(0.15), "color1": parts.colour(0.6)}
         tiles["to_uv"] = _scaled(24)
         fog = {
             "type": "homogeneous",
-            "scale": 4.0,  # Mitsuba takes colours up to 1 only
+            "scale": 4.0,  # Mitsuba limits colours to 1
             "sigma_t": parts.colour(0.9, 0.6, 0.35),
             "albedo": parts.colour(0.6, 0.85, 0.95),
         }
@@ -49,7 +49,7 @@ class ThreeBodies:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Grey paint, dull metal, thin grey fog."""
+        """Return the unknowns: grey paint, dull metal, thin grey fog."""
         return (
             Parameter("paint.bsdf.reflectance.value", initial=0.5),
             Parameter("metal.bsdf.alpha.value", initial=0.4),

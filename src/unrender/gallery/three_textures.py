@@ -1,8 +1,8 @@
-"""`three-textures`: the paint of a ball, a jar and a cone, found together, outdoors.
+"""Problem `three-textures`: the paint of a ball, a jar and a cone, together, outdoors.
 
-The joint albedo of three objects of the adaptive sampling of pixels (its Fig. 1). Most pixels show the ground, which tells next to nothing
-of the paint; those of the things differ in what they tell: the sides in the sun are bright, those in the shade are lit by the sky and by
-what the ground gives back.
+The joint albedo of three objects of adaptive pixel sampling (Fig. 1 of its paper). Most pixels show the ground, which contains almost no
+information about the paint. Pixels of the objects differ: the sides in the sun are bright, while the sky and the ground light the shaded
+sides.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from unrender.scene.parameter import Parameter
 _SUN = np.array([0.45, 0.7, 0.55]) / np.linalg.norm([0.45, 0.7, 0.55])
 """Direction to the sun."""
 _APART = 0.72
-"""Distance of each thing from the middle."""
+"""Distance of each object from the centre."""
 
 
 @register(name="three-textures", position=31)
 @dataclass(frozen=True)
 class ThreeTextures:
-    """The paint of three things at once under a sky with a sun, seen from all around.
+    """The paint of three objects under a sky with a sun, seen from all sides.
 
-    Several views; three unknown reflectances of texture_resolution² texels, from grey, with LargeSteps. Of the ball's lower end no
-    picture tells.
+    Several views. Three unknown reflectances of texture_resolution² texels, initially grey, with LargeSteps. No image shows the lower end
+    of the ball.
     """
 
     resolution: int = fields.resolution(64)
@@ -41,7 +41,7 @@ class ThreeTextures:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The things on the ground y = 0, each at 0.72 from the y axis, the ball towards +z."""
+        """Return the objects on the ground y = 0, each at 0.72 from the y axis, the ball at +z."""
         angles = 0.5 + 2 * np.pi * np.arange(self.views) / self.views
         rows, columns = 48, 96
         ball = meshes.ellipsoid(0.45 * np.eye(3), np.array([0.0, 0.45, 0.0]), rows, columns)
@@ -63,7 +63,7 @@ class ThreeTextures:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The three paints, grey at first."""
+        """Return the three paints, initially grey."""
         smooth = LargeSteps(1.0)
         return tuple(
             Parameter(f"{name}.bsdf.reflectance.data", initial=0.5, preconditioner=smooth)
@@ -71,7 +71,7 @@ class ThreeTextures:
         )
 
     def _photograph(self, name: textures.Photograph) -> dict[str, Any]:
-        """Upright, once on either half of what it goes around, mirrored."""
+        """Return an upright photograph, once on either half of the circumference, mirrored."""
         return textures.bitmap(textures.photograph(name, self.texture_resolution)[::-1], repeat=(2, 1))
 
 
@@ -85,7 +85,7 @@ def _place(number: int) -> np.ndarray:
 
 
 def _jar(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radius and height of a drum with round edges, closed above and below."""
+    """Return radius and height of a drum with round edges, closed at the top and bottom."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, rows)
     return 0.42 * np.cos(angle) ** 0.5 + 1e-3, 0.45 + 0.45 * np.sin(angle)
 

@@ -1,7 +1,7 @@
-"""`two-planets`: the textures of two planets, one of them in a glass ball, from pictures all around them.
+"""Problem `two-planets`: the textures of two planets, one of them in a glass ball, from images from all sides.
 
-The exchange of two planets' textures of the adaptive sampling of pixels (its Fig. 8). Light reaches the enclosed planet through two
-refractions and no emitter can be sampled from it: its pixels are many times as noisy as the other's, at the same derivative.
+The exchange of two planets' textures of adaptive pixel sampling (Fig. 8 of its paper). Light reaches the enclosed planet through two
+refractions, and no emitter can be sampled from it: its pixels are much noisier than the other's, at equal derivatives.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _PLANET, _INNER, _OUTER = 0.72, 0.92, 1.0
 """Radii of the planets and of the two sides of the glass."""
 
 _APART = 1.05
-"""Distance of each planet from the middle."""
+"""Distance of each planet from the centre."""
 
 _DUSK = ((0.06, 0.12, 0.32), (0.4, 0.42, 0.55), (0.1, 0.12, 0.22))
-"""Of zenith, horizon and nadir."""
+"""Radiance of zenith, horizon and nadir."""
 
 _SUN = np.array([0.3, 0.75, 0.6]) / np.linalg.norm([0.3, 0.75, 0.6])
 
@@ -32,9 +32,9 @@ _SUN = np.array([0.3, 0.75, 0.6]) / np.linalg.norm([0.3, 0.75, 0.6])
 @register(name="two-planets", position=11)
 @dataclass(frozen=True)
 class TwoPlanets:
-    """The textures of two planets, one within glass, each starting with the other's.
+    """The textures of two planets, one inside of glass, each initially with the other's texture.
 
-    Many views; two unknown reflectances of texture_resolution² texels, with LargeSteps. Paths to the enclosed planet and on to the light
+    Many views. Two unknown reflectances of texture_resolution² texels, with LargeSteps. Paths to the enclosed planet and on to the light
     have at least 6 segments.
     """
 
@@ -46,7 +46,7 @@ class TwoPlanets:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The planets: at x = -1.05 the blue one, free, at x = 1.05 the red one, enclosed; nothing else but the sky."""
+        """Return the planets: at x = -1.05 the free blue one, at x = 1.05 the enclosed red one, and the sky."""
         angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
         heights = np.where(np.arange(self.views) % 2 == 0, 1.6, -0.5)
         return {
@@ -65,7 +65,7 @@ class TwoPlanets:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The textures, exchanged at first."""
+        """Return the textures, initially exchanged."""
         smooth = LargeSteps(1.0)
         return (
             Parameter("free.bsdf.reflectance.data", initial=red(self.texture_resolution), preconditioner=smooth),
@@ -79,12 +79,12 @@ def _ball(name: str, x: float, texture: np.ndarray) -> Any:
 
 
 def sky() -> dict[str, Any]:
-    """A dusk with a large sun."""
+    """Return a dusk sky with a large sun."""
     return parts.environment(parts.picture(_SUN, np.radians(18.0), (7.5, 7.0, 6.0), _DUSK))
 
 
 def shell(radius: float, inside: float, outside: float, x: float = 0.0) -> dict[str, Any]:
-    """One side of a glass ball around (x, 0, 0), with the indices of refraction there."""
+    """Return one side of a glass ball around (x, 0, 0), with these indices of refraction."""
     return {
         "type": "sphere",
         "center": [x, 0.0, 0.0],
@@ -94,7 +94,7 @@ def shell(radius: float, inside: float, outside: float, x: float = 0.0) -> dict[
 
 
 def blue(resolution: int) -> np.ndarray:
-    """Oceans, continents from green to brown, ice at the poles, clouds: (resolution, resolution, 3) float32, v = 1 first."""
+    """Return oceans, green to brown continents, polar ice and clouds: (resolution, resolution, 3) float32, v = 1 first."""
     x, land = _directions(resolution), _noise(resolution, 3, (1.6, 3.2, 6.0))
     cloud = textures.ramp(_noise(resolution, 8, (2.5, 5.0, 7.0)), 0.35, 1.0)
     deep, shelf, green, brown, ice = (
@@ -108,7 +108,7 @@ def blue(resolution: int) -> np.ndarray:
 
 
 def red(resolution: int) -> np.ndarray:
-    """Rust with dark plains, craters and one white pole: (resolution, resolution, 3) float32, v = 1 first."""
+    """Return rust with dark plains, craters and one white pole: (resolution, resolution, 3) float32, v = 1 first."""
     x, rough = _directions(resolution), _noise(resolution, 21, (2.0, 4.0, 8.0))
     dust, rust, dark, ice = (np.array(c) for c in ([0.75, 0.42, 0.2], [0.55, 0.2, 0.08], [0.2, 0.08, 0.06], [0.85] * 3))
     surface = _mix(rust, dust, textures.ramp(rough, -0.6, 0.8))
@@ -122,7 +122,7 @@ def red(resolution: int) -> np.ndarray:
 
 
 def _directions(resolution: int) -> np.ndarray:
-    """Where on the unit sphere each texel lies: (resolution, resolution, 3), the north pole's row first."""
+    """Return each texel's position on the unit sphere, (resolution, resolution, 3), with the north pole's row first."""
     u, v = textures.grid(resolution)
     longitude, latitude = 2 * np.pi * (u - 0.5), np.pi * (0.5 - v)
     return np.stack(
@@ -131,7 +131,7 @@ def _directions(resolution: int) -> np.ndarray:
 
 
 def _noise(resolution: int, seed: int, frequencies: tuple[float, ...]) -> np.ndarray:
-    """Waves through the sphere in directions by chance, without a seam: (resolution, resolution), of variance 1 or so."""
+    """Return seamless noise of waves with random directions through the sphere: (resolution, resolution), of variance about 1."""
     rng, x = np.random.default_rng(seed), _directions(resolution)
     total = np.zeros(x.shape[:2])
     for octave, frequency in enumerate(frequencies):

@@ -1,4 +1,4 @@
-"""What the problems of participating media share: grids, cameras all around, a cube whose faces do not show."""
+"""Shared parts of problems with participating media: grids, cameras around the origin, a cube with invisible faces."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from unrender.gallery import parts
 
 
 def grid(values: np.ndarray) -> dict[str, Any]:
-    """A volume over the cube [-1, 1]³, linear between the middles of its voxels.
+    """Return a volume over the cube [-1, 1]³, interpolated linearly between voxel centres.
 
     Args:
-        values: (Z, Y, X, C), stored as they are.
+        values: (Z, Y, X, C), stored unchanged.
     """
     place = mi.ScalarTransform4f().translate([-1, -1, -1]).scale(2)
     volume = mi.VolumeGrid(np.ascontiguousarray(values, dtype=np.float32))
@@ -22,12 +22,12 @@ def grid(values: np.ndarray) -> dict[str, Any]:
 
 
 def cube(medium: dict[str, Any]) -> dict[str, Any]:
-    """The cube [-1, 1]³ full of a medium; light passes its faces straight."""
+    """Return the cube [-1, 1]³ filled with a medium; its faces do not refract."""
     return {"type": "cube", "bsdf": {"type": "null"}, "interior": medium}
 
 
 def around(views: int, resolution: int, distance: float = 4.2, fov: float = 36.0) -> dict[str, Any]:
-    """Cameras evenly around the y axis, by turns lower and higher, that look at the origin."""
+    """Return cameras at equal angles around the y axis, alternately lower and higher, that look at the origin."""
     angles = np.pi / 6 + 2 * np.pi * np.arange(views) / views
     heights = np.where(np.arange(views) % 2 == 0, 0.25, 0.6)
     return {
@@ -39,16 +39,16 @@ def around(views: int, resolution: int, distance: float = 4.2, fov: float = 36.0
 
 
 def positions(resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, y and z of the middles of the voxels of `grid`, each (resolution, resolution, resolution)."""
+    """Return x, y and z of the voxel centres of `grid`, each (resolution, resolution, resolution)."""
     middle = (np.arange(resolution) + 0.5) / resolution * 2 - 1
     z, y, x = np.meshgrid(middle, middle, middle, indexing="ij")
     return x, y, z
 
 
 def noise(resolution: int, octaves: int, seed: int) -> np.ndarray:
-    """Smooth noise of several octaves in [0, 1], each half as strong and twice as fine: (resolution, resolution, resolution).
+    """Return smooth noise of several octaves in [0, 1], each with half the amplitude and twice the frequency: (resolution,) * 3.
 
-    The same at every resolution, but for the detail that this can hold.
+    Equal at every resolution, except for detail that the resolution cannot represent.
     """
     from scipy.ndimage import map_coordinates
 

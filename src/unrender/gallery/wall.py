@@ -1,7 +1,7 @@
-"""`wall`: a picture that fills the film, of few texels, lit by bounced light alone.
+"""Problem `wall`: an image of few texels that fills the film, lit by indirect light only.
 
-The simplest problem of a texture under noise: every texel is seen by sixteen pixels, and the best step of each is known nearly exactly
-from the picture alone. What a method needs for it beyond a few steps of the right length, it needs for the noise.
+The simplest texture problem with noise. Sixteen pixels show every texel, and the best step of each is nearly known from the image alone.
+Whatever a method needs beyond a few steps of the right length, it needs because of the noise.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from unrender.scene.parameter import Parameter
 @register(name="wall", position=26)
 @dataclass(frozen=True)
 class Wall:
-    """A photograph of few texels on a wall that fills the picture, lit only by bounced light.
+    """A photograph of few texels on a wall that fills the image, lit only by indirect light.
 
-    One view; one unknown, the wall's reflectance (texture_resolution², 3), from grey. The room is that of `indirect-room`.
+    One view. One unknown, the wall's reflectance (texture_resolution², 3), initially grey. The room is that of `indirect-room`.
     """
 
     resolution: int = fields.resolution(80)
@@ -32,11 +32,11 @@ class Wall:
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """The room, and a camera whose picture ends where the wall does, 3.1 away and 2 wide."""
+        """Return the room, with a camera whose image ends at the edges of the wall, 3.1 away and 2 wide."""
         room = IndirectRoom(texture_resolution=self.texture_resolution).scene()
         fov = math.degrees(2 * math.atan(1 / 3.1))
         return {**room, "camera": parts.camera((0, 0, 2.1), (0, 0, -1), fov, self.resolution)}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """The wall's texture, grey at first."""
+        """Return the wall's texture, initially grey."""
         return (Parameter("back.bsdf.reflectance.data", initial=0.5),)

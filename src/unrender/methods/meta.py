@@ -25,8 +25,8 @@ class MetaCommonOptions(Options):
     )
     step_rule: Literal["deviation", "walk"] = Field(
         "deviation",
-        description="rule of meta-adam: deviation, steps per standard deviation of the gradient, as in the paper; or walk, where noise "
-        "moves a parameter as far as with adam, with adam's learning rates",
+        description="rule of meta-adam: deviation divides by the deviation of the gradient, as in the paper; walk limits steps made "
+        "by noise to those of adam",
     )
     learning_rate: PositiveFloat = Field(0.002, description="learning rate of parameters without their own")
     schedule: str | None = Field(None, description=SCHEDULE_HELP)
