@@ -29,7 +29,7 @@ _REACH = 0.6
 @register(name="shadow", position=18)
 @dataclass(frozen=True)
 class Shadow:
-    """The position of a ball outside of the image: two numbers, from its shadow, which initially does not overlap the true one.
+    """The position of a ball outside of the image: two numbers, from its shadow, initially away from the true one.
 
     One view. The unknowns are x and z of the ball's translation, bounded so that its shadow is in the image. A plateau: the loss does not
     change until the shadows overlap. The renderer's path gradient is zero everywhere.
