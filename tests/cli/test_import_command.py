@@ -155,7 +155,7 @@ def test_a_response_is_fitted_or_named(unrender: Unrender, capture: Path, mesh: 
     linear = np.asarray(ur.Problem.from_file("asset/problem.toml").views[0].reference)
     answer = unrender(*given, "--response", "fit")
     assert answer.status == 0, answer.error
-    assert "note: response: the light stands still" in answer.out
+    assert "note: response: light and object are static" in answer.out
     problem = ur.Problem.from_file("asset/problem.toml")
     assert problem.initial_values()["response"].shape == (3, 2)
     assert "response" not in ur.Problem.from_file("asset/held-out.toml").initial_values()

@@ -164,7 +164,7 @@ class ExpressionRenderer(RendererWrapper):
             raise ExpressionError(one.key, f"{one.key} cannot be a function: {info.reason}")
         reads = _Reads(start)
         try:
-            found = arrays.numpy(_shaped(one, reads, info.shape))
+            value = arrays.numpy(_shaped(one, reads, info.shape))
         except KeyError as error:
             hint = did_you_mean(str(error.args[0]), start)
             raise ExpressionError(one.key, f"no parameter is called {error.args[0]}{hint}") from error
@@ -173,10 +173,10 @@ class ExpressionRenderer(RendererWrapper):
         except Exception as error:  # a function of the user's, or shapes that do not go together
             words = " ".join(str(error).split())[:200]
             raise ExpressionError(one.key, f"it cannot be evaluated at the initial values: {words}") from error
-        if not np.isfinite(found).all():
+        if not np.isfinite(value).all():
             raise ExpressionError(one.key, "it is not finite at the initial values")
         low, high = info.lowest, info.highest
-        if (low is not None and (found < low).any()) or (high is not None and (found > high).any()):
+        if (low is not None and (value < low).any()) or (high is not None and (value > high).any()):
             raise ExpressionError(one.key, f"at the initial values it is outside of the range {low} to {high}")
         if not reads.names:
             raise ExpressionError(one.key, "it reads no unknown; set the value in the scene")
@@ -252,18 +252,18 @@ def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo
 def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:
     """Return the value of an expression, of the parameter's shape and of the kind of the unknowns' arrays."""
     like = values.like
-    found = one.function(values)
-    if not arrays.is_drjit(found) or not dr.is_tensor_v(found):
-        found = type(like)(found)
-    if tuple(found.shape) == shape:
-        return found
+    result = one.function(values)
+    if not arrays.is_drjit(result) or not dr.is_tensor_v(result):
+        result = type(like)(result)
+    if tuple(result.shape) == shape:
+        return result
     try:
-        spread = np.broadcast_shapes(tuple(found.shape), shape)
+        spread = np.broadcast_shapes(tuple(result.shape), shape)
     except ValueError:
         spread = ()
     if spread != shape:
-        raise ExpressionError(one.key, f"its result has the shape {tuple(found.shape)}, {one.key} has {shape}")
-    return found + dr.zeros(type(like), shape)
+        raise ExpressionError(one.key, f"its result has the shape {tuple(result.shape)}, {one.key} has {shape}")
+    return result + dr.zeros(type(like), shape)
 
 
 class _ExpressionSession(SessionWrapper):
@@ -310,25 +310,25 @@ class _ExpressionSession(SessionWrapper):
         own, _ = self._split(parameters)
         moved, rest = self._split(tangents)
         leaves = _leaves(own)
-        found = self._renderer.evaluated(leaves)
+        results = self._renderer.evaluated(leaves)
         for key, leaf in leaves.items():
             dr.set_grad(leaf, moved[key])
-        dr.forward_to(*found.values())
-        along = {key: type(x)(dr.grad(x)) for key, x in found.items()}
+        dr.forward_to(*results.values())
+        along = {key: type(x)(dr.grad(x)) for key, x in results.items()}
         arrays.evaluate(along)
         return {**rest, **along}
 
-    def _gradient(self, parameters: Tree, found: Tree, paths: Any) -> Tree:
+    def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
         """Return the gradient by the unknowns: the functions' derivatives, transposed, times that by the scene's parameters."""
         own, rest = self._split(parameters)
-        gradient = {key: found[key] for key in rest if key in found}
+        gradient = {key: inner_gradient[key] for key in rest if key in inner_gradient}
         leaves = _leaves({key: x for key, x in own.items() if key in self._wanted})
         if not leaves:
             return gradient | trees.zeros_like(own)
         fixed = {key: x for key, x in own.items() if key not in leaves}
         values = self._renderer.evaluated({**fixed, **leaves})
         products: list[Any] = [
-            dr.sum(x * dr.detach(found[key]), axis=None) for key, x in values.items() if key in found
+            dr.sum(x * dr.detach(inner_gradient[key]), axis=None) for key, x in values.items() if key in inner_gradient
         ]
         total: Any = sum(products[1:], products[0])
         dr.backward(total)

@@ -49,10 +49,10 @@ def scene_renderer(renderer: Renderer) -> Renderer:
 def member_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the values with each tie replaced by its members, and unknowns of expressions by the parameters that depend on them."""
     base = _without_photographs(renderer)
-    found = dict(values)
+    expanded = dict(values)
     while isinstance(base, (TiedRenderer, ExpressionRenderer)):
-        found, base = base.scene_values(found), base.inner
-    return found
+        expanded, base = base.scene_values(expanded), base.inner
+    return expanded
 
 
 def _without_photographs(renderer: Renderer) -> Renderer:

@@ -100,9 +100,9 @@ class WorldsRenderer(RendererWrapper):
         states: list[World] = [World(inner, 0, {})]
         numbers = []
         for world in self.worlds:
-            found = next((n for n, known in enumerate(states) if world.same_state(known)), None)
-            numbers.append(len(states) if found is None else found)
-            states += [world] if found is None else []
+            index = next((n for n, known in enumerate(states) if world.same_state(known)), None)
+            numbers.append(len(states) if index is None else index)
+            states += [world] if index is None else []
         self.states = tuple(states)
         self._state = np.array([0] * self._count + numbers)
         self._sensor = np.array([*range(self._count), *(world.sensor for world in self.worlds)])
@@ -110,11 +110,11 @@ class WorldsRenderer(RendererWrapper):
     @property
     def renderers(self) -> list[Renderer]:
         """The renderers of all scenes, the first that of `inner`."""
-        found: list[Renderer] = []
+        distinct: list[Renderer] = []
         for state in self.states:
-            if not any(state.renderer is other for other in found):
-                found.append(state.renderer)
-        return found
+            if not any(state.renderer is other for other in distinct):
+                distinct.append(state.renderer)
+        return distinct
 
     @property
     def notices(self) -> tuple[str, ...]:
@@ -344,20 +344,22 @@ class WorldsSession:
 
     def _rendered(self, request: SampleRequest, render: Callable[[int, SampleRequest], Rendering]) -> Rendering:
         parts = self._renderer.parts(request)
-        found = [render(number, part) for number, part, _ in parts]
+        renderings = [render(number, part) for number, part, _ in parts]
         count = 0 if request.pixels is None else arrays.shape(request.pixels)[0]
-        paths = [_Part(number, chosen, count, one.paths) for (number, _, chosen), one in zip(parts, found, strict=True)]
-        previous = [one.previous for one in found]
+        paths = [
+            _Part(number, chosen, count, one.paths) for (number, _, chosen), one in zip(parts, renderings, strict=True)
+        ]
+        previous = [one.previous for one in renderings]
         return Rendering(
-            _joined([one.images for one in found], paths),
+            _joined([one.images for one in renderings], paths),
             None if any(x is None for x in previous) else _joined(previous, paths),
             paths,
         )
 
-    def _sum(self, parameters: Tree, paths: Sequence[_Part], found: Sequence[Tree]) -> Tree:
+    def _sum(self, parameters: Tree, paths: Sequence[_Part], gradients: Sequence[Tree]) -> Tree:
         """Return the sum of the states' gradients; a value that a state knows has none there."""
         total = trees.zeros_like({key: x for key, x in parameters.items() if key in self._wanted})
-        for part, gradient in zip(paths, found, strict=True):
+        for part, gradient in zip(paths, gradients, strict=True):
             known = self._known[part.state]
             total = {key: x + gradient[key] if key in gradient and key not in known else x for key, x in total.items()}
         return total
@@ -369,8 +371,8 @@ def _of_part(images: Array, part: _Part) -> Array:
         return images
     groups, _, channels = arrays.shape(images)
     rows = arrays.shaped(arrays.flat(images), (groups * part.count, channels), images)
-    found = arrays.gather_rows(rows, _rows(part, groups, arrays.flat(images)))
-    return arrays.shaped(arrays.flat(found), (groups, len(part.chosen), channels), images)
+    pixels = arrays.gather_rows(rows, _rows(part, groups, arrays.flat(images)))
+    return arrays.shaped(arrays.flat(pixels), (groups, len(part.chosen), channels), images)
 
 
 def _joined(parts: Sequence[Any], paths: Sequence[_Part]) -> Array:

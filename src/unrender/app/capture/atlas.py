@@ -68,8 +68,8 @@ def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple
         if done.returncode or not made.is_file():
             last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"status {done.returncode}"]
             raise InputError(f"the atlas of {len(mesh.faces)} faces could not be made: {last[0][:200]}")
-        with np.load(made, allow_pickle=False) as found:
-            of, faces, uv = found["of"], found["faces"].astype(np.int64), found["uv"].astype(float)
+        with np.load(made, allow_pickle=False) as arrays:
+            of, faces, uv = arrays["of"], arrays["faces"].astype(np.int64), arrays["uv"].astype(float)
     own = normals(mesh) if mesh.normals is None else mesh.normals
     return Mesh(mesh.vertices[of], faces, uv, own[of])
 

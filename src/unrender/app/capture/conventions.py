@@ -59,7 +59,7 @@ def reinterpreted(capture: Capture, axes: str, world_to_camera: bool) -> Capture
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    found = np.eye(4)
-    found[:3, :3] = matrix[:3, :3].T
-    found[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
-    return found
+    inverse = np.eye(4)
+    inverse[:3, :3] = matrix[:3, :3].T
+    inverse[:3, 3] = -matrix[:3, :3].T @ matrix[:3, 3]
+    return inverse

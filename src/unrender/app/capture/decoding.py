@@ -36,9 +36,9 @@ def _exponent(text: str) -> float:
     names = f"{SRGB}, {LINEAR}, {FIT} or an exponent from {_LEAST:g} to {_MOST:g}, such as 2.2"
     expected = f"--response {printable(text[:40])}: expected {names}"
     try:
-        found = float(text)
+        exponent = float(text)
     except ValueError as error:
         raise InputError(expected) from error
-    if not math.isfinite(found) or not _LEAST <= found <= _MOST:
+    if not math.isfinite(exponent) or not _LEAST <= exponent <= _MOST:
         raise InputError(expected)
-    return found
+    return exponent

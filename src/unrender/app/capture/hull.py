@@ -208,12 +208,13 @@ class Trial:
     overlap: float
 
 
-def explain(capture: Capture, views: CapturedViews, mesh: Mesh | None, found: float) -> str:
-    """One line on why masks and mesh, or masks and poses, do not fit, where `found` is their overlap as given."""
+def explain(capture: Capture, views: CapturedViews, mesh: Mesh | None, mean_overlap: float) -> str:
+    """Explain in one line why masks and mesh, or masks and poses, do not fit; `mean_overlap` is their overlap in the original
+    conventions."""
     whose = "the mesh covers" if mesh is not None else "a shape carved from all masks covers"
-    line = f"{whose} the masks with an overlap (IoU) of {found:.2f}, expected at least {SUFFICIENT:g}"
+    line = f"{whose} the masks with an overlap (IoU) of {mean_overlap:.2f}, expected at least {SUFFICIENT:g}"
     best = max(trials(capture, views, mesh), key=lambda trial: trial.overlap, default=None)
-    if best is None or best.overlap < found + _CLEAR:
+    if best is None or best.overlap < mean_overlap + _CLEAR:
         return f"{line}; no other convention of axes fits better: poses, masks or the order of names may be wrong"
     return f"{line}; {best.what} would give {best.overlap:.2f}: {best.remedy}"
 
@@ -223,7 +224,7 @@ def trials(capture: Capture, views: CapturedViews, mesh: Mesh | None) -> list[Tr
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int))
     few = [_reduced(views[index]) for index in chosen]
     names = [views[index].name for index in chosen]
-    found = []
+    results = []
     for axes, inverse in [(axes, inverse) for inverse in (False, True) for axes in AXES]:
         if (axes, inverse) == (capture.axes, capture.world_to_camera):
             continue
@@ -231,12 +232,12 @@ def trials(capture: Capture, views: CapturedViews, mesh: Mesh | None) -> list[Tr
         posed = [replace(view, camera_to_world=other[name]) for view, name in zip(few, names, strict=True)]
         direction = "world-to-camera" if inverse else "camera-to-world"
         remedy = f"give --axes {axes}" + (f" --{direction}" if inverse != capture.world_to_camera else "")
-        found.append(Trial(f"{direction} matrices with {axes} axes", remedy, _fit(posed, mesh)))
+        results.append(Trial(f"{direction} matrices with {axes} axes", remedy, _fit(posed, mesh)))
     upside_down = [replace(v, camera_to_world=v.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])) for v in few]
-    found.append(Trial("pictures turned by 180°", "turn the photographs and masks", _fit(upside_down, mesh)))
+    results.append(Trial("pictures turned by 180°", "turn the photographs and masks", _fit(upside_down, mesh)))
     for what, remedy, moved in _meshes(mesh):
-        found.append(Trial(what, remedy, _fit(few, moved)))
-    return found
+        results.append(Trial(what, remedy, _fit(few, moved)))
+    return results
 
 
 def _meshes(mesh: Mesh | None) -> Iterator[tuple[str, str, Mesh]]:
@@ -269,7 +270,7 @@ def _fit(views: CapturedViews, mesh: Mesh | None) -> float:
 
 
 def _reduced(view: CapturedView) -> CapturedView:
-    """The view at a fourth of the resolution or so."""
+    """Return the view at about a fourth of its resolution."""
     factor = max(1, min(view.lens.width, view.lens.height) // 48)
     width, height = view.lens.width // factor, view.lens.height // factor
 

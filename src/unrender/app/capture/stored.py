@@ -38,10 +38,10 @@ class StoredArrays:
 
     def __getitem__(self, index: int) -> np.ndarray:
         offset, shape = self._places[index]
-        found = np.empty(shape, np.float32)
+        array = np.empty(shape, np.float32)
         self._file.seek(offset)
-        self._file.readinto(found.data.cast("B"))  # pyright: ignore[reportAttributeAccessIssue]
-        return found
+        self._file.readinto(array.data.cast("B"))  # pyright: ignore[reportAttributeAccessIssue]
+        return array
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return (self[index] for index in range(len(self)))

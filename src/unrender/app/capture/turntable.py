@@ -77,16 +77,16 @@ def likeness(views: CapturedViews) -> float:
     if empty.sum() < _FEWEST_PIXELS:
         return 0.0
     rows = np.maximum(empty.sum(1), 1)[:, None, None]
-    found, poses = [], []
+    normalised, poses = [], []
     for view in views:
         blurred = ndimage.gaussian_filter(srgb(np.clip(view.values, 0, 1)), (_BLUR * longer, _BLUR * longer, 0))
         inside = np.where(empty[..., None], blurred, 0)
         values = (inside - inside.sum(1, keepdims=True) / rows)[empty].ravel()
         if (spread := float(values.std())) > _CONTRAST:
-            found.append((values / spread).astype(np.float32))
+            normalised.append((values / spread).astype(np.float32))
             poses.append(view.camera_to_world[:3, :3])
-    if len(found) < _FEWEST_VIEWS:
+    if len(normalised) < _FEWEST_VIEWS:
         return 0.0
-    correlations = np.array(found) @ np.array(found).T / len(found[0])
+    correlations = np.array(normalised) @ np.array(normalised).T / len(normalised[0])
     apart = np.einsum("aij,bij->ab", poses, poses) < 1 + 2 * np.cos(_ANGLE)
     return float(correlations[apart].mean()) if apart.any() else 0.0

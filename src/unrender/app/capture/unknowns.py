@@ -101,14 +101,14 @@ def parameters(unknowns: Sequence[str], diagonal: float, turntable: bool = False
 def textures(unknowns: Sequence[str], size: int) -> dict[str, tuple[str, np.ndarray]]:
     """Return {attribute of the material: (file in the texture folder, initial values (size, size, C))}; `normalmap` belongs to the map
     around it."""
-    found = {"base_color": ("base-colour.exr", np.full((size, size, 3), COLOUR, np.float32))}
+    textures_by_name = {"base_color": ("base-colour.exr", np.full((size, size, 3), COLOUR, np.float32))}
     if "roughness" in unknowns:
-        found["roughness"] = ("roughness.exr", np.full((size, size, 1), ROUGHNESS, np.float32))
+        textures_by_name["roughness"] = ("roughness.exr", np.full((size, size, 1), ROUGHNESS, np.float32))
     if "metallic" in unknowns:
-        found["metallic"] = ("metallic.exr", np.full((size, size, 1), _METALLIC, np.float32))
+        textures_by_name["metallic"] = ("metallic.exr", np.full((size, size, 1), _METALLIC, np.float32))
     if "normal" in unknowns:
-        found["normalmap"] = ("normal.exr", np.broadcast_to(np.array(_FLAT, np.float32), (size, size, 3)))
-    return found
+        textures_by_name["normalmap"] = ("normal.exr", np.broadcast_to(np.array(_FLAT, np.float32), (size, size, 3)))
+    return textures_by_name
 
 
 def stages(unknowns: Sequence[str], problem: Path, turntable: bool = False) -> Stages:

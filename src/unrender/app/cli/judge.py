@@ -43,36 +43,36 @@ def judge(
         arguments.use_variant(variant)
         from unrender.app.evaluation.judge import judge as measure
 
-        found = measure(arguments.finished_run(directory), held_out, environment, spp, out, overwrite)
-    _tell(console, found)
+        judgement = measure(arguments.finished_run(directory), held_out, environment, spp, out, overwrite)
+    _tell(console, judgement)
 
 
-def _tell(console: object, found: Judgement) -> None:
+def _tell(console: object, judgement: Judgement) -> None:
     from rich.table import Table
 
     from unrender.app.cli.comparison_table import plain
     from unrender.display.terminal import Console
 
     assert isinstance(console, Console)
-    if found.measures:
+    if judgement.measures:
         table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
         names = {"PSNR": "psnr", "SSIM": "ssim", "LPIPS": "lpips"}
-        names = {title: name for title, name in names.items() if found.mean[name] is not None}
+        names = {title: name for title, name in names.items() if judgement.mean[name] is not None}
         for title in ("photograph", *names):
             table.add_column(title, overflow="fold")
-        for photograph, each in zip(found.names, found.measures, strict=True):
+        for photograph, each in zip(judgement.names, judgement.measures, strict=True):
             table.add_row(plain(photograph), *(_number(getattr(each, name), name) for name in names.values()))
-        table.add_row("[bold]mean[/]", *(_number(found.mean[name], name) for name in names.values()))
+        table.add_row("[bold]mean[/]", *(_number(judgement.mean[name], name) for name in names.values()))
         console.print(table)
-    if found.albedo is not None:
-        factors = ", ".join(f"{factor:.3g}" for factor in found.albedo.factors)
+    if judgement.albedo is not None:
+        factors = ", ".join(f"{factor:.3g}" for factor in judgement.albedo.factors)
         console.print(
-            f"base colour: RMSE {found.albedo.rmse:.4f}, {found.albedo.scaled_rmse:.4f} after factors {factors}",
+            f"base colour: RMSE {judgement.albedo.rmse:.4f}, {judgement.albedo.scaled_rmse:.4f} after factors {factors}",
             markup=False,
         )
-    for notice in found.notices:
+    for notice in judgement.notices:
         console.print(f"note: {notice}", soft_wrap=True, markup=False)
-    console.print(f"overview: {found.folder / 'sheet.png'}", soft_wrap=True, markup=False)
+    console.print(f"overview: {judgement.folder / 'sheet.png'}", soft_wrap=True, markup=False)
 
 
 def _number(value: float | None, name: str) -> str:

@@ -270,10 +270,10 @@ def _search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
 
     axes = parse_axes(plan.over, method(plan.method), plan.settings)
     if plan.search == "grid":
-        found = Grid(axes)
-        if plan.trials not in (None, found.trials):
-            raise InputError(f"--trials {plan.trials}: a grid always has its {found.trials} points; leave it out")
-        return plan.model_copy(update={"trials": found.trials}), found
+        grid = Grid(axes)
+        if plan.trials not in (None, grid.trials):
+            raise InputError(f"--trials {plan.trials}: a grid always has its {grid.trials} points; leave it out")
+        return plan.model_copy(update={"trials": grid.trials}), grid
     count = plan.trials or _TRIALS
     kind = Random if plan.search == "random" else TPE
     return plan.model_copy(update={"trials": count}), kind(axes, count, plan.seed)

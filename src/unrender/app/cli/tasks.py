@@ -193,14 +193,14 @@ def receive(folder: Path, written: Mapping[str, bytes]) -> None:
 
 def in_turn(job: Job, tasks: Sequence[RunTask], problem: Problem) -> list[RunOutcome]:
     """Carry out runs one after the other, silently, until one does not come to its end."""
-    found: list[RunOutcome] = []
+    outcomes: list[RunOutcome] = []
     console, progress = quiet()
     with progress:
         for task in tasks:
-            found.append(carry_out(job, task, problem, console, progress))
-            if found[-1].status not in ENDED:
+            outcomes.append(carry_out(job, task, problem, console, progress))
+            if outcomes[-1].status not in ENDED:
                 break
-    return found
+    return outcomes
 
 
 @functools.lru_cache(maxsize=1)

@@ -48,8 +48,8 @@ def turntable(
         from unrender.app.evaluation.turntable import turntable as write
 
         axis = None if up is None else _axis(up)
-        found = write(directory, place, environment, frames, rate, size, spp, elevation, axis, background, overwrite)
-    console.print(f"video: {found}", soft_wrap=True, markup=False)
+        video = write(directory, place, environment, frames, rate, size, spp, elevation, axis, background, overwrite)
+    console.print(f"video: {video}", soft_wrap=True, markup=False)
 
 
 def _axis(text: str) -> list[float]:

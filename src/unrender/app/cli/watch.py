@@ -52,12 +52,12 @@ def watch(
         address = server.Address(opened.getsockname()[1])
         typer.echo(f"watching at {address.url}\nCtrl-C stops this page; the runs continue")
         with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
-            found = (
+            on_admission = (
                 None if no_browser else _open(address, stack)
             )  # the socket is listening already, so the browser can connect
             with contextlib.suppress(OSError):
                 os.nice(_NICE)  # give the watched runs priority; not earlier, since the browser would inherit it
-            server.serve([directory.absolute() for directory in directories], address, opened, found)
+            server.serve([directory.absolute() for directory in directories], address, opened, on_admission)
 
 
 def _runs(directory: Path) -> list[Path]:

@@ -98,29 +98,29 @@ class DistributedExecutor:
     # ------------------------------------------------------------------ Executor
 
     def check(self, estimator: Any) -> None:
-        found = estimator
-        while isinstance(found, FilteredGradient):
-            found = found.inner
-        name = type(found).__name__
-        if not isinstance(found, (PathGradient, MetaEstimator)):
+        inner = estimator
+        while isinstance(inner, FilteredGradient):
+            inner = inner.inner
+        name = type(inner).__name__
+        if not isinstance(inner, (PathGradient, MetaEstimator)):
             raise InputError(
                 f"{name} renders all views of a problem itself, so they cannot be dealt to workers; "
                 "methods plain, rcv, meta, coupled, adaptive and most choices of auto can"
             )
-        if getattr(found, "differential_bsdf", False):
+        if getattr(inner, "differential_bsdf", False):
             raise InputError(f"{name}: differential_bsdf is not supported by workers; leave it out")
-        if getattr(found, "emitters", "scene") == "adaptive":
+        if getattr(inner, "emitters", "scene") == "adaptive":
             raise InputError(f'{name}: emitters="adaptive" is not supported by workers; leave emitters="scene"')
-        if isinstance(found.pixels, AdaptiveCounts):
+        if isinstance(inner.pixels, AdaptiveCounts):
             raise InputError(
                 f"{name}: pixels=AdaptiveCounts(...) is not supported by workers; use unrender.pixels.All()"
             )
-        image = found.image.inner if isinstance(found.image, Denoised) else found.image
+        image = inner.image.inner if isinstance(inner.image, Denoised) else inner.image
         if not isinstance(image, (Plain, RecursiveControlVariate)):
             raise InputError(
                 f"{name}: the memory of {type(image).__name__} cannot be distributed to workers; use another image estimator"
             )
-        if isinstance(found, MetaEstimator) and not (isinstance(found.pixels, All) or isinstance(image, Plain)):
+        if isinstance(inner, MetaEstimator) and not (isinstance(inner.pixels, All) or isinstance(image, Plain)):
             raise InputError(
                 f"{name}: a control variate of images and mini-batches of pixels at once cannot be dealt to workers; leave out one"
             )
@@ -145,9 +145,9 @@ class DistributedExecutor:
         self._in_step = False
         if isinstance(kept, Memory):
             self._collect_if_long(kept)
-        found = self._sample(request, [replies[index] for index in sorted(replies)], kept)
-        told = [(part, replies[index].draws) for index, part in enumerate(parts) if part is not None]
-        return replace(found, draws=joined([(part, draws) for part, draws in told if draws is not None]))
+        gathered = self._sample(request, [replies[index] for index in sorted(replies)], kept)
+        draws_of_parts = [(part, replies[index].draws) for index, part in enumerate(parts) if part is not None]
+        return replace(gathered, draws=joined([(part, draws) for part, draws in draws_of_parts if draws is not None]))
 
     def trace_pilot(self, problem: Problem, request: PilotRequest) -> list[np.ndarray]:
         del problem
@@ -165,11 +165,11 @@ class DistributedExecutor:
             if part is not None
         }
         replies = self._replies(calls, sent, None)
-        found = [np.empty((sum(map(len, used.values())), *x.shape[1:]), x.dtype) for x in replies[min(replies)].paths]
+        paths = [np.empty((sum(map(len, used.values())), *x.shape[1:]), x.dtype) for x in replies[min(replies)].paths]
         for share, positions in used.items():
-            for whole, part in zip(found, replies[share].paths, strict=True):
+            for whole, part in zip(paths, replies[share].paths, strict=True):
                 whole[positions] = part[: len(positions)]
-        return found
+        return paths
 
     def _reset_traffic(self) -> None:
         """Reset the traffic counters at the start of a step."""
@@ -189,13 +189,13 @@ class DistributedExecutor:
             return whole if state.snapshot is None else replace(whole, snapshot=_snapshot(whole))
         if dataclasses.is_dataclass(state) and not isinstance(state, type):
             parts = {each.name: getattr(state, each.name) for each in dataclasses.fields(state) if each.init}
-            found = {name: self.collect(part) for name, part in parts.items()}
-            changed = {name: part for name, part in found.items() if part is not parts[name]}
+            collected = {name: self.collect(part) for name, part in parts.items()}
+            changed = {name: part for name, part in collected.items() if part is not parts[name]}
             return replace(state, **changed) if changed else state
         if isinstance(state, (tuple, list)) and type(state) in (tuple, list):
-            found = [self.collect(part) for part in state]
-            same = all(a is b for a, b in zip(found, state, strict=True))
-            return state if same else type(state)(found)
+            collected = [self.collect(part) for part in state]
+            same = all(a is b for a, b in zip(collected, state, strict=True))
+            return state if same else type(state)(collected)
         return state
 
     def snapshot(self) -> Any:
@@ -219,9 +219,9 @@ class DistributedExecutor:
         """Return the call that all shares have in common, and its arrays."""
         sent: dict[int, Sent] = {}
 
-        def named(found: Mapping[str, Sent]) -> dict[str, int]:
-            sent.update({one.number: one for one in found.values()})
-            return self._outbox.values(found)
+        def named(values: Mapping[str, Sent]) -> dict[str, int]:
+            sent.update({one.number: one for one in values.values()})
+            return self._outbox.values(values)
 
         def numbered(tree: Tree) -> dict[str, int]:
             return named(self._outbox.numbered(tree))
@@ -269,7 +269,7 @@ class DistributedExecutor:
 
     def _replies(self, calls: Mapping[int, Call], sent: Mapping[int, Sent], memory: Memory | None) -> dict[int, Reply]:
         """Return all replies. The memory of a lost share is restored by repeating its steps, and the share is called again."""
-        found: dict[int, Reply] = {}
+        received: dict[int, Reply] = {}
         started, busy = time.perf_counter(), 0.0
         for share in self._hosts.movable():
             if memory is not None:
@@ -277,22 +277,22 @@ class DistributedExecutor:
             self._hosts.move(share)
             self._forget({share} | self._hosts.emptied())
         for _ in range(_MOST_LOSSES):
-            open_ = {share: call for share, call in calls.items() if share not in found}
+            open_ = {share: call for share, call in calls.items() if share not in received}
             ready = list(open_) if memory is None else self._ensured(open_, memory.recipe)
             addressed = {share: self._addressed(share, open_[share], sent) for share in ready}
             self.traffic.sent += sum(payload_bytes(call) for call in addressed.values())
             replies = self._hosts.run(addressed)
             self.traffic.received += sum(payload_bytes(reply) for reply in replies.values())
             busy = max([busy, *(reply.seconds for reply in replies.values())])
-            found |= replies
+            received |= replies
             lost = (set(open_) - set(replies)) | self._hosts.emptied()
             self._forget(lost)
             self.traffic.lost += len(lost)
-            if len(found) == len(calls):
+            if len(received) == len(calls):
                 self.traffic.busy += busy
                 self.traffic.seconds += time.perf_counter() - started
-                return found
-        views = ", ".join(str(view) for share in sorted(set(calls) - set(found)) for view in self._shares[share])
+                return received
+        views = ", ".join(str(view) for share in sorted(set(calls) - set(received)) for view in self._shares[share])
         raise InputError(f"workers: those of views {views} were lost {_MOST_LOSSES} times in one step")
 
     def _forget(self, shares: Iterable[int]) -> None:
@@ -335,16 +335,16 @@ class DistributedExecutor:
     def _collect(self, recipe: Recipe) -> None:
         if recipe.stored is not None:
             return
-        found: dict[int, Any] = {}
+        packed_parts: dict[int, Any] = {}
         shares = range(len(self._shares))
         for _ in range(_MOST_LOSSES):
             if len(self._ensured(shares, recipe)) == len(shares):
                 fetched = self._hosts.fetch(recipe.number)
                 self._forget(self._hosts.emptied() | (set(shares) - set(fetched)))
-                found |= fetched
-            if len(found) == len(shares):
-                recipe.store(tuple(found[share] for share in shares))
-                self._collection = sum(payload_bytes(packed.tensors) for packed in found.values())
+                packed_parts |= fetched
+            if len(packed_parts) == len(shares):
+                recipe.store(tuple(packed_parts[share] for share in shares))
+                self._collection = sum(payload_bytes(packed.tensors) for packed in packed_parts.values())
                 return
         raise InputError(f"workers: some were lost {_MOST_LOSSES} times while their memory was collected")
 
@@ -352,10 +352,10 @@ class DistributedExecutor:
         """Return the memory of each view, in the views' order."""
         self._collect(recipe)
         assert recipe.stored is not None
-        found: dict[int, Any] = {}
+        by_view: dict[int, Any] = {}
         for share, packed in zip(self._shares, recipe.stored, strict=True):
-            found |= zip(share, unpack(packed), strict=True)
-        return tuple(found[view] for view in sorted(found))
+            by_view |= zip(share, unpack(packed), strict=True)
+        return tuple(by_view[view] for view in sorted(by_view))
 
     # ------------------------------------------------------------------ replies to a sum
 

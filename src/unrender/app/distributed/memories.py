@@ -53,10 +53,10 @@ class Recipe:
 
     def chain(self) -> list[Recipe]:
         """Return the recipes from the last stored one, or the first step, to this one."""
-        found: list[Recipe] = [self]
-        while found[-1].stored is None and found[-1].base is not None:
-            found.append(found[-1].base)
-        return found[::-1]
+        recipes: list[Recipe] = [self]
+        while recipes[-1].stored is None and recipes[-1].base is not None:
+            recipes.append(recipes[-1].base)
+        return recipes[::-1]
 
 
 class Memory:

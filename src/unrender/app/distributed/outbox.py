@@ -81,9 +81,9 @@ class Outbox:
             self._note(key, pair["exact"], Sent(self._next(), np.asarray(pair["sent"])))
 
     def _sent(self, key: str, value: Any) -> Sent:
-        if (found := self._known.get(id(value))) is not None:
+        if (entry := self._known.get(id(value))) is not None:
             self._known.move_to_end(id(value))
-            return found[1]
+            return entry[1]
         host = arrays.numpy(value)
         last = self._last.get(key)
         if last is not None and last[1].value.shape == host.shape:

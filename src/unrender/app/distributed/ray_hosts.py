@@ -130,8 +130,8 @@ class RayHosts:
         return replies
 
     def emptied(self) -> set[int]:
-        found, self._emptied = self._emptied, set()
-        return found
+        emptied, self._emptied = self._emptied, set()
+        return emptied
 
     def store(self, share: int, number: int, packed: Packed) -> bool:
         return share in self._collected({share: self._called(share, "store", share, number, packed)})
@@ -149,11 +149,11 @@ class RayHosts:
             return []
         if behind := [share for share in range(self.count) if self._lags[share].behind >= _IN_A_ROW]:
             return behind[:1]
-        loads, found = [sorted(worker.shares) for worker in self._workers], list[int]()
+        loads, movable = [sorted(worker.shares) for worker in self._workers], list[int]()
         while len(most := max(loads, key=len)) > len(least := min(loads, key=len)) + 1:
             least.insert(0, most.pop())
-            found.append(least[0])
-        return found
+            movable.append(least[0])
+        return movable
 
     def move(self, share: int) -> None:
         """Move a share. Do nothing if it has moved meanwhile, or there is no other worker."""
@@ -190,13 +190,13 @@ class RayHosts:
         groups: dict[tuple[int, ...], list[int]] = {}
         for share, values in arrays.items():
             groups.setdefault((*sorted(values),), []).append(share)
-        found: dict[int, Any] = {}
+        references: dict[int, Any] = {}
         for members in groups.values():
             one: Any = arrays[members[0]]
             if one and len(members) > 1:
                 one = self._guarded(lambda one=one: self._ray.put(one))
-            found |= dict.fromkeys(members, one)
-        return found
+            references |= dict.fromkeys(members, one)
+        return references
 
     def _called(self, share: int, name: str, *arguments: Any) -> Any:
         """Return the reference to the answer of a share's worker. Ray stores large arguments in the object store."""
@@ -210,7 +210,7 @@ class RayHosts:
 
     def _collected(self, references: Mapping[int, Any]) -> dict[int, Any]:
         """Return the results of calls to shares, without those of lost workers, whose shares are on other workers afterwards."""
-        found: dict[int, Any] = {}
+        results: dict[int, Any] = {}
         open_ = dict(references)
         started = last = time.monotonic()
         lost: list[_Worker] = []
@@ -223,7 +223,7 @@ class RayHosts:
             for share in [share for share, reference in open_.items() if reference in done]:
                 last = time.monotonic()
                 try:
-                    found[share] = self._ray.get(open_.pop(share), timeout=_ANSWER)
+                    results[share] = self._ray.get(open_.pop(share), timeout=_ANSWER)
                 except Exception as error:
                     self._classify_error(share, error, lost)
             now = time.monotonic()
@@ -236,7 +236,7 @@ class RayHosts:
                 open_ = {other: reference for other, reference in open_.items() if self._of[other] is not lost[-1]}
         for worker in dict.fromkeys(lost):
             self._replace(worker)
-        return found
+        return results
 
     def _limit(self, share: int) -> float:
         usual = self._lags[share].usual

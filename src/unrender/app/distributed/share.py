@@ -57,11 +57,11 @@ class ViewShare:
             request = replace(request, batch=MiniBatch(sample, tangents=self._tree(call.tangents)))
         parts = [request.estimate_frame(self.problem, frame, call.key.fold(max(index, 0))) for index, frame in frames]
         kept = tuple(part.kept for part in parts)
-        found = {name: [getattr(part, name) for part in parts] for name in TREES}
-        arrays.evaluate(kept, found, [part.loss for part in parts])
+        parts_by_name = {name: [getattr(part, name) for part in parts] for name in TREES}
+        arrays.evaluate(kept, parts_by_name, [part.loss for part in parts])
         if call.batch is None:
             self._remember(call, kept)
-        sums = {name: total(map(trees.numpy, parts)) for name, parts in found.items()}
+        sums = {name: total(map(trees.numpy, parts)) for name, parts in parts_by_name.items()}
         if call.single:
             sums = {name: {key: value.astype(np.float32) for key, value in tree.items()} for name, tree in sums.items()}
         shown = [(index, part) for (index, _), part in zip(frames, parts, strict=True) if call.pictures and index >= 0]
@@ -94,8 +94,8 @@ class ViewShare:
 
     def _receive(self, call: Call) -> None:
         for number, value in call.arrays.items():
-            found = value.applied(self._host[value.base]) if isinstance(value, Difference) else value
-            self._host[number], self._arrays[number] = found, self.problem.renderer.array(found)
+            received = value.applied(self._host[value.base]) if isinstance(value, Difference) else value
+            self._host[number], self._arrays[number] = received, self.problem.renderer.array(received)
         for number in call.drop_arrays:
             self._host.pop(number, None)
             self._arrays.pop(number, None)

@@ -118,8 +118,8 @@ def _scene(problem: Problem) -> Any:
 
 def _located(given: _Given, *names: str) -> _Given:
     """Return the object with absolute file names, since workers have other working directories."""
-    found = {name: value for name in names if isinstance(value := getattr(given, name), (str, Path))}
-    located: dict[str, Any] = {name: Path(value).absolute() for name, value in found.items()}
+    paths = {name: value for name in names if isinstance(value := getattr(given, name), (str, Path))}
+    located: dict[str, Any] = {name: Path(value).absolute() for name, value in paths.items()}
     if isinstance(given, View) and given.known is not None:
         known = given.known.items()
         located["known"] = {k: Path(x).absolute() if isinstance(x, (str, Path)) else x for k, x in known}

@@ -82,8 +82,8 @@ def parse(description: Path | Mapping[str, Any]) -> Parsed:
     """Parse an XML file or a dictionary, and resolve its references. Only Mitsuba's own plugins are loaded.
 
     Raises:
-        InputError: the XML is malformed or includes files from outside its folder; or a type is not the name of a plugin, or names a plugin
-            in the scene's folder. Mitsuba's own refusals have their original type.
+        InputError: the XML is malformed or includes files from outside its folder; or a type is not the name of a plugin, or names a
+            plugin in the scene's folder. Mitsuba's own refusals have their original type.
     """
     config = mi.parser.ParserConfig(variant.ensure())
     config.merge_equivalent = config.merge_meshes = config.parallel = False
@@ -134,8 +134,8 @@ def _check_complete(props: Any) -> None:
 
 def _settle(props: Any, search: Sequence[Path]) -> None:
     """Make the file name of an object absolute if the file exists."""
-    if _is_text(props, _FILE) and (found := scene_files.resolve(props[_FILE], search)) is not None:
-        props[_FILE] = str(found.resolve())
+    if _is_text(props, _FILE) and (resolved := scene_files.resolve(props[_FILE], search)) is not None:
+        props[_FILE] = str(resolved.resolve())
 
 
 def _check_paths(nodes: Any) -> None:

@@ -128,8 +128,8 @@ class Pass:
         """
         raise NotImplementedError  # of a pass whose `function` is its own
 
-    def result(self, paths: CameraPaths, found: Any) -> Any:
-        """Return what the launch returns, from what `call` found."""
+    def result(self, paths: CameraPaths, output: Any) -> Any:
+        """Return the result of the launch from the output of `call`."""
         return None
 
 
@@ -145,8 +145,8 @@ class ImagePass(Pass):
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         return paths.primal()
 
-    def result(self, paths: CameraPaths, found: Any) -> Any:
-        return paths.weighted(*found)[0]
+    def result(self, paths: CameraPaths, output: Any) -> Any:
+        return paths.weighted(*output)[0]
 
 
 @dataclass(frozen=True)
@@ -161,8 +161,8 @@ class ImagePairPass(Pass):
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         return paths.primal()
 
-    def result(self, paths: CameraPaths, found: Any) -> Any:
-        return paths.weighted(*found)
+    def result(self, paths: CameraPaths, output: Any) -> Any:
+        return paths.weighted(*output)
 
 
 @dataclass(frozen=True)
@@ -264,8 +264,8 @@ class TangentPass(Pass):
         (radiance,) = own
         return paths.forward(radiance)
 
-    def result(self, paths: CameraPaths, found: Any) -> Any:
-        derivative = found[0] * paths.weight
+    def result(self, paths: CameraPaths, output: Any) -> Any:
+        derivative = output[0] * paths.weight
         return dr.square(
             derivative if self.combined is None else mi.Spectrum(dr.dot(mi.Spectrum(*self.combined), derivative))
         )
@@ -288,8 +288,8 @@ class ConnectionsPass(Pass):
         weights, noise = (film.film_adjoint(each, size.spp, size.pixels) for each in image_weights)
         return paths.connections(radiance, weights, noise, self.bounces)
 
-    def result(self, paths: CameraPaths, found: Any) -> Any:
-        return found.values, found.emitters
+    def result(self, paths: CameraPaths, output: Any) -> Any:
+        return output.values, output.emitters
 
 
 @dataclass(frozen=True)
@@ -302,9 +302,9 @@ class VerticesPass(Pass):
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         return paths.vertices()
 
-    def result(self, paths: CameraPaths, found: Any) -> Any:
+    def result(self, paths: CameraPaths, output: Any) -> Any:
         """Return the number of vertices in each channel of a spectrum, to be developed like radiance."""
-        return mi.Spectrum(found)
+        return mi.Spectrum(output)
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,8 +56,8 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
     """
     for given, name in ((folder, "FOLDER"), (masks, "--masks")):
         if given is not None and bounded_files.kind(given) != "folder":
-            found = "not a folder" if bounded_files.exists(given) else "no such folder"
-            raise InputError(f"{given}: {found}" if name == "FOLDER" else f"{name} {given}: {found}")
+            problem = "not a folder" if bounded_files.exists(given) else "no such folder"
+            raise InputError(f"{given}: {problem}" if name == "FOLDER" else f"{name} {given}: {problem}")
     if kind == LIGHTS:
         raise InputError(f"{folder}: not in the format {LIGHTS}: expected {lights.FILE}")
     if kind is not None and kind not in FORMATS:

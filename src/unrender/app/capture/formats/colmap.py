@@ -71,10 +71,10 @@ def recognise(folder: Path) -> bool:
 
 def read(folder: Path, masks: Path | None = None) -> Capture:
     """Read the capture of such a folder. Raise `InputError`."""
-    found = _place(folder)
-    if found is None:
+    location = _place(folder)
+    if location is None:
         raise InputError(f"{folder}: no cameras and images of COLMAP")
-    place, ending = found
+    place, ending = location
     cameras_file, images_file = place / f"cameras{ending}", place / f"images{ending}"
     text = ending == ".txt"
     lenses = dict(_text_cameras(cameras_file) if text else _binary_cameras(cameras_file))

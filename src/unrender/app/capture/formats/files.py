@@ -57,8 +57,8 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
     """
     relative = _relative(folder, photograph)
     if given is not None:
-        found = _of_name(given, relative)
-        return None if found == photograph else found
+        mask = _of_name(given, relative)
+        return None if mask == photograph else mask
     if named is not None:
         path = folder / named
         if not is_file(path):
@@ -72,7 +72,7 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
             return beside
     own = photograph.parent.with_name(f"{photograph.parent.name}_mask") if photograph.parent.name else folder / "mask"
     places = [own, *(place / name for place in (folder, photograph.parent.parent) for name in _MASK_FOLDERS)]
-    return next((found for place in places if (found := _of_name(place, relative)) is not None), None)
+    return next((mask for place in places if (mask := _of_name(place, relative)) is not None), None)
 
 
 def _relative(folder: Path, photograph: Path) -> list[Path]:
@@ -87,8 +87,8 @@ def _of_name(folder: Path, relative: Iterable[Path]) -> Path | None:
         place = folder / path.parent
         if place.is_dir():
             names = (path.name, *(f"{path.stem}{e}" for e in PICTURES), *(f"{path.name}{e}" for e in PICTURES))
-            if (found := next((place / name for name in names if is_file(place / name)), None)) is not None:
-                return found
+            if (file := next((place / name for name in names if is_file(place / name)), None)) is not None:
+                return file
     return None
 
 

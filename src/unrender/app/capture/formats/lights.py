@@ -74,22 +74,22 @@ def _directions(path: Path) -> np.ndarray:
     try:
         if len(lines) < 2 or len(lines[0]) != 1 or int(lines[0][0]) != len(lines) - 1:
             raise InputError(expected)
-        found = np.array([[float(number) for number in line] for line in lines[1:]], float)
+        directions = np.array([[float(number) for number in line] for line in lines[1:]], float)
     except ValueError as error:
         raise InputError(f"{expected} ({printable(str(error)[:80])})") from error
-    if found.ndim != 2 or found.shape[1] != 3 or not np.isfinite(found).all():
+    if directions.ndim != 2 or directions.shape[1] != 3 or not np.isfinite(directions).all():
         raise InputError(expected)
-    length = np.linalg.norm(found, axis=1, keepdims=True)
+    length = np.linalg.norm(directions, axis=1, keepdims=True)
     if not (length > 0).all():
         raise InputError(f"{expected}; one is 0 0 0")
-    if len(found) < _FEWEST:
-        raise InputError(f"{path}: {len(found)} lights, expected at least {_FEWEST}")
-    if (found[:, 2] <= 0).any():
+    if len(directions) < _FEWEST:
+        raise InputError(f"{path}: {len(directions)} lights, expected at least {_FEWEST}")
+    if (directions[:, 2] <= 0).any():
         raise InputError(f"{path}: a light behind the object (z <= 0); expected z towards the camera")
-    found = found / length
-    if np.linalg.svd(found)[1][2] < 0.05 * len(found) ** 0.5:
+    directions = directions / length
+    if np.linalg.svd(directions)[1][2] < 0.05 * len(directions) ** 0.5:
         raise InputError(f"{path}: all lights lie in a plane, which leaves normals unknown")
-    return found
+    return directions
 
 
 def _by_number(path: Path) -> list[tuple[int, int | str]]:

@@ -53,6 +53,6 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
         mask = files.find_mask(folder, file, masks)
-        found, scale = pose(matrix[:, :4], AXES, False, where)
-        photographs.append(Photograph(file.name, file, lens, found, mask, scale=scale))
+        camera_pose, scale = pose(matrix[:, :4], AXES, False, where)
+        photographs.append(Photograph(file.name, file, lens, camera_pose, mask, scale=scale))
     return Capture(folder, "llff", tuple(photographs), AXES, False)

@@ -63,13 +63,13 @@ def _nodes(ray: Any, address: str) -> list[Any]:
     until = time.monotonic() + _SECONDS
     try:
         client = ray._raylet.GcsClient(address=address)
-        while not (found := list(client.get_all_node_info(timeout=_SECONDS).values())) and time.monotonic() < until:
+        while not (nodes := list(client.get_all_node_info(timeout=_SECONDS).values())) and time.monotonic() < until:
             time.sleep(0.1)
     except Exception as error:  # of many kinds
         reason = one_line(reason_of(error, 200))
         raise InputError(f"workers: Ray cannot be reached at {address}: {reason}") from error
-    if not found:
+    if not nodes:
         raise InputError(
             f"workers: the cluster at {address} has no node; run ray status to see whether its nodes are alive"
         )
-    return found
+    return nodes

@@ -60,7 +60,7 @@ class Workers:
             number, address = address, ""
         counted = number in ("", "auto") or (number.isascii() and number.isdigit() and 1 <= int(number[:7]) <= _MOST)
         located = not (at or address) or (
-            (found := _ADDRESS.match(address)) is not None and 0 < int(found.group(2)) < 65536
+            (match := _ADDRESS.match(address)) is not None and 0 < int(match.group(2)) < 65536
         )
         if not counted or not located or not text.strip():
             if "://" in text:

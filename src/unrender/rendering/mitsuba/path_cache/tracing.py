@@ -88,8 +88,8 @@ class TracePass(Pass):
         record = _Record(self._empty(lanes), lanes, mi.Color3f(paths.weight))
         return functools.partial(self._trace, context, record, paths.ray, paths.sampler)
 
-    def result(self, paths: CameraPaths, found: Any) -> Any:
-        return found
+    def result(self, paths: CameraPaths, output: Any) -> Any:
+        return output
 
     def _trace(self, context: PathContext, record: _Record, ray: Any, sampler: Any) -> dict[str, Any]:
         state = _State(
