@@ -282,7 +282,7 @@ def test_a_key_that_the_scene_between_stages_has_under_another_name_is_refused(s
     stage = stages_file.Stage("colour", (f"_{KEY}",))
     whole = Whole.read(stages_file.Stages(staged / "problem.toml", (first, stage), steps=1))
     for _ in range(2):  # what was written is not taken the second time
-        with pytest.raises(InputError, match=rf"stage colour: _{KEY} is called \S+ in the scene that holds"):
+        with pytest.raises(InputError, match=rf"stage colour: _{KEY} is called \S+ in the scene with"):
             whole.of_stage(stage, {"sky.radiance.value": np.full(3, 0.5, np.float32)}, staged / "scene")
     assert not (staged / "scene").exists()
 

@@ -205,6 +205,6 @@ def test_a_fitted_response_is_an_unknown_and_not_beside_exposures() -> None:
 def test_photographs_under_known_lights_choose_by_themselves(tmp_path: Path) -> None:
     (tmp_path / "lit").mkdir()
     (tmp_path / "lit" / "lights.txt").write_text("1\n0 0 1\n")
-    with pytest.raises(InputError, match="--response: of one camera under known lights"):
+    with pytest.raises(InputError, match="--response: with one camera under known lights"):
         ur.app.import_capture(tmp_path / "lit", tmp_path / "out", ur.app.ImportOptions(response="linear"))
     assert not (tmp_path / "out").exists()
