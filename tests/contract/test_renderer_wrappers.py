@@ -165,7 +165,7 @@ def test_missing_capabilities_are_refused_and_not_made_up(names: tuple[str, ...]
     session = renderer.prepare(list(given), None)
     assert list(renderer.formats())[:3] == [PictureFormat(signed=True)] * 3
     assert np.all(session.vertices(given, SampleRequest(0, 4, 1, 2)) == 1.0)
-    with pytest.raises(InputError, match="keep their triangles|cannot change"):
+    with pytest.raises(InputError, match=r"keep their triangles|cannot change"):
         renderer.with_meshes({"map": None}, [])
     with pytest.raises(InputError, match="differential_bsdf"):
         renderer.with_differential_bsdf()

@@ -24,7 +24,7 @@ from unrender.core.text import one_line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line. Returns the exit status."""
+    """Run the command line and return the exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:  # without further imports
         print(metadata.version("unrender"))

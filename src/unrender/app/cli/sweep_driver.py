@@ -174,7 +174,7 @@ class _State:
     stopped: str = ""
 
     def save(self, folder: Path, status: str = "running") -> None:
-        """Write sweep.json as it is now."""
+        """Write the current sweep.json."""
         best = self.trials.best
         ended = [trial for _, trial in sorted(self.trials.ended.items())]
         changes = {
@@ -304,7 +304,7 @@ def _drive(console: Console, session: Session, state: _State, executor: Executor
 
 
 def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:
-    """Return the record of a completed trial; None if this process was told to stop."""
+    """Return the record of a completed trial; None if this process is being stopped."""
     started = state.under_way.pop(ended.key)
     runs, message = [], ended.message
     if not message:

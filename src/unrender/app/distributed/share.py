@@ -176,7 +176,7 @@ class ViewShare:
 
 
 class Hosts(Protocol):
-    """Holds shares, and may lose them."""
+    """Processes that hold shares, and can lose them."""
 
     @property
     def count(self) -> int:
