@@ -3,8 +3,8 @@
     estimator = { type = "PathGradient", spp = 2, image = { type = "RecursiveControlVariate", space = "path" } }
 
 A component is a registered frozen dataclass (`core.registry`); its table has a type and fields. A field whose annotation is a protocol
-takes components of that kind alone, and a text in place of a table: `loss = "L1"`, `schedule = "cosine(300)"`. TOML has no null: fields
-that are None are left out where that is their default, and else listed under "none".
+takes components of that kind only, and a text in place of a table: `loss = "L1"`, `schedule = "cosine(300)"`. TOML has no null: fields
+that are None are omitted if this is their default, and listed under "none" otherwise.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from unrender.core.suggestions import did_you_mean
 
 _CALL = re.compile(r"\s*([A-Za-z_]\w*)\s*(?:\(([^()]*)\))?\s*")
 _NEXT = "then"
-"""The field that takes what follows the word "then"."""
+"""Name of the field for the component after the word "then"."""
 
 
 def parse(text: str, kind: str) -> Any:
-    """The component that `text` describes: its name in any case, and the numbers of its first fields in their order.
+    """Return the component of a text: its name, in any case, and the values of its first fields in order.
 
     Args:
-        text: "name", "name(number, ...)", or two of these with "then" between them where the first has a field `then`.
-        kind: of `registry.KINDS`.
+        text: "name", "name(number, ...)", or two of these with "then" between them if the first has a field `then`.
+        kind: kind of component, one of `registry.KINDS`.
 
     Raises:
         InputError: an unknown name, or arguments that do not fit.
@@ -89,7 +89,7 @@ class NotStorable(Exception):
 
 
 def table(component: Any) -> dict[str, Any]:
-    """The table of a component. Raises `NotStorable` with the reason."""
+    """Return the table of a component. Raises `NotStorable` with the reason."""
     kind = type(component)
     known = registry.component_of(kind)
     if known is None:
@@ -98,28 +98,28 @@ def table(component: Any) -> dict[str, Any]:
 
 
 def fields(value: Any) -> dict[str, Any]:
-    """The fields of a dataclass as a table has them. Raises `NotStorable` with the reason."""
-    found: dict[str, Any] = {}
+    """Return the fields of a dataclass in types of TOML. Raises `NotStorable` with the reason."""
+    values: dict[str, Any] = {}
     none = []
     for field in dataclasses.fields(value):
         if not field.init:
             continue
         part = getattr(value, field.name)
         if part is not None:
-            found[field.name] = _plain(part, f"{type(value).__name__}.{field.name}")
+            values[field.name] = _plain(part, f"{type(value).__name__}.{field.name}")
         elif field.default is not None:
             none.append(field.name)
-    return found | ({_NONE: none} if none else {})
+    return values | ({_NONE: none} if none else {})
 
 
 def component(given: Any, kind: str | None = None, where: str = "", folder: Path | None = None) -> Any:
-    """The component that a table, or the short text form of its kind, describes.
+    """Return the component of a table, or of the short text form of its kind.
 
     Args:
-        given: {"type": name, field: value, ...}; where `kind` is known also "name", or the short form of a kind that has one.
-        kind: of `registry.KINDS`; None takes any that stands in tables.
-        where: what a message begins with.
-        folder: what the relative paths in it start from; None leaves them.
+        given: {"type": name, field: value, ...}; if `kind` is set also "name", or the short form of a kind that has one.
+        kind: kind of component, one of `registry.KINDS`; None accepts every kind that tables can store.
+        where: prefix of messages.
+        folder: folder to which relative paths refer; None leaves them unchanged.
 
     Raises:
         InputError: unknown types or fields (with the nearest known one), missing fields, values of the wrong type or out of range.
@@ -133,7 +133,7 @@ def component(given: Any, kind: str | None = None, where: str = "", folder: Path
 
 
 def build(made_by: type[_T], given: Mapping[str, Any]) -> _T:
-    """A dataclass from a table of its fields. Raises `InputError` as `component` does."""
+    """Return a dataclass from a table of its fields. Raises `InputError` as `component` does."""
     return _build(made_by, made_by.__name__, given, None, 0)
 
 
@@ -156,22 +156,22 @@ def _component(given: Any, kind: str | None, folder: Path | None, depth: int) ->
 
 
 def _build(made_by: type[_T], name: str, given: Mapping[str, Any], folder: Path | None, depth: int) -> _T:
-    found = {field.name: field for field in dataclasses.fields(made_by) if field.init}  # pyright: ignore[reportArgumentType]
+    known = {field.name: field for field in dataclasses.fields(made_by) if field.init}  # pyright: ignore[reportArgumentType]
     none = given.get(_NONE, [])
-    if _NONE not in found and (
-        not isinstance(none, list) or any(not isinstance(key, str) or key not in found for key in none)
+    if _NONE not in known and (
+        not isinstance(none, list) or any(not isinstance(key, str) or key not in known for key in none)
     ):
         raise InputError(f"none: expected a list of fields of {name}, got {repr(none)[:80]}")
-    arguments: dict[str, Any] = {} if _NONE in found else dict.fromkeys(none)
+    arguments: dict[str, Any] = {} if _NONE in known else dict.fromkeys(none)
     hints = _hints(made_by)
     for key, value in given.items():
-        if key == _NONE and _NONE not in found:
+        if key == _NONE and _NONE not in known:
             continue
-        if key not in found:
-            has = f"it has {', '.join(found)}" if found else "it has none"
-            raise InputError(f"{name} has no option {str(key)[:60]}{did_you_mean(str(key), found) or f'; {has}'}")
+        if key not in known:
+            has = f"it has {', '.join(known)}" if known else "it has none"
+            raise InputError(f"{name} has no option {str(key)[:60]}{did_you_mean(str(key), known) or f'; {has}'}")
         arguments[key] = _value(value, hints.get(key), key, folder, depth)
-    for key, field in found.items():
+    for key, field in known.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and key not in arguments:
             raise InputError(f"{name} needs {key}")
@@ -184,7 +184,7 @@ def _build(made_by: type[_T], name: str, given: Mapping[str, Any], folder: Path 
 
 
 def _value(value: Any, hint: Any, key: str, folder: Path | None, depth: int) -> Any:
-    """A field's value: a component where its annotation is a protocol of one or the value is a table with a type."""
+    """Return a field's value: a component if its annotation is a component protocol, or if the value is a table with a type."""
     if value is None or registry.component_of(type(value)) is not None:
         return value
     choices = (hint, *typing.get_args(hint))
@@ -202,7 +202,7 @@ def _value(value: Any, hint: Any, key: str, folder: Path | None, depth: int) -> 
 
 
 def _hints(made_by: type) -> dict[str, Any]:
-    """The annotations of a dataclass; {} where they name what only a type checker imports."""
+    """Return the annotations of a dataclass; {} if they use names that are imported for type checking only."""
     try:
         return typing.get_type_hints(made_by)
     except Exception:  # whatever the evaluation of an annotation raises
@@ -222,7 +222,7 @@ def _unknown(name: str, kind: str | None, known: Mapping[str, type]) -> str:
 
 
 def _plain(value: Any, where: str) -> Any:
-    """A value in TOML's types."""
+    """Return a value in types of TOML."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return table(value)
     if isinstance(value, (bool, int, float, str)):

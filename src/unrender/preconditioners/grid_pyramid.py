@@ -96,7 +96,7 @@ class GridPyramid:
 
     @cached_property
     def _samples(self) -> list[np.ndarray]:
-        """For each level but the coarsest, one cell of each block that a cell of the coarsest level covers."""
+        """Return one cell of each block that a cell of the coarsest level covers, for each level but the coarsest."""
         rng = np.random.default_rng(0)
         samples = []
         for level, cells in enumerate(self.levels[:-1]):

@@ -21,7 +21,7 @@ from unrender.scene.problem import Problem
 __all__ = ["NumbersCheck", "check_numbers"]
 
 _MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
-"""Elements of all numbers and of one, up to which they are looked at."""
+"""Elements of all numbers and of one, up to which they are tested."""
 _MOST_VALUES = 1 << 25
 """Values of the pictures of one pass, up to which there is a check."""
 _MOST_VIEWS = 4
@@ -41,7 +41,7 @@ _ERRORS = 3.0
 _DOUBTFUL = 0.1
 """Standard error, as a share of a number's size, from which on the references leave it open."""
 _FURTHER, _STEP_ERRORS = 0.05, 4.0
-"""Least remaining step, as a share of a number's size and in standard errors, that is told."""
+"""Least remaining step, as a share of a number's size and in standard errors, that is reported."""
 _OF_WIDTHS = 10.0
 """Size of a pose, in widths of its differences: it may be 0 at the end."""
 _TOGETHER = 0.9
@@ -50,7 +50,7 @@ _TOGETHER = 0.9
 
 @dataclass(frozen=True)
 class NumbersCheck:
-    """What least squares says about the numbers of a run.
+    """Result of the least-squares test of the numbers of a run.
 
     Attributes:
         undetermined: {key: line} of the numbers that the references leave open.
@@ -69,19 +69,19 @@ class NumbersCheck:
 def check_numbers(
     problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray], seconds: float
 ) -> NumbersCheck:
-    """Return what least squares at `values` says about the problem's numbers, all other unknowns kept.
+    """Return what least squares at `values` says about the problem's numbers, with all other unknowns fixed.
 
     The derivatives J of the pictures are differences of renders, along directions of which the pictures change independently. The
     covariance of the numbers is (JᵀJ)⁻¹ Jᵀ diag(r²) J (JᵀJ)⁻¹, with the residual r after the step below. It contains the references' noise.
-    Where it is large beside the numbers, the references do not determine them. Where the step −(JᵀJ)⁻¹ Jᵀ r is long, the run ended early.
+    If it is large relative to the numbers, the references do not determine them. Where the step −(JᵀJ)⁻¹ Jᵀ r is long, the run ended early.
 
-    Numbers with a prior are kept, too. Steps are told of losses with a linear derivative only: others have their minimum elsewhere.
+    Numbers with a prior are fixed, too. Steps are reported for losses with a linear derivative only: others have their minimum elsewhere.
 
     Args:
-        problem: its views and scene.
+        problem: problem with views and scene.
         values: {key: array} at the end.
         start: {key: array} at the start.
-        seconds: after which nothing further is begun; there is no result then.
+        seconds: time after which nothing further is started; there is no result then.
     """
     found = _Numbers.of(problem, values, start)
     if found is None:
@@ -89,7 +89,7 @@ def check_numbers(
     until = time.perf_counter() + seconds
     try:
         return _check(found, until)
-    except InputError:  # the renderer refuses a value inside the bounds
+    except InputError:  # the renderer rejects a value inside the bounds
         return NumbersCheck()
 
 

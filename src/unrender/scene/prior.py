@@ -161,7 +161,7 @@ def _rounded(r: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Unknown:
-    """What a prior needs to know of its unknown.
+    """Properties of an unknown that its prior uses.
 
     Attributes:
         channels: Number of values per texel, voxel or vertex.
