@@ -45,6 +45,7 @@ from unrender.runs.result import hardware, versions
 from unrender.runs.sensitivity import hardly_seen
 from unrender.scene.batches import WholeView
 from unrender.scene.bounds import project
+from unrender.scene.executor import LOCAL
 from unrender.scene.parameter import ParameterSettings
 from unrender.statistics.recursion import advance
 
@@ -169,7 +170,8 @@ def coupled_gradients(
 ) -> tuple[Tree, Tree]:
     """Gradients F of the current state and H of the previous one, from the same samples."""
     request = PairRequest(previous, space)
-    found = GradientRequest(current, ur.images.Plain(), PlainState(), spp, key, pair_request=request).carry_out(problem)
+    asked = GradientRequest(current, ur.images.Plain(), PlainState(), spp, key, pair_request=request)
+    found = LOCAL.estimate_gradient(problem, asked)
     if found.previous is None:
         raise RuntimeError("the pair has no previous gradient")
     return found.gradient, found.previous
@@ -267,9 +269,8 @@ def gradient_of(
     """The gradient from a pixel mini-batch, None for whole views, in the coordinates of the descent; with probabilities of emitters, None
     for the scene's own."""
     request = None if emitters is None else EmitterRequest(emitters, {})
-    found = GradientRequest(
-        parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch, emitters=request
-    ).carry_out(problem)
+    asked = GradientRequest(parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch, emitters=request)
+    found = LOCAL.estimate_gradient(problem, asked)
     coordinates = problem.coordinates
     moved = coordinates.pull_back(coordinates.wrt_u(found.gradient, parameters), {})
     return [arrays.numpy(value) for value in moved.values()]
