@@ -140,7 +140,7 @@ def test_a_browser_sees_a_run_move_pauses_resumes_and_stops_it(problem: Path, mi
     ("arguments", "message"),
     [
         (["problem.toml"], "problem.toml: a file, expected a run folder"),
-        ([".", "../" + "{name}"], "given twice"),
+        ([".", "../" + "{name}"], "listed twice"),
         ([".", "--port", "70000"], "--port': Input should be less than or equal to 65535"),
         ([".", "--port", "1"], "--port 1: "),
         ([], "Missing argument"),

@@ -221,7 +221,7 @@ def test_others_take_different_numbers(made: Any) -> None:
         (lambda: Counts(uniform=0.0), "AdaptiveCounts: uniform must be"),
         (lambda: Counts(uniform=1.5), "AdaptiveCounts: uniform must be a share"),
         (lambda: ur.PathGradient(pixels=Counts(), spp=2), "spp must be at least 3, got 2"),
-        (lambda: ur.PathGradient(pixels=Counts(), spp=4, adjoint_spp=1), "leave adjoint_spp out"),
+        (lambda: ur.PathGradient(pixels=Counts(), spp=4, adjoint_spp=1), "leave out adjoint_spp"),
         (lambda: ur.PathGradient(ur.images.Denoised(), Counts(), spp=4), "Denoised needs full views"),
         (lambda: ur.MetaEstimator(pixels=Counts()), "spp must be at least 3, got 1"),
     ],

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from callbacks import At
+from callbacks import At, of_the_run
 
 import unrender as ur
 from unrender.core.errors import InputError
@@ -130,7 +130,7 @@ def test_a_state_that_is_not_finite_is_no_checkpoint(tmp_path: Path) -> None:
 
     folder = tmp_path / "run"
     result = start(folder, 4, optimizer=Hiding(since=0))
-    (line,) = result.warnings
+    (line,) = of_the_run(result.warnings)
     assert "checkpoint not written: the state holds numbers that are not finite (optimizer['hidden'])" in line
     assert list((folder / "checkpoints").glob("*")) == []
 
@@ -172,10 +172,10 @@ def test_a_checkpoint_that_parses_but_cannot_be_used_is_passed_over(
     result = ur.resume(folder)
     assert result.resumed == [4]
     np.testing.assert_array_equal(result.parameters[RATE], whole.parameters[RATE])
-    (line,) = result.warnings
+    (line,) = of_the_run(result.warnings)
     assert line.startswith("skipped: ")
     assert "checkpoint of step 6" in line or "state: " in line
-    assert record(folder)["warnings"] == [line]
+    assert of_the_run(record(folder)["warnings"]) == [line]
 
 
 def test_where_no_checkpoint_can_be_used_the_last_one_s_fault_is_told(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from callbacks import At
+from callbacks import At, of_the_run
 
 import unrender as ur
 from unrender.core.errors import InputError
@@ -229,7 +229,7 @@ def test_a_folder_deleted_on_the_way_is_made_again(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("unrender.runs.folder.writer._CHECK_SECONDS", 0.0)
     folder = tmp_path / "run"
     result = start(folder, every=4, callbacks=[At(5, lambda run: shutil.rmtree(folder))])
-    assert result.warnings == [
+    assert of_the_run(result.warnings) == [
         f"run folder {folder}: deleted during the run; it was created again, without the earlier checkpoints"
     ]
     assert steps_of(folder) == list(range(12))
@@ -389,7 +389,7 @@ def test_a_clock_set_back_changes_nothing(tmp_path: Path, monkeypatch: pytest.Mo
             os.utime(path, (now() + 86400, now() + 86400))  # files of the future
 
     result = start(folder, steps=6, callbacks=[At(3, back)])
-    assert not result.warnings
+    assert not of_the_run(result.warnings)
     again = ur.resume(folder, steps=12)
     seconds = [record["seconds"] for record in again.history]
     assert seconds == sorted(seconds)
@@ -429,10 +429,8 @@ def test_checkpoints_that_cannot_be_said_are_one_warning(tmp_path: Path) -> None
     result = ur.optimize(
         ur.gallery.problem("exponential"), Own(), ur.optimizers.Adam(), 6, run_directory=folder, checkpoint_every=2
     )
-    assert len(result.warnings) == 1
-    assert (
-        "checkpoint not written: a state is made of dataclasses, arrays and numbers, got object" in result.warnings[0]
-    )
+    (line,) = of_the_run(result.warnings)
+    assert "checkpoint not written: a state is made of dataclasses, arrays and numbers, got object" in line
     assert np.isfinite(result.parameters[RATE])
     assert status(folder) == "finished"
 

@@ -208,7 +208,9 @@ def test_the_stock_loop_names_cameras_that_it_cannot_move() -> None:
 
 def test_pixels_by_the_variance_of_camera_gradients_are_refused_with_what_to_do() -> None:
     problem = ur.gallery.problem("camera", resolution=8, reference_spp=16)
-    with pytest.raises(ur.InputError, match=r"adaptive pixels do not know .*: --method plain, or .*scheme = uniform"):
+    with pytest.raises(
+        ur.InputError, match=r"adaptive pixel sampling does not support .*; use --method plain, or .*scheme = uniform"
+    ):
         ur.optimize(problem, "adaptive", steps=1, progress=False)
 
 

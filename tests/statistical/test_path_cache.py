@@ -292,7 +292,7 @@ def test_two_sides_of_different_materials_and_what_moves_are_not_served() -> Non
         ("ball.bsdf.brdf_0.reflectance.data", "two sides"),
         ("floor.vertex_positions", "moves"),
         ("ball.translation", "pose"),
-        ("floor.to_world", "paths go"),
+        ("floor.to_world", "the directions of paths depend on it"),
     ):
         if key in renderer.parameters():
             with pytest.raises(InputError, match=named):
@@ -348,7 +348,7 @@ def test_a_texture_that_a_plugin_may_hold_unseen_is_not_served() -> None:
         return {"type": "scene", "shared": zoo.texture(2)} | found
 
     renderer = MitsubaRenderer(described, zoo.DEPTH)
-    with pytest.raises(InputError, match="a plugin in Python"):
+    with pytest.raises(InputError, match="the Python plugin Silent"):
         Lookups(renderer.pair, [FLOOR])
     assert not isinstance(renderer.prepare([FLOOR], None), CachingSession)
 

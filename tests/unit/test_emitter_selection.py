@@ -88,8 +88,8 @@ def test_the_scene_s_weights_are_where_it_starts_and_what_is_kept() -> None:
     ("options", "words"),
     [
         ({"emitters": "power"}, "emitters must be"),
-        ({"emitters": "adaptive", "spp": 1}, "groups of samples"),
-        ({"emitters": "adaptive", "spp": 4, "adjoint_spp": 2}, "groups of samples"),
+        ({"emitters": "adaptive", "spp": 1}, "needs sample groups"),
+        ({"emitters": "adaptive", "spp": 4, "adjoint_spp": 2}, "needs sample groups"),
         ({"emitters": "adaptive", "pixels": ur.pixels.AdaptiveCounts()}, "AdaptiveCounts"),
     ],
 )

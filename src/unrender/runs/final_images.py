@@ -142,7 +142,8 @@ def _undetermined(
     numbers = check_numbers(problem, result.parameters, result.initial, allowed)
     text = "\n".join(lines)
     lines += [line for key, line in numbers.undetermined.items() if key not in text]
-    return lines, tuple(line for key, line in numbers.unfinished.items() if key not in text)
+    failed = result.status == "failed"  # such a run did not end by its budget
+    return lines, () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
 
 
 def _chosen(problem: Problem) -> list[int]:
