@@ -92,6 +92,15 @@ def test_a_number_without_influence_is_open_and_the_others_are_not():
     assert list(found.undetermined) == ["b"]
 
 
+@pytest.mark.parametrize("entry", [0.0, np.nan])
+def test_pictures_that_no_number_changes_or_that_are_not_finite_have_no_check(entry: float):
+    made = problem(np.full_like(MATRIX, 0.0))
+    made.renderer.matrix = np.full_like(MATRIX, entry)  # type: ignore
+    found = check_numbers(made, made.initial_values(), made.initial_values(), FAR)
+    assert not found.undetermined
+    assert not found.unfinished
+
+
 def test_fewer_values_than_numbers_leave_all_open():
     renderer = AnalyticRenderer(TRUTH, MATRIX[:3], 2.0, 0.0, shape=(1, 1))
     view = ur.View(renderer.exact(TRUTH).astype(np.float32))

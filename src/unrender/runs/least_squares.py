@@ -89,7 +89,7 @@ def check_numbers(
     until = time.perf_counter() + seconds
     try:
         return _check(found, until)
-    except InputError:  # the renderer rejects a value inside the bounds
+    except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues in double precision
         return NumbersCheck()
 
 
@@ -264,6 +264,9 @@ def _check(numbers: _Numbers, until: float) -> NumbersCheck:
             changes = np.sqrt(np.maximum(squares, errors) / found.one[0].size)
             factors = np.clip(wanted / np.maximum(changes, 1e-30), 1.0 / _CHANGES[index], _CHANGES[index])
             widths = np.minimum(factors * widths, numbers.limits)
+    matrix = found.matrix()
+    if not (np.isfinite(matrix).all() and matrix.any()):
+        return NumbersCheck()  # pictures that are not finite, or that no number changes
     directions, repeats = _directions(found, numbers.limits, wanted), 0
     residuals = np.zeros((2, *numbers.references().shape))
     while repeats < _REPEATS and (not repeats or time.perf_counter() + 2.0 * longest < until):
