@@ -89,7 +89,10 @@ def check_numbers(
     until = time.perf_counter() + seconds
     try:
         return _check(found, until)
-    except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues in double precision
+    except (
+        InputError,
+        np.linalg.LinAlgError,
+    ):  # a value that the renderer rejects, or matrices without eigenvalues in double precision
         return NumbersCheck()
 
 

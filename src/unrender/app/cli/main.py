@@ -87,12 +87,10 @@ def _status_of(error: BaseException, signals: Signals) -> int | None:
     # Typer may vendor its own copy of click, so take the error classes from the one that it exports.
     usage_error: type[Exception] = next(k for k in typer.BadParameter.__mro__ if k.__name__ == "ClickException")
     match error:
-        case VariantError():
-            return _complain(str(error), ENVIRONMENT)
         case UnrenderError():
             if limits.address_space() and memory.says_so(error):
                 return _out_of_memory(f"{error}: ")
-            return _complain(str(error), INPUT)
+            return _complain(str(error), ENVIRONMENT if isinstance(error, VariantError) else INPUT)
         case typer.Exit():
             return error.exit_code
         case typer.Abort() | KeyboardInterrupt():  # Typer converts the latter to the former

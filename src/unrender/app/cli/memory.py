@@ -29,6 +29,7 @@ _SIGNS = re.compile(
     re.IGNORECASE,
 )
 _PASSED_ON = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2")
+_GIVING_UP = b"OpenBLAS error: Memory allocation still failed"
 _OF_MEMORY = ("SIGABRT", "SIGSEGV", "SIGBUS", "SIGKILL", "SIGILL", "SIGTRAP")
 _DEATH_OF_PARENT = 1  # PR_SET_PDEATHSIG
 
@@ -109,6 +110,10 @@ def supervised() -> int | None:
         print(f"unrender: {one_line(exhaustion(f', it seems: {name} ended the process'))}", file=sys.stderr)
         return ENVIRONMENT
     with os.fdopen(errors, "rb") as file:
+        file.seek(0)
+        if status == 1 and _GIVING_UP in file.read():  # OpenBLAS ends the process itself
+            print(f"unrender: {one_line(exhaustion())}", file=sys.stderr)
+            return ENVIRONMENT
         file.seek(0)
         shutil.copyfileobj(file, sys.stderr.buffer)
         sys.stderr.flush()
