@@ -112,16 +112,21 @@ def test_a_scene_of_another_variant_is_refused() -> None:
 
 @pytest.mark.parametrize("by_call", [False, True], ids=["explicit", "differentiable"])
 def test_two_threads_draw_what_each_draws_alone(by_call: bool) -> None:
-    """Renderers of two threads take turns: neither raises, and no random sequence depends on the other."""
+    """Renderers of two threads take turns: neither raises, and no random sequence depends on the other.
+
+    `drjit.backward` of one thread beside another's kernels may wait for ever, within Dr.Jit. So those steps hold a lock, as the guide asks.
+    """
+    backward = threading.Lock()
 
     def descend(seed: int, found: dict[int, Any]) -> None:
         renderer = ur.Renderer(surface(), KEYS, groups=2, seed=seed)
         found[seed] = []
         for _ in range(3):
             if by_call:
-                values = attached()
-                dr.backward(loss(renderer(values)))
-                gradient = dr.grad(values[LAMP]).numpy()
+                with backward:
+                    values = attached()
+                    dr.backward(loss(renderer(values)))
+                    gradient = dr.grad(values[LAMP]).numpy()
             else:
                 gradient = explicit(renderer, {TEXTURE: START, LAMP: GLOW})[LAMP]
             found[seed].append(np.ravel(gradient))
