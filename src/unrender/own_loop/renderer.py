@@ -86,6 +86,7 @@ class Renderer:
     Raises `InputError` for incompatible options, parameters without a path gradient, and arrays of another shape.
     """
 
+    @exclusive("Renderer")
     def __init__(
         self,
         scene: Any,
