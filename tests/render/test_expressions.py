@@ -12,10 +12,10 @@ import pytest
 
 import unrender as ur
 from unrender.core import arrays
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, KeyedError
 from unrender.estimators.base import as_numpy
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.rendering.expression_texts import ExpressionError, parse
+from unrender.rendering.expression_texts import parse
 from unrender.rendering.expressions import ExpressionRenderer
 from unrender.rendering.photographs import scene_values
 from unrender.scene.fingerprint import fingerprint
@@ -101,7 +101,7 @@ def test_texts_are_evaluated(text: str, expected: list[float]) -> None:
     ],
 )
 def test_texts_of_other_kinds_are_refused(text: str) -> None:
-    with pytest.raises(ExpressionError) as caught:
+    with pytest.raises(KeyedError) as caught:
         parse("lamp", text)
     assert "\n" not in str(caught.value)
 

@@ -81,6 +81,11 @@ def all_true(mask: Array) -> bool:
     return bool(dr.all(mask, axis=None)) if is_drjit(mask) else bool(np.all(mask))
 
 
+def all_within(x: Array, low: float | None, high: float | None) -> bool:
+    """Return whether all elements are in [low, high]; None is open. Waits for the device."""
+    return (low is None or all_true(x >= low)) and (high is None or all_true(x <= high))
+
+
 def zeros_like(x: Array) -> Array:
     """Return zeros of the shape and type of `x`."""
     return dr.zeros(type(x), dr.shape(x)) if is_drjit(x) else np.zeros_like(x)

@@ -25,6 +25,11 @@ def number(
     raise InputError(f"{owner}: {name} must be a finite number {' and '.join(limits)}".rstrip() + f", got {value!r}")
 
 
+def limits(low: float | None, high: float | None) -> list[str]:
+    """Return the ends of a range in words, for messages; None is open."""
+    return [f"{word} {end:g}" for word, end in (("at least", low), ("at most", high)) if end is not None]
+
+
 def integer(owner: str, name: str, value: Any, at_least: int) -> int:
     """Return `value` as an integer >= `at_least`, else raise `InputError`."""
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:

@@ -21,5 +21,18 @@ class InputError(UnrenderError, ValueError):
     """Invalid input from the user: a file, a field, a name or a value. The command line exits with 2."""
 
 
+class KeyedError(InputError):
+    """Invalid input about one key.
+
+    Args:
+        key: The key.
+        what: One line without the key.
+    """
+
+    def __init__(self, key: str, what: str):
+        super().__init__(what)
+        self.key = key
+
+
 class VariantError(UnrenderError, RuntimeError):
     """Missing capability of the machine: no usable LLVM, no GPU, an unknown variant. The command line exits with 3."""

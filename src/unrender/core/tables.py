@@ -137,6 +137,15 @@ def build(made_by: type[_T], given: Mapping[str, Any]) -> _T:
     return _build(made_by, made_by.__name__, given, None, 0)
 
 
+def options(made_by: type[_T], given: Any, example: str) -> _T:
+    """Return a dataclass from an instance, or from a table of its fields such as `example`. Raises `InputError`."""
+    if isinstance(given, made_by):
+        return given
+    if not isinstance(given, Mapping):
+        raise InputError(f"expected a table such as {example}, got {given!r:.60}")
+    return build(made_by, given)
+
+
 def _component(given: Any, kind: str | None, folder: Path | None, depth: int) -> Any:
     if depth > _DEEPEST:
         raise InputError("nested too deeply")

@@ -128,7 +128,7 @@ class GradientRequest:
         )  # the pair whose gradients use the paths of the images
         groups = leave_one_out_groups(spp, adjoint_spp)
         session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
-        image_estimate, kept = self.image.estimate(
+        image_estimate, contribution = self.image.estimate(
             problem, parameters, self.state, frame, spp, groups, key.fold(0), pair_request
         )
         mean = image_estimate.mean()
@@ -170,7 +170,7 @@ class GradientRequest:
             )
         pixels = traced * frame.pixels
         return FrameGradient(
-            gradient, paired, previous, fresh, loss, mean, pixels, image_estimate.info, kept, draws, connections
+            gradient, paired, previous, fresh, loss, mean, pixels, image_estimate.info, contribution, draws, connections
         )
 
 

@@ -128,7 +128,7 @@ class ImageEstimator(Protocol):
 
     @property
     def pixelwise(self) -> bool:
-        """Whether pixel mini-batches can be estimated."""
+        """Return whether pixel mini-batches can be estimated."""
         ...
 
     def init(self, problem: Problem, parameters: Tree) -> Any:

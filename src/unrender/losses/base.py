@@ -12,12 +12,12 @@ class Loss(Protocol):
 
     @property
     def linear(self) -> bool:
-        """Whether `derivative` is linear (affine) in the image, so that image noise does not bias the gradient."""
+        """Return whether `derivative` is linear (affine) in the image, so that image noise does not bias the gradient."""
         ...
 
     @property
     def pixelwise(self) -> bool:
-        """Whether the loss of an element depends on that element alone, so that it can be evaluated for some pixels.
+        """Return whether the loss of an element depends on that element alone, so that it can be evaluated for some pixels.
 
         A loss of full images (..., H, W, 3) returns an image's loss in each of its elements, so that their mean is the loss, and scales
         its derivative accordingly.

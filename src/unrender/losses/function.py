@@ -55,7 +55,7 @@ class FunctionLoss:
 
     @functools.cached_property
     def takes_reference(self) -> bool:
-        """Whether the function also takes the reference. Raises `InputError` if it takes neither one nor two arguments."""
+        """Return whether the function also takes the reference. Raises `InputError` if it takes neither one nor two arguments."""
         try:
             parameters = inspect.signature(self.function).parameters.values()
         except (TypeError, ValueError):  # compiled code may have no signature

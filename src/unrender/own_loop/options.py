@@ -39,7 +39,7 @@ class Options:
     coupled: bool
     sensors: tuple[int, ...]
     single: bool
-    """Whether a single sensor was passed, so that a call returns its image and not a tuple."""
+    """Return whether a single sensor was passed, so that a call returns its image and not a tuple."""
     max_depth: int
     seed: int
     references: tuple[Any, ...] = field(default=(), compare=False)
@@ -80,7 +80,7 @@ class Options:
 
     @property
     def all_pixels(self) -> bool:
-        """Whether every step renders full images."""
+        """Return whether every step renders full images."""
         return isinstance(self.pixels, All)
 
     def describe(self) -> dict[str, Any]:

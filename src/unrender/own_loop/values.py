@@ -10,7 +10,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from unrender.core import arrays, frameworks
+from unrender.core import arrays, checks, frameworks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.frameworks import Framework
@@ -108,15 +108,12 @@ class Exchange:
         """Warn once per parameter whose values leave their physical range. An optimizer of the loop knows no bounds."""
         for key, values in tree.items():
             low, high = self.known[key].lowest, self.known[key].highest
-            below = low is not None and not arrays.all_true(values >= low)
-            above = high is not None and not arrays.all_true(values <= high)
-            if (below or above) and key not in self._warned:
-                self._warned.add(key)
-                limits = ", ".join(
-                    f"{word} {limit:g}" for word, limit in (("at least", low), ("at most", high)) if limit is not None
-                )
-                text = f"Renderer: {key} is expected to be {limits}, and has values outside: clip it after each step"
-                warnings.warn(text, stacklevel=5)
+            if key in self._warned or arrays.all_within(values, low, high):
+                continue
+            self._warned.add(key)
+            limits = ", ".join(checks.limits(low, high))
+            text = f"Renderer: {key} is expected to be {limits}, and has values outside: clip it after each step"
+            warnings.warn(text, stacklevel=5)
 
     def attached(self, given: Given) -> Tree:
         """Return the parameters as Dr.Jit arrays that are still attached to the loop's derivative graph."""

@@ -121,17 +121,17 @@ class ImportanceRule(Protocol):
 
     @property
     def learns(self) -> bool:
-        """Whether the samples of the steps update the maps."""
+        """Return whether the samples of the steps update the maps."""
         ...
 
     @property
     def by_cost(self) -> bool:
-        """Whether a pixel's importance is divided by the root of its cost."""
+        """Return whether a pixel's importance is divided by the root of its cost."""
         ...
 
     @property
     def needs_second_moment(self) -> bool:
-        """Whether the second moment of the pixels' parameter derivatives is estimated, which doubles the number of paths."""
+        """Return whether the second moment of the pixels' parameter derivatives is estimated, which doubles the number of paths."""
         ...
 
     def maps(self, statistics: pixel_statistics.PixelStatistics) -> Maps:

@@ -10,9 +10,9 @@ import drjit as dr
 import numpy as np
 
 from unrender.core import arrays
-from unrender.core.errors import InputError
+from unrender.core.errors import KeyedError
 
-__all__ = ["ExpressionError", "Function", "parse"]
+__all__ = ["Function", "parse"]
 
 Function = Callable[[Any], Any]
 """A function of values by name; see `Expression`."""
@@ -41,38 +41,25 @@ _LONGEST, _DEEPEST = 1000, 50
 """Characters and nesting of a text form."""
 
 
-class ExpressionError(InputError):
-    """An error in one expression.
-
-    Args:
-        key: Parameter of the scene.
-        what: The error in one line.
-    """
-
-    def __init__(self, key: str, what: str):
-        super().__init__(what)
-        self.key = key
-
-
 def parse(key: str, text: str) -> Function:
     """Return the function that a text describes.
 
     The text has numbers, lists of numbers, names of unknowns, + - * / **, brackets, name[i] for the i-th row, and the functions abs, cos,
-    exp, log, max, min, mix(a, b, t), sin, sqrt and tanh. Raises `ExpressionError` for anything else.
+    exp, log, max, min, mix(a, b, t), sin, sqrt and tanh. Raises `KeyedError` for anything else.
     """
     try:
         if len(text) > _LONGEST:
-            raise ExpressionError(key, f"longer than {_LONGEST} characters")
+            raise KeyedError(key, f"longer than {_LONGEST} characters")
         tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        raise ExpressionError(key, f"it is no expression: {text!r:.60}") from error
+        raise KeyedError(key, f"it is no expression: {text!r:.60}") from error
     return _compiled(key, tree, 0)
 
 
 def _compiled(key: str, node: ast.expr, depth: int) -> Function:
-    """Return the function of one node of a syntax tree. Raises `ExpressionError` for a node of another kind."""
+    """Return the function of one node of a syntax tree. Raises `KeyedError` for a node of another kind."""
     if depth > _DEEPEST:
-        raise ExpressionError(key, f"nested more than {_DEEPEST} times")
+        raise KeyedError(key, f"nested more than {_DEEPEST} times")
 
     def inner(part: ast.expr) -> Function:
         return _compiled(key, part, depth + 1)
@@ -87,7 +74,7 @@ def _compiled(key: str, node: ast.expr, depth: int) -> Function:
             try:
                 table = np.array(ast.literal_eval(node), np.float32)
             except (ValueError, TypeError) as error:
-                raise ExpressionError(key, "a list must have numbers, in rows of one length") from error
+                raise KeyedError(key, "a list must have numbers, in rows of one length") from error
             return lambda values: arrays.like(table, values.like)
         case ast.UnaryOp(op=ast.USub(), operand=operand):
             value = inner(operand)
@@ -100,9 +87,7 @@ def _compiled(key: str, node: ast.expr, depth: int) -> Function:
         case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS:
             count, function = _FUNCTIONS[name]
             if len(args) != count:
-                raise ExpressionError(key, f"{name} takes {count} arguments, got {len(args)}")
+                raise KeyedError(key, f"{name} takes {count} arguments, got {len(args)}")
             parts = [inner(part) for part in args]
             return lambda values: function(*(part(values) for part in parts))
-    raise ExpressionError(
-        key, f"{ast.unparse(node)!r:.60} is not allowed; see unrender.rendering.expression_texts.parse"
-    )
+    raise KeyedError(key, f"{ast.unparse(node)!r:.60} is not allowed; see unrender.rendering.expression_texts.parse")

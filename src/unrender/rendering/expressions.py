@@ -13,11 +13,11 @@ import numpy as np
 
 from unrender.core import arrays, trees
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, KeyedError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.io import bounded_files
-from unrender.rendering.expression_texts import ExpressionError, Function, parse
+from unrender.rendering.expression_texts import Function, parse
 from unrender.rendering.renderer import (
     ParameterInfo,
     Renderer,
@@ -30,7 +30,6 @@ from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
 __all__ = [
     "Expression",
-    "ExpressionError",
     "ExpressionRenderer",
     "are_storable",
     "expression_layer",
@@ -54,11 +53,11 @@ class Expression:
 
     @classmethod
     def of(cls, key: str, given: Any) -> Expression:
-        """Return the expression that a user gives: a function, or a text. Raises `ExpressionError`."""
+        """Return the expression that a user gives: a function, or a text. Raises `KeyedError`."""
         if isinstance(given, str):
             return cls(key, parse(key, given), given)
         if not callable(given):
-            raise ExpressionError(key, f"expected a function or a text such as '2 * strength', got {given!r:.60}")
+            raise KeyedError(key, f"expected a function or a text such as '2 * strength', got {given!r:.60}")
         return cls(key, given)
 
 
@@ -97,7 +96,7 @@ class ExpressionRenderer(RendererWrapper):
         unknowns: {name: initial value} of the unknowns that the functions may read.
 
     Raises:
-        ExpressionError: A function reads what is no unknown, fails, or its result does not suit the parameter.
+        KeyedError: A function reads what is no unknown, fails, or its result does not suit the parameter.
         InputError: No function reads one of the unknowns.
     """
 
@@ -158,28 +157,29 @@ class ExpressionRenderer(RendererWrapper):
     def _checked(self, one: Expression, known: Mapping[str, ParameterInfo], start: Tree) -> tuple[str, ...]:
         """Return the names that an expression reads."""
         if one.key not in known:
-            raise ExpressionError(one.key, f"the scene has no parameter {one.key}{did_you_mean(one.key, known)}")
+            raise KeyedError(one.key, f"the scene has no parameter {one.key}{did_you_mean(one.key, known)}")
         info = known[one.key]
         if not (info.perturbable or info.differentiable):
-            raise ExpressionError(one.key, f"{one.key} cannot be a function: {info.reason}")
+            raise KeyedError(one.key, f"{one.key} cannot be a function: {info.reason}")
         reads = _Reads(start)
         try:
             value = arrays.numpy(_shaped(one, reads, info.shape))
         except KeyError as error:
             hint = did_you_mean(str(error.args[0]), start)
-            raise ExpressionError(one.key, f"no parameter is called {error.args[0]}{hint}") from error
-        except ExpressionError:
+            raise KeyedError(one.key, f"no parameter is called {error.args[0]}{hint}") from error
+        except KeyedError:
             raise
         except Exception as error:  # a function of the user's, or shapes that do not go together
             words = " ".join(str(error).split())[:200]
-            raise ExpressionError(one.key, f"it cannot be evaluated at the initial values: {words}") from error
+            raise KeyedError(one.key, f"it cannot be evaluated at the initial values: {words}") from error
         if not np.isfinite(value).all():
-            raise ExpressionError(one.key, "it is not finite at the initial values")
-        low, high = info.lowest, info.highest
-        if (low is not None and (value < low).any()) or (high is not None and (value > high).any()):
-            raise ExpressionError(one.key, f"at the initial values it is outside of the range {low} to {high}")
+            raise KeyedError(one.key, "it is not finite at the initial values")
+        if not arrays.all_within(value, info.lowest, info.highest):
+            raise KeyedError(
+                one.key, f"at the initial values it is outside of the range {info.lowest} to {info.highest}"
+            )
         if not reads.names:
-            raise ExpressionError(one.key, "it reads no unknown; set the value in the scene")
+            raise KeyedError(one.key, "it reads no unknown; set the value in the scene")
         return tuple(reads.names)
 
 
@@ -192,7 +192,7 @@ def with_expressions(renderer: Renderer, given: Mapping[str, Any], unknowns: Map
         unknowns: {key: initial value} of all unknowns; those that are parameters of the scene stay so.
 
     Raises:
-        ExpressionError: See `ExpressionRenderer`.
+        KeyedError: See `ExpressionRenderer`.
         InputError: An unknown without a finite initial value.
     """
     layer = expression_layer(renderer)
@@ -214,7 +214,7 @@ def with_expressions(renderer: Renderer, given: Mapping[str, Any], unknowns: Map
             )
     if not starts:
         first = next(iter(given))
-        raise ExpressionError(first, "there is no unknown to read; name one that is no parameter of the scene")
+        raise KeyedError(first, "there is no unknown to read; name one that is no parameter of the scene")
     return ExpressionRenderer(renderer, [Expression.of(key, one) for key, one in given.items()], starts)
 
 
@@ -262,7 +262,7 @@ def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:
     except ValueError:
         spread = ()
     if spread != shape:
-        raise ExpressionError(one.key, f"its result has the shape {tuple(result.shape)}, {one.key} has {shape}")
+        raise KeyedError(one.key, f"its result has the shape {tuple(result.shape)}, {one.key} has {shape}")
     return result + dr.zeros(type(like), shape)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core import checks
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, KeyedError
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import WithParameter
@@ -26,20 +26,7 @@ from unrender.rendering.renderer import (
 )
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
-__all__ = ["Tie", "TieError", "TiedRenderer", "with_ties"]
-
-
-class TieError(InputError):
-    """An invalid tie.
-
-    Args:
-        key: name of the unknown.
-        what: error message of one line.
-    """
-
-    def __init__(self, key: str, what: str):
-        super().__init__(what)
-        self.key = key
+__all__ = ["Tie", "TiedRenderer", "with_ties"]
 
 
 @dataclass(frozen=True)
@@ -66,25 +53,25 @@ class Tie:
                 raise InputError(f"{member}: expected a factor other than 0")
 
     def info(self, known: Mapping[str, ParameterInfo]) -> ParameterInfo:
-        """Return the description of the unknown. Raise `TieError` if the members are incompatible."""
+        """Return the description of the unknown. Raise `KeyedError` if the members are incompatible."""
         for member in self.factors:
             if member not in known:
-                raise TieError(self.key, f"the scene has no parameter {member}{did_you_mean(member, known)}")
+                raise KeyedError(self.key, f"the scene has no parameter {member}{did_you_mean(member, known)}")
             if known[member].welded:
-                raise TieError(
+                raise KeyedError(
                     self.key, f"{member}: vertex positions cannot be tied; place the mesh as instances of a shapegroup"
                 )
             if not (known[member].perturbable or known[member].differentiable):
-                raise TieError(self.key, f"{member} cannot be recovered: {known[member].reason}")
+                raise KeyedError(self.key, f"{member} cannot be recovered: {known[member].reason}")
         infos = [known[member] for member in self.factors]
         first = next(iter(self.factors))
         for member, info in zip(self.factors, infos, strict=True):
             if info.shape != infos[0].shape:
-                raise TieError(
+                raise KeyedError(
                     self.key, f"{member} has the shape {info.shape}, {first} {infos[0].shape}; expected equal shapes"
                 )
             if info.conversion != infos[0].conversion or info.role != infos[0].role:
-                raise TieError(
+                raise KeyedError(
                     self.key, f"{member} and {first} read their values differently; expected parameters of one kind"
                 )
         low, high = self._limits(infos)
@@ -123,7 +110,7 @@ def with_ties(renderer: Renderer, ties: Iterable[Tie]) -> Renderer:
     Return the renderer itself if it has these ties already, and the renderer of the scene if `ties` is empty. If the
     ties change, parameters of photographs around the renderer are dropped.
 
-    Raises `TieError` if the members of a tie are incompatible, or two ties share a member.
+    Raises `KeyedError` if the members of a tie are incompatible, or two ties share a member.
     """
     ties, base = tuple(ties), renderer
     while isinstance(base, WithParameter):
@@ -152,10 +139,10 @@ class TiedRenderer(RendererWrapper):
         for tie in ties:
             for member in tie.factors:
                 if member in owner:
-                    raise TieError(tie.key, f"{member} is tied to {owner[member]} already")
+                    raise KeyedError(tie.key, f"{member} is tied to {owner[member]} already")
                 owner[member] = tie.key
             if tie.key in known and tie.key not in tie.factors:
-                raise TieError(
+                raise KeyedError(
                     tie.key, f"{tie.key} is a parameter of the scene itself; expected one of keys, or another name"
                 )
         self._info = {**{key: info for key, info in known.items() if key not in owner}, **infos}

@@ -155,10 +155,14 @@ class WorldsRenderer(RendererWrapper):
         wanted, sessions = differentiated(keys, derivatives), {}
         for renderer in self.renderers:
             known = renderer.parameters()
-            held = [key for state in self.states if state.renderer is renderer for key in state.values]
-            own = list(dict.fromkeys([*(key for key in keys if key in known), *held]))
+            own = list(dict.fromkeys([*(key for key in keys if key in known), *self.known_keys(renderer)]))
             sessions[id(renderer)] = renderer.prepare(own, space, wanted & frozenset(own))
         return WorldsSession(self, sessions, wanted)
+
+    def known_keys(self, renderer: Renderer) -> list[str]:
+        """Return the keys that some world of a renderer gives a value of its own."""
+        held = (key for state in self.states if state.renderer is renderer for key in state.values)
+        return list(dict.fromkeys(held))
 
     def parts(self, request: SampleRequest) -> list[tuple[int, SampleRequest, np.ndarray | None]]:
         """Return (index of the state, request for its renderer, positions in the request's pixels) for each state of the sensors of a
@@ -167,7 +171,8 @@ class WorldsRenderer(RendererWrapper):
         Positions are None where the part contains all pixels.
         """
         if request.sensors is None:
-            return [(int(self._state[request.sensor]), self._inner_request(request, request.sensor, None), None)]
+            inner = replace(request, sensor=int(self._sensor[request.sensor]))
+            return [(int(self._state[request.sensor]), inner, None)]
         sensors = arrays.numpy(request.sensors).astype(np.int64)
         numbers = self._state[sensors]
         parts = []
@@ -217,9 +222,6 @@ class WorldsRenderer(RendererWrapper):
             positions = index if positions is None else arrays.gather(positions, index)
         return replace(request, sensor=int(inner[0]), sensors=sensors, pixels=pixels, positions=positions)
 
-    def _inner_request(self, request: SampleRequest, sensor: int, sensors: Array | None) -> SampleRequest:
-        return replace(request, sensor=int(self._sensor[sensor]), sensors=sensors)
-
 
 @dataclass(frozen=True, eq=False)
 class _Part:
@@ -245,7 +247,7 @@ class WorldsSession:
         self._renderer, self._sessions, self._wanted = renderer, sessions, wanted
         self._known = [{key: renderer.array(x) for key, x in state.values.items()} for state in renderer.states]
         self._keys = [frozenset(state.renderer.parameters()) for state in renderer.states]
-        self._own = [self._scene_values(state.renderer) for state in renderer.states]
+        self._own = [state.renderer.values(renderer.known_keys(state.renderer)) for state in renderer.states]
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
         return self._rendered(request, lambda n, part: self._session(n).image(self._at(n, parameters), part))
@@ -321,11 +323,6 @@ class WorldsSession:
             session = drawing_emitters(self._session(part.state))
             moments.append(session.emitter_moments(state, part.paths, own, *both))
         return sum(moments[1:], moments[0])
-
-    def _scene_values(self, renderer: Renderer) -> Tree:
-        """Return the scene's values of parameters that have other values in some of its worlds."""
-        keys = [key for state in self._renderer.states if state.renderer is renderer for key in state.values]
-        return renderer.values(list(dict.fromkeys(keys)))
 
     def _session(self, state: int) -> RenderSession:
         return self._sessions[id(self._renderer.states[state].renderer)]

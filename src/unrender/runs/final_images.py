@@ -16,7 +16,7 @@ from unrender.runs.least_squares import check_numbers
 from unrender.runs.result import Result
 from unrender.runs.sensitivity import sensitivity
 from unrender.scene.problem import Problem
-from unrender.scene.render import MANY_SENSORS, render
+from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.statistics import debiased
 
 _PICTURE_PATHS = 1 << 22
@@ -189,7 +189,7 @@ def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
         seconds = time.perf_counter() - started
     allowed = min(max(_SHARE * result.seconds, _LEAST_SECONDS), most_seconds)
     paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
-    return max(2, 2 * trial, _power_of_two(int(min(most, max(paths, 0.0) / (2 * sum(sizes))))))
+    return max(2, 2 * trial, power_of_two(int(min(most, max(paths, 0.0) / (2 * sum(sizes))))))
 
 
 def _most_spp(problem: Problem) -> int:
@@ -199,15 +199,10 @@ def _most_spp(problem: Problem) -> int:
 def _pass_spp(problem: Problem) -> int:
     """Return the samples per pixel of one pass, few enough for the least pictures of all views. All passes share one kernel."""
     pixels = sum(height * width for height, width in problem.sizes)
-    return _power_of_two(min(_PASS_PATHS // pixels, _MOST_PASS, _most_spp(problem) // 2))
+    return power_of_two(min(_PASS_PATHS // pixels, _MOST_PASS, _most_spp(problem) // 2))
 
 
 def _trial_spp(problem: Problem) -> int:
     """Return the samples per pixel of quick test renderings."""
     height, width = problem.sizes[0]
-    return _power_of_two(min(max(_TRIAL_PATHS // (height * width), 1), _most_spp(problem) // 2))
-
-
-def _power_of_two(number: int) -> int:
-    """Return the largest power of two <= `number`, at least 1. Few different sample counts need few different kernels."""
-    return 1 << (max(number, 1).bit_length() - 1)
+    return power_of_two(min(max(_TRIAL_PATHS // (height * width), 1), _most_spp(problem) // 2))

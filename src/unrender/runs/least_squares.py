@@ -17,6 +17,7 @@ from unrender.core.text import listed
 from unrender.display import formatting
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
+from unrender.scene.render import power_of_two
 
 __all__ = ["NumbersCheck", "check_numbers"]
 
@@ -189,7 +190,7 @@ class _Numbers:
         point = np.concatenate([np.ravel(values[key]).astype(np.float64) for key in keys])
         return cls(
             problem, values, tuple(keys), tuple(views), point, np.array(sizes), np.array(limits), rigid,
-            1 << (spp.bit_length() - 1),
+            power_of_two(spp),
         )  # fmt: skip
 
     def parts(self, points: np.ndarray) -> dict[str, np.ndarray]:

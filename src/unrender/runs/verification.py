@@ -18,7 +18,7 @@ from unrender.estimators.penalties import penalty
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.batches import PixelBatch, PixelSample
 from unrender.scene.problem import Problem
-from unrender.scene.render import view_request
+from unrender.scene.render import power_of_two, view_request
 from unrender.statistics import paired_losses
 
 __all__ = ["FreshPictures", "Picture", "Remembering", "is_finite", "remembered"]
@@ -123,8 +123,8 @@ class FreshPictures:
         allowed = _LEAST_PATHS if paths < _LONGER * _LEAST_PATHS else int(min(paths, _MOST_PATHS))
         self.frames, self.sampled = _frames(problem, allowed // _GROUPS, self._key.fold(0))
         self.pixels = sum(len(frame.pixels) for frame in self.frames)
-        self._spp = _GROUPS * _power_of_two(_LEAST_PATHS // (_GROUPS * max(self.pixels, 1)))
-        self._launches = _power_of_two(allowed // max(self.pixels * self._spp, 1))
+        self._spp = _GROUPS * power_of_two(_LEAST_PATHS // (_GROUPS * max(self.pixels, 1)))
+        self._launches = power_of_two(allowed // max(self.pixels * self._spp, 1))
 
     @property
     def paths(self) -> int:
@@ -221,11 +221,6 @@ def is_finite(first: Picture, other: Picture) -> bool:
         broken += int((at_first & ~here).sum())
         known += at_first.size
     return broken <= _MOST_NON_FINITE * known
-
-
-def _power_of_two(number: int) -> int:
-    """Return the largest power of two <= `number`, at least 1."""
-    return 1 << (max(number, 1).bit_length() - 1)
 
 
 def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], bool]:

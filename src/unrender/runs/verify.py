@@ -73,7 +73,7 @@ class Memory:
 
     @property
     def disagrees(self) -> bool:
-        """Whether the error exceeds noise, and is a fraction of the residual that misleads the optimisation."""
+        """Return whether the error exceeds noise, and is a fraction of the residual that misleads the optimisation."""
         if not math.isfinite(self.error):
             return True
         relevant = self.error**2 > _OF_RESIDUAL * self.residual**2 and self.error > _OF_PICTURE * self.picture

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
-from unrender.scene import mesh_regularizer, remeshing
+from unrender.scene import remeshing
 from unrender.scene.errors import FieldError
 from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.remeshing import Remeshing
@@ -25,7 +26,7 @@ def check_regularizer(given: Any, mesh: _Mesh | None) -> MeshRegularizer | None:
     """Return a regularizer bound to the mesh, (positions, faces); None for none. Raises `InputError`."""
     if given is None:
         return None
-    regularizer = mesh_regularizer.of(given)
+    regularizer = tables.options(MeshRegularizer, given, "{ bilaplacian = 0.001 }")
     if mesh is None:
         raise InputError(_NO_MESH)
     return regularizer.on_mesh(*mesh)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from unrender.core import checks, tables
+from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.preconditioners.mesh import MeshTopology
 
@@ -98,12 +96,3 @@ class _Mesh:
         at = positions[first].astype(np.float64)
         length = float(np.linalg.norm(at[i] - at[j], axis=1).mean())
         return cls(topology.places, first, topology.copies, topology.neighbours, valence, length)
-
-
-def of(given: Any) -> MeshRegularizer:
-    """Return a regularizer from an instance or a table of options. Raises `InputError`."""
-    if isinstance(given, MeshRegularizer):
-        return given
-    if not isinstance(given, Mapping):
-        raise InputError(f"expected a table such as {{ bilaplacian = 0.001 }}, got {given!r:.60}")
-    return tables.build(MeshRegularizer, given)

@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, KeyedError
 from unrender.parameterisations.base import Parameterisation
 from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.renderer import Renderer
-from unrender.rendering.tied import Tie, TieError, with_ties
+from unrender.rendering.tied import Tie, with_ties
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
 from unrender.scene.mesh_regularizer import MeshRegularizer
@@ -117,6 +117,6 @@ def tied(renderer: Renderer, parameters: Sequence[Parameter], ties: Sequence[Tie
     """Return the renderer with the ties of these parameters. Raises `FieldError` for members that cannot share a value."""
     try:
         return with_ties(renderer, ties)
-    except TieError as error:
+    except KeyedError as error:
         index = [parameter.key for parameter in parameters].index(error.key)
         raise FieldError(("parameters", index, "keys"), str(error)) from error

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -104,15 +104,8 @@ class Prior:
             away = unknown.away(cells)
             value += float(np.sum(away * away)) / (2 * self.std**2)
             gradient += away / self.std**2
-        for scale, size, slope in self._pair_terms():
-            for i, j in unknown.neighbours(cells):
-                difference = cells[i] - cells[j]
-                norm = np.sqrt(np.sum(difference * difference, axis=-1, keepdims=True))
-                value += float(np.sum(size(norm / scale)))
-                pull = difference * slope(norm / scale) / scale**2
-                unknown.add(gradient, i, pull)
-                unknown.add(gradient, j, -pull)
-        return self.weight * value, self.weight * unknown.spread(gradient, x)
+        sizes, pull = self._pairs(cells, cells)
+        return self.weight * (value + sizes), self.weight * unknown.spread(gradient + pull, x)
 
     def product(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Return M v, of the shape of `x`: M is positive semidefinite and equals the Hessian of −log p(x) for all quadratic terms.
@@ -124,14 +117,8 @@ class Prior:
         product = np.zeros_like(cells)
         if self.std is not None:
             product += along / self.std**2
-        for scale, _, slope in self._pair_terms():
-            for i, j in unknown.neighbours(cells):
-                difference = cells[i] - cells[j]
-                norm = np.sqrt(np.sum(difference * difference, axis=-1, keepdims=True))
-                pull = (along[i] - along[j]) * slope(norm / scale) / scale**2
-                unknown.add(product, i, pull)
-                unknown.add(product, j, -pull)
-        return self.weight * unknown.spread(product, x)
+        _, pull = self._pairs(cells, along)
+        return self.weight * unknown.spread(product + pull, x)
 
     def describe(self) -> str:
         """Return the terms in one line."""
@@ -144,19 +131,23 @@ class Prior:
             raise InputError("prior: it is bound to no unknown yet (on)")
         return self._unknown
 
-    def _pair_terms(self) -> list[tuple[float, Any, Any]]:
-        """Return (scale, value, slope over r) of the terms of pairs, as functions of r, their distance in units of the scale."""
-        terms: list[tuple[float, Any, Any]] = []
-        if self.smoothness is not None:
-            terms.append((self.smoothness, lambda r: 0.5 * r * r, lambda r: 1.0))
-        if self.total_variation is not None:
-            terms.append((self.total_variation, _rounded, lambda r: 1 / np.sqrt(r * r + _CORNER**2)))
-        return terms
-
-
-def _rounded(r: np.ndarray) -> np.ndarray:
-    """Return √(r² + c²) − c."""
-    return np.sqrt(r * r + _CORNER**2) - _CORNER
+    def _pairs(self, cells: np.ndarray, along: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the terms of pairs of neighbours at `cells`, and M `along`, with M at `cells`. Their gradient is M `cells`."""
+        unknown, value, pulls = self._of(), 0.0, np.zeros_like(cells)
+        for i, j in unknown.neighbours(cells):
+            norm = np.linalg.norm(cells[i] - cells[j], axis=-1, keepdims=True)
+            stiffness = np.zeros_like(norm)
+            if self.smoothness is not None:
+                value += 0.5 * float(np.sum((norm / self.smoothness) ** 2))
+                stiffness += 1 / self.smoothness**2
+            if self.total_variation is not None:
+                rounded = np.hypot(norm / self.total_variation, _CORNER)
+                value += float(np.sum(rounded - _CORNER))
+                stiffness += 1 / (rounded * self.total_variation**2)
+            pull = stiffness * (along[i] - along[j])
+            unknown.add(pulls, i, pull)
+            unknown.add(pulls, j, -pull)
+        return value, pulls
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,15 +219,6 @@ class _Unknown:
             total[index] += values
         else:
             np.add.at(total, index, values)
-
-
-def of(given: Any) -> Prior:
-    """Return the prior that a user gives: a `Prior`, or a table of its options. Raises `InputError`."""
-    if isinstance(given, Prior):
-        return given
-    if not isinstance(given, Mapping):
-        raise InputError(f"expected a table such as {{ smoothness = 0.05 }}, got {given!r:.60}")
-    return tables.build(Prior, given)
 
 
 def _channels(shape: tuple[int, ...]) -> int:

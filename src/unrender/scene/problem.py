@@ -12,12 +12,12 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, KeyedError
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
 from unrender.losses import L2, Loss
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.rendering.expressions import ExpressionError, are_storable, with_expressions
+from unrender.rendering.expressions import are_storable, with_expressions
 from unrender.rendering.photographs import with_photographs
 from unrender.rendering.renderer import Renderer
 from unrender.scene import notebook
@@ -272,7 +272,7 @@ class Problem(ViewLosses):
 
     @property
     def has_truth(self) -> bool:
-        """Whether the true value or surface of any parameter is known."""
+        """Return whether the true value or surface of any parameter is known."""
         return any(u.truth is not None or u.surface is not None for u in self.unknowns.values())
 
     @property
@@ -375,7 +375,7 @@ def open_scene(
         renderer = with_expressions(
             renderer, functions, {p.key: p.initial for p in parameters if isinstance(p.key, str)}
         )
-    except ExpressionError as error:
+    except KeyedError as error:
         raise FieldError(("expressions", error.key), str(error), f"expression of {error.key}") from error
     except InputError as error:
         name, _, what = str(error).partition(": ")

@@ -60,6 +60,11 @@ def render(
     return (total / spp).astype(np.float32)
 
 
+def power_of_two(number: int) -> int:
+    """Return the largest power of two <= `number`, at least 1. Few different sample counts need few different kernels."""
+    return 1 << (max(number, 1).bit_length() - 1)
+
+
 def view_request(problem: Problem, view: int, spp: int, seed: int) -> SampleRequest:
     """Return the request for a view.
 

@@ -23,7 +23,7 @@ from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
-from unrender.scene import coarse_to_fine, prior
+from unrender.scene import coarse_to_fine
 from unrender.scene.bounds import check_bounds, move_inside, open_scale, project
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
@@ -159,7 +159,9 @@ def check_parameter(
 
 
 def _bound_prior(given: Any, info: ParameterInfo, initial: np.ndarray) -> Prior:
-    return prior.of(given).on(initial, info.conversion.repeated, mesh_topology(info), info.welded)
+    return tables.options(Prior, given, "{ smoothness = 0.05 }").on(
+        initial, info.conversion.repeated, mesh_topology(info), info.welded
+    )
 
 
 def _check_rate(rate: Any) -> float | None:

@@ -122,6 +122,13 @@ def check_views(given: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[
     return tuple(checked), notices
 
 
+def check_sensor(index: int, view: View, count: int) -> None:
+    """Raise `FieldError` unless the `index`-th view has one of `count` sensors."""
+    if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < count:
+        have = f"0 to {count - 1}" if count > 1 else "0, the only sensor"
+        raise FieldError(("views", index, "sensor"), f"expected {have}, got {view.sensor!r}", f"view {index}: sensor")
+
+
 def _check_view(
     index: int, view: View, resolutions: Sequence[tuple[int, int]], films: Renderer, tell_saturated: bool
 ) -> tuple[View, list[str]]:
@@ -139,9 +146,7 @@ def _check_view(
     def wrong(field: str, what: str | Exception) -> FieldError:
         return FieldError(("views", index, field), str(what), f"{owner}: {field}")
 
-    if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < len(resolutions):
-        have = f"0 to {len(resolutions) - 1}" if len(resolutions) > 1 else "0, the only sensor"
-        raise wrong("sensor", f"expected {have}, got {view.sensor!r}")
+    check_sensor(index, view, len(resolutions))
     if not is_number(view.weight) or view.weight <= 0:
         raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
     height, width = resolutions[view.sensor]

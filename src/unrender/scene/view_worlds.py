@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core import arrays, checks
 from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.io import parameter_values
@@ -17,6 +18,7 @@ from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.rendering.worlds import World, with_worlds
 from unrender.scene.errors import FieldError
 from unrender.scene.view import View
+from unrender.scene.view_checks import check_sensor
 
 
 def known_keys(views: Sequence[View]) -> list[str]:
@@ -49,7 +51,8 @@ def of_views(
             if own is None:
                 own = _opened(index, view, keys, scene_renderer(renderer), opened)
                 scenes.append((view.scene, own))
-        worlds[index] = World(own, _sensor(index, view, own), _values(index, view.known or {}, own.parameters()))
+        check_sensor(index, view, len(own.resolutions()))
+        worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters()))
     made, sensors = with_worlds(renderer, list(worlds.values()))
     located = dict(zip(worlds, sensors, strict=True))
     return made, tuple(
@@ -80,14 +83,6 @@ def _opened(
     return own
 
 
-def _sensor(index: int, view: View, renderer: Renderer) -> int:
-    count = len(renderer.resolutions())
-    if isinstance(view.sensor, bool) or not isinstance(view.sensor, int) or not 0 <= view.sensor < count:
-        have = f"0 to {count - 1}" if count > 1 else "0, the only sensor"
-        raise FieldError(("views", index, "sensor"), f"expected {have}, got {view.sensor!r}", f"view {index}: sensor")
-    return view.sensor
-
-
 def _values(index: int, given: Any, known: Mapping[str, ParameterInfo]) -> dict[str, np.ndarray]:
     place, owner = ("views", index, "with"), f"view {index}: known"
     if not isinstance(given, Mapping):
@@ -103,11 +98,11 @@ def _values(index: int, given: Any, known: Mapping[str, ParameterInfo]) -> dict[
             filled, _ = parameter_values.fill(value, info.shape, info.conversion)
         except InputError as error:
             raise FieldError(place, f"{key}: {error}", owner) from error
-        low, high = info.lowest, info.highest
-        if (low is not None and (filled < low).any()) or (high is not None and (filled > high).any()):
-            ends = " and ".join(
-                f"{word} {end:g}" for word, end in (("at least", low), ("at most", high)) if end is not None
+        if not arrays.all_within(filled, info.lowest, info.highest):
+            raise FieldError(
+                place,
+                f"{key}: expected {' and '.join(checks.limits(info.lowest, info.highest))}, got {value!r:.60}",
+                owner,
             )
-            raise FieldError(place, f"{key}: expected {ends}, got {value!r:.60}", owner)
         found[key] = np.asarray(filled, np.float32)
     return found

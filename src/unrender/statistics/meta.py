@@ -69,7 +69,7 @@ class Moments:
 
     @property
     def has_mean(self) -> bool:
-        """Whether `mean` is an array with one value per element."""
+        """Return whether `mean` is an array with one value per element."""
         return not isinstance(self.mean, float) and arrays.shape(self.mean) == arrays.shape(self.square)
 
 

@@ -60,19 +60,19 @@ class Traits:
 
     @property
     def only_cameras(self) -> bool:
-        """Whether all unknowns are poses of sensors. Lens parameters have other units."""
+        """Return whether all unknowns are poses of sensors. Lens parameters have other units."""
         return all(info.viewpoint and info.rigid for info in self.infos.values())
 
     @property
     def cameras_beside_lenses(self) -> bool:
-        """Whether all unknowns are poses of sensors and other numbers that change the form of the picture, such as lenses."""
+        """Return whether all unknowns are poses of sensors and other numbers that change the form of the picture, such as lenses."""
         infos = self.infos.values()
         suit = all(info.perturbable and (info.viewpoint or (info.nonlinear and not info.rigid)) for info in infos)
         return suit and {info.rigid for info in infos} == {True, False}
 
     @property
     def newton_suits(self) -> bool:
-        """Whether Gauss-Newton steps are possible: no requested image or pixels, a pixelwise loss, no preconditioners."""
+        """Return whether Gauss-Newton steps are possible: no requested image or pixels, a pixelwise loss, no preconditioners."""
         requested = self.options.image is not None or self.options.pixels is not None
         return not requested and self.problem.loss.pixelwise and not self.problem.coordinates.preconditioners
 
