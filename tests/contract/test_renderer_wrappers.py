@@ -18,7 +18,8 @@ from unrender.rendering.exposure import ExposedRenderer
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.partial import HeldParameters, PartialDerivatives
-from unrender.rendering.renderer import Camera, EmitterMoments, PictureFormat, SampleRequest
+from unrender.rendering.picture_format import PictureFormat
+from unrender.rendering.renderer import Camera, EmitterMoments, SampleRequest
 from unrender.rendering.response import RespondingRenderer
 from unrender.rendering.tied import Tie, TiedRenderer
 from unrender.rendering.vignetting import VignettedRenderer

@@ -98,6 +98,14 @@ def test_the_gradient_is_the_sum_of_separate_problems(image: str) -> None:
     assert (as_numpy(alone).gradient[LAMP] == 0).all()
 
 
+@pytest.mark.slow
+def test_adaptive_mini_batches_mix_the_worlds() -> None:
+    made = lit_apart()
+    result = ur.optimize(made, "adaptive", steps=40)
+    assert result.skipped == 0
+    assert np.abs(result.parameters[WALL] - 0.3).mean() < np.abs(result.initial[WALL] - 0.3).mean()
+
+
 def test_the_gradient_is_the_slope_of_the_loss() -> None:
     """A brighter wall and a brighter lamp, by differences of many-sample pictures."""
     made = lit_apart()

@@ -65,6 +65,17 @@ def max_depth(default: int, at_least: int) -> Any:
     return integer(default, "longest light path in segments", at_least=at_least, at_most=1 << 20)
 
 
+def choice(default: str, about: str, among: tuple[str, ...]) -> Any:
+    """Return a dataclass field: one of these words."""
+
+    def check(owner: str, name: str, value: Any) -> str:
+        if value not in among:
+            raise InputError(f"{owner}: {name} must be one of {', '.join(among)}, got {value!r}")
+        return value
+
+    return field(default=default, metadata={"kind": str, "about": about, "check": check})
+
+
 def _check_loss(owner: str, name: str, value: Any) -> Loss:
     known = registry.component_of(type(value))
     if known is not None and known.kind == "loss":

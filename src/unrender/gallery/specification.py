@@ -28,6 +28,7 @@ from unrender.core.random import Key
 from unrender.io import bounded_files, files
 from unrender.losses import Loss
 from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.pixel_filter import PixelFilters, is_box
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.scene_loading import media
@@ -43,18 +44,21 @@ _SAMPLER = re.compile(r"^\s*(sample_count|samples_per_wavefront|wavefront_size) 
 """State that a rendering leaves in a sampler, and that the next one sets."""
 
 
-def recall(scene: Any, sensor: int, spp: int, max_depth: int, render: Callable[[], np.ndarray]) -> np.ndarray:
+def recall(
+    scene: Any, sensor: int, spp: int, max_depth: int, render: Callable[[], np.ndarray], aov: str = ""
+) -> np.ndarray:
     """Return the cached image, or the result of `render`, which is then cached.
 
     Args:
         scene: loaded Mitsuba scene.
         sensor, spp, max_depth: rendering settings.
         render: function that returns the image, (H, W, 3) float32.
+        aov: property of the first surface that the image has in place of radiance; "" for radiance.
     """
     place = cache.folder(cache.REFERENCES)
     if place is None:
         return render()
-    path = place / f"{digest(scene, sensor, spp, max_depth)}.npz"
+    path = place / f"{digest(scene, sensor, spp, max_depth, aov)}.npz"
     width, height = scene.sensors()[sensor].film().crop_size()
     image = _read(path, (int(height), int(width), 3))
     if image is None:
@@ -65,7 +69,7 @@ def recall(scene: Any, sensor: int, spp: int, max_depth: int, render: Callable[[
     return image
 
 
-def digest(scene: Any, sensor: int, spp: int, max_depth: int) -> str:
+def digest(scene: Any, sensor: int, spp: int, max_depth: int, aov: str = "") -> str:
     """Return a name for the image: the SHA-256 of everything that determines it."""
     state = hashlib.sha256()
     versions = [f"{name} {metadata.version(name)}" for name in ("mitsuba", "drjit")]
@@ -78,6 +82,7 @@ def digest(scene: Any, sensor: int, spp: int, max_depth: int) -> str:
         spp,
         max_depth,
         _SAMPLER.sub("", _ADDRESS.sub("", str(scene))),
+        *([aov] if aov else []),
         *(["filtered"] if not is_box(scene.sensors()[sensor].film()) else []),
     ]
     state.update("\n".join(map(str, facts)).encode())
@@ -178,17 +183,21 @@ def build_problem(name: str, specification: Specification) -> Problem:
     return Problem(renderer, parameters, views, specification.loss, specification.max_depth, truth=truth, name=name)
 
 
-def reference(scene: Any, sensor: int, spp: int, max_depth: int) -> np.ndarray:
+def reference(scene: Any, sensor: int, spp: int, max_depth: int, aov: str = "") -> np.ndarray:
     """Return a reference image by Mitsuba's `path` integrator, or `volpath` with media: (H, W, 3) float32. Unbiased.
+
+    With an AOV (`picture_format.AOVS`), it has that property of the first surface in place of radiance.
 
     It uses the film's reconstruction filter, and `spp` samples or slightly more, in as many equal passes as memory requires. Equal
     arguments give equal images, which are stored in the cache folder (`backend.cache`).
     """
     with phases.phase("reference images") as advance:
-        return recall(scene, sensor, spp, max_depth, lambda: _render(scene, sensor, spp, max_depth, advance))
+        return recall(scene, sensor, spp, max_depth, lambda: _render(scene, sensor, spp, max_depth, aov, advance), aov)
 
 
-def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable[[float], None]) -> np.ndarray:
+def _render(
+    scene: Any, sensor: int, spp: int, max_depth: int, aov: str, advance: Callable[[float], None]
+) -> np.ndarray:
     volumes = bool(media(scene))
     integrator = mi.load_dict({"type": "volpath" if volumes else "path", "max_depth": max_depth})
     camera = scene.sensors()[sensor]
@@ -206,7 +215,10 @@ def _render(scene: Any, sensor: int, spp: int, max_depth: int, advance: Callable
             camera, sampler, mi.UInt32(seed), take, None, width * height, filters=PixelFilters.of([camera])
         )
         ray, weight = film.rays(samples)
-        radiance, _, _ = integrator.sample(scene, sampler, ray, camera.get_medium())
+        if aov:
+            radiance = AovKernel(aov).value(scene.ray_intersect(ray), ray, True)
+        else:
+            radiance, _, _ = integrator.sample(scene, sampler, ray, camera.get_medium())
         radiance *= weight
         dr.eval(radiance)
         total += take * film.develop(radiance, take, 1, total.shape).numpy()[0]

@@ -17,6 +17,7 @@ from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.rendering.mitsuba.scene_loading import load
+from unrender.rendering.picture_format import AOVS
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
@@ -42,11 +43,12 @@ class SphereToMesh:
     reference_spp: int = fields.reference_spp(512)
     max_depth: int = fields.max_depth(2, at_least=2)
     strength: int = fields.integer(0, "λ of large steps (LargeSteps) on the mesh, 0 for none; 19 is usual", at_least=0)
+    pictures: str = fields.choice("colour", f"what the images contain: colour, {', '.join(AOVS)}", ("colour", *AOVS))
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the sphere floating over a floor, under a sun, with cameras that look down, so that the floor shows its dark side's
-        outline."""
+        outline. Masks are of the sphere alone."""
         points, faces = meshes.icosphere(self.subdivisions)
         return self._stage() | {"sphere": meshes.triangles("sphere", _RADIUS * points, faces, _clay())}
 
@@ -65,11 +67,13 @@ class SphereToMesh:
     def problem(self, name: str) -> Problem:
         """Return the problem: the sphere's scene, and references of the body by Mitsuba's `path` integrator."""
         true = load(self.target)
-        pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
-        views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
+        aov = "" if self.pictures == "colour" else self.pictures
+        pictures = [reference(true, view, self.reference_spp, self.max_depth, aov) for view in range(self.views)]
+        views = [View(picture, sensor, aov=aov or None) for sensor, picture in enumerate(pictures)]
         return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name)
 
     def _stage(self) -> dict[str, Any]:
+        floor = parts.rectangle((0, -1.3, 0), (20, 0, 0), (0, 0, -20), parts.diffuse(0.12, 0.18, 0.25))
         angles = 2 * np.pi * np.arange(self.views) / self.views
         heights = np.where(np.arange(self.views) % 2 == 0, 1.9, 3.2)
         return {
@@ -81,7 +85,7 @@ class SphereToMesh:
                 for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
             },
             "sun": staging.sun((0.35, 1.0, 0.45), 1.0),
-            "floor": parts.rectangle((0, -1.3, 0), (20, 0, 0), (0, 0, -20), parts.diffuse(0.12, 0.18, 0.25)),
+            **({} if self.pictures == "mask" else {"floor": floor}),
         }
 
 

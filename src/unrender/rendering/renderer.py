@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -312,33 +312,6 @@ class ReplacedMesh:
     vertices: np.ndarray
     faces: np.ndarray
     uv: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class PictureFormat:
-    """Pixel format of a film.
-
-    Attributes:
-        colour: "rgb" (linear), "luminance" or "xyz". Images of the renderer are RGB; "luminance" makes all three channels equal.
-        signed: whether pixels may be negative, because of negative lobes of the filter or because the images are not radiance.
-    """
-
-    colour: Literal["rgb", "luminance", "xyz"] = "rgb"
-    signed: bool = False
-
-
-@runtime_checkable
-class WithFormats(Protocol):
-    """A renderer whose films have explicit pixel formats."""
-
-    def formats(self) -> Sequence[PictureFormat]:
-        """Return the format of each sensor's film."""
-        ...
-
-
-def format_of(renderer: Any, sensor: int) -> PictureFormat:
-    """Return the format of a sensor's film; signed RGB if the renderer has no films."""
-    return renderer.formats()[sensor] if isinstance(renderer, WithFormats) else PictureFormat(signed=True)
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,10 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.rendering.picture_format import PictureFormat, format_of
 from unrender.rendering.renderer import (
     EmitterMoments,
     ParameterInfo,
-    PictureFormat,
     Renderer,
     Rendering,
     RenderSession,
@@ -26,7 +26,6 @@ from unrender.rendering.renderer import (
     counted_vertices,
     differentiated,
     drawing_emitters,
-    format_of,
     with_differential_bsdf,
 )
 from unrender.rendering.wrapper import RendererWrapper
@@ -189,7 +188,7 @@ class WorldsRenderer(RendererWrapper):
             InputError: there are several scenes.
         """
         if len(self.renderers) > 1:
-            raise InputError(f"{', '.join(meshes)}: the triangles of views of several scenes cannot change")
+            raise InputError(f"{', '.join(meshes)}: triangles cannot change where views show several scenes or AOVs")
         return super().with_meshes(meshes, keys)
 
     def with_differential_bsdf(self) -> Renderer:
@@ -299,9 +298,7 @@ class WorldsSession:
         parts = self._renderer.parts(request)
         counts = [counted_vertices(self._session(n), self._at(n, parameters), part) for n, part, _ in parts]
         count = 0 if request.pixels is None else arrays.shape(request.pixels)[0]
-        of = [_Part(n, chosen, count, None) for n, _, chosen in parts]
-        grouped = [arrays.add_first_axis(x) for x in counts]
-        return _joined(grouped, of)[0] if of[0].chosen is not None else counts[0]
+        return _joined(counts, [_Part(n, chosen, count, None) for n, _, chosen in parts])
 
     def emitters(self) -> np.ndarray:
         """Return the emitters.
@@ -376,6 +373,8 @@ def _joined(parts: Sequence[Any], paths: Sequence[_Part]) -> Array:
     """Return the images of the full request from those of its parts."""
     if paths[0].chosen is None:
         return parts[0]
+    if len(arrays.shape(parts[0])) < 3:  # of one group, without its axis
+        return _joined([arrays.add_first_axis(x) for x in parts], paths)[0]
     total, groups, channels = None, *(arrays.shape(parts[0])[n] for n in (0, 2))
     for images, part in zip(parts, paths, strict=True):
         flat = arrays.flat(images)

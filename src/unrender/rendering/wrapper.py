@@ -12,11 +12,11 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.rendering.picture_format import PictureFormat, format_of
 from unrender.rendering.renderer import (
     Camera,
     EmitterMoments,
     ParameterInfo,
-    PictureFormat,
     Remeshable,
     Renderer,
     Rendering,
@@ -27,7 +27,6 @@ from unrender.rendering.renderer import (
     WithCameras,
     counted_vertices,
     drawing_emitters,
-    format_of,
     with_differential_bsdf,
 )
 

@@ -12,7 +12,8 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.optimizers.partitioned import PartitionedState
-from unrender.rendering.renderer import Remeshable, ReplacedMesh, format_of
+from unrender.rendering.picture_format import format_of
+from unrender.rendering.renderer import Remeshable, ReplacedMesh
 from unrender.runs.folder.meshes import arrays_of
 from unrender.runs.hooks import Hook
 from unrender.runs.noise import GradientNoise

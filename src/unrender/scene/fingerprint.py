@@ -89,6 +89,7 @@ def _take(problem: Problem) -> dict[str, str]:
         fields |= (
             {} if view.scene is None else {"scene": str(view.scene) if isinstance(view.scene, (str, Path)) else "given"}
         )
+        fields |= {} if view.aov is None else {"aov": view.aov}
         parts |= {f"view {index}: {name}": value for name, value in fields.items()}
     return parts | _of_scene(problem) | _of_files(problem)
 

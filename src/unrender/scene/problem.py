@@ -18,7 +18,7 @@ from unrender.core.trees import Tree
 from unrender.losses import L2, Loss
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.expressions import are_storable, with_expressions
-from unrender.rendering.photographs import with_photographs
+from unrender.rendering.photographs import OF_PHOTOGRAPHS, with_photographs
 from unrender.rendering.renderer import Renderer
 from unrender.scene import notebook
 from unrender.scene.coarse_to_fine import CoarseToFine
@@ -329,6 +329,11 @@ def _opened(
         renderer, views, members, lambda of: open_renderer(of, max_depth, [*members, *known_keys(views)])
     )
     sensors = [view.sensor for view in located if isinstance(view.sensor, int)]
+    for index, view in enumerate(views):
+        if view.aov is not None and (beside := next((key for key in keys if key in OF_PHOTOGRAPHS), None)):
+            raise FieldError(
+                ("views", index, "aov"), f"not supported beside the unknown {beside}; leave out one of them"
+            )
     try:
         return with_photographs(renderer, keys, sensors), located
     except InputError as error:

@@ -61,6 +61,8 @@ def _described(problem: Problem, folder: Path) -> dict[str, Any]:
                 table |= store.field(name, picture, f"view{index}-{name}", inline=False)
         if isinstance(view.scene, (str, Path)):
             table["scene"] = str(Path(view.scene).resolve())
+        if view.aov is not None:
+            table["aov"] = view.aov
         if view.known:
             known = [store.field(key, x, f"view{index}-{n}") for n, (key, x) in enumerate(view.known.items())]
             table["with"] = {key: value for part in known for key, value in part.items()}

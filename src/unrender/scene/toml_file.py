@@ -26,6 +26,7 @@
     mask = "mask.png"
     with = { "lamp.intensity.value" = 0 }      # values of known parameters in this view alone
     scene = "room-2.xml"                       # another scene that this view is of
+    aov = "depth"                              # what the reference has in place of colour
 
 Paths are relative to the file. Only `scene`, `key` (or `keys`) and `reference` are required.
 """
@@ -41,6 +42,7 @@ from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, confinement, toml_models
 from unrender.io.toml_models import Table
+from unrender.rendering.picture_format import AOVS
 from unrender.scene import coarse_to_fine
 from unrender.scene.errors import FieldError
 from unrender.scene.parameter import Parameter
@@ -103,6 +105,7 @@ class _View(Table):
         None, alias="with", description='a table of values by key, such as { "lamp.intensity.value" = 0 }'
     )
     scene: StrictStr | None = Field(None, description="the path of a Mitsuba .xml file")
+    aov: StrictStr | None = Field(None, description=f"one of {', '.join(AOVS)}")
 
 
 class _Problem(Table):
@@ -175,7 +178,7 @@ def _build(model: _Problem, file: Path) -> Problem:
 def _view(model: _View, folder: Path) -> View:
     known = None if model.known is None else {key: _value(value, folder) for key, value in model.known.items()}
     mask, scene = (None if name is None else folder / name for name in (model.mask, model.scene))
-    return View(folder / model.reference, model.sensor, model.weight, mask, known, scene)
+    return View(folder / model.reference, model.sensor, model.weight, mask, known, scene, model.aov)
 
 
 def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:

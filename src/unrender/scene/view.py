@@ -28,6 +28,9 @@ class View:
             as it is.
         scene: Another scene that this view is of, as for `Problem`: an .xml file, a dictionary, a function, or a renderer. Unknowns are
             those of the problem's scene; the ones that this scene has under the same key act on it. None for the problem's scene.
+        aov: What the reference contains in place of colour, for the first surface that each pixel sees: "depth" (distance), "position",
+            "sh_normal" (shading normal), "albedo" (diffuse reflectance), in world space, or "mask" (1 on surfaces). Background is 0. None
+            for colour.
     """
 
     reference: str | Path | np.ndarray | StoredPicture
@@ -36,3 +39,9 @@ class View:
     mask: str | Path | np.ndarray | StoredPicture | None = None
     known: Mapping[str, Any] | None = None
     scene: str | Path | dict[str, Any] | Callable[[], Any] | Any = None
+    aov: str | None = None
+
+    @property
+    def own_world(self) -> bool:
+        """Whether it shows other values, another scene or another quantity than the problem's scene."""
+        return self.known is not None or self.scene is not None or self.aov is not None

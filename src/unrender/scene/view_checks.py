@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.io.stored_pictures import PictureStore, StoredPicture
 from unrender.losses import Censored, Loss
-from unrender.rendering.renderer import PictureFormat, Renderer, format_of
+from unrender.rendering.picture_format import PictureFormat, format_of
+from unrender.rendering.renderer import Renderer
 from unrender.scene.errors import FieldError
 from unrender.scene.references import ON_DEVICE
 from unrender.scene.validation import is_number
@@ -50,6 +52,8 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
     Raises `InputError` as `images.read` does, and if the number of channels differs from the film's or radiance is negative. It also
     does so for floating-point files labelled RGB of films that store XYZ: `mi.util.write_bitmap` labels XYZ values so.
     """
+    if form.aov:
+        return _of_aov(source, form.aov)
     grey = form.colour == "luminance"
     channels = {"luminance": (1, 2), "xyz": (3, 4), "rgb": (1, 3, 4)}[form.colour]
     try:
@@ -81,6 +85,29 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
         notices.append("is luminance, with which the image's luminance is compared")
     full = np.array(np.broadcast_to(values, (*values.shape[:2], 3)))
     return Reference(full, image.alpha, bool(image.notice), tuple(notices))
+
+
+def _of_aov(source: Any, name: str) -> Reference:
+    """Read the reference of an AOV. The alpha of a mask in 8 or 16 bits is the mask; other integer values are sRGB albedos."""
+    image = images.read(source, alpha=True)
+    values, notices = image.values, []
+    if name == "mask" and image.notice:
+        values = images.read(source, linearise=False).values if image.alpha is None else image.alpha[..., None]
+        notices += ["is the alpha of the file"] if image.alpha is not None else []
+    elif name == "albedo":
+        notices += [image.notice] if image.notice else []
+    elif image.notice:
+        raise InputError(f"8- and 16-bit values cannot be a {name}; use a floating-point file or array")
+    if name in ("sh_normal", "position") and values.shape[2] != 3:
+        raise InputError(f"expected the three coordinates of a {name}, got one channel")
+    if name in ("depth", "mask") and values.shape[2] == 3 and np.ptp(values, axis=2).any():
+        raise InputError(f"expected one channel, or three equal ones, of a {name}")
+    if name in ("mask", "albedo") and not arrays.all_within(values, 0.0, 1.0):
+        raise InputError(f"expected values from 0 to 1, got {values.min():g} to {values.max():g}")
+    if name == "depth":
+        _check_not_negative(values)
+    full = np.array(np.broadcast_to(values, (*values.shape[:2], 3)))
+    return Reference(full, image.alpha if name == "albedo" else None, False, tuple(notices))
 
 
 def _is_of_film(source: Any) -> bool:

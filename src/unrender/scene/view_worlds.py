@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.suggestions import did_you_mean
 from unrender.io import parameter_values
 from unrender.rendering.photographs import scene_renderer
+from unrender.rendering.picture_format import AOVS, AovRenderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.rendering.worlds import World, with_worlds
 from unrender.scene.errors import FieldError
@@ -43,7 +44,7 @@ def of_views(
     scenes: list[tuple[Any, Renderer]] = []
     worlds: dict[int, World] = {}
     for index, view in enumerate(views):
-        if view.known is None and view.scene is None:
+        if not view.own_world:
             continue
         own = scene_renderer(renderer)
         if view.scene is not None:
@@ -52,11 +53,13 @@ def of_views(
                 own = _opened(index, view, keys, scene_renderer(renderer), opened)
                 scenes.append((view.scene, own))
         check_sensor(index, view, len(own.resolutions()))
+        if view.aov is not None:
+            own = _with_aov(index, view.aov, own)
         worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters()))
     made, sensors = with_worlds(renderer, list(worlds.values()))
     located = dict(zip(worlds, sensors, strict=True))
     return made, tuple(
-        replace(view, sensor=located[index], known=None, scene=None) if index in located else view
+        replace(view, sensor=located[index], known=None, scene=None, aov=None) if index in located else view
         for index, view in enumerate(views)
     )
 
@@ -81,6 +84,18 @@ def _opened(
             what = f"{key} has the shape {known[key].shape} there, {others[key].shape} in the problem's scene"
             raise FieldError(place, what, f"view {index}: scene")
     return own
+
+
+def _with_aov(index: int, name: Any, own: Renderer) -> Renderer:
+    place, owner = ("views", index, "aov"), f"view {index}: aov"
+    if name not in AOVS:
+        raise FieldError(place, f"expected one of {', '.join(AOVS)}, got {name!r:.60}", owner)
+    try:
+        if isinstance(own, AovRenderer):
+            return own.with_aov(name)
+    except InputError as error:
+        raise FieldError(place, str(error), owner) from error
+    raise FieldError(place, "this renderer has radiance only; leave it out", owner)
 
 
 def _values(index: int, given: Any, known: Mapping[str, ParameterInfo]) -> dict[str, np.ndarray]:

@@ -49,7 +49,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     given = [_located(problem.given_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
     sensors = sensors_with_rows(problem.renderer)
-    if sensors is not None and any(view.known is not None or view.scene is not None for view in problem.given_views):
+    if sensors is not None and any(view.own_world for view in problem.given_views):
         raise InputError(
             f"workers: {problem.name} has parameters of photographs beside views of different worlds; leave --workers out"
         )

@@ -13,7 +13,9 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
+from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
+from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.mesh_layout import POSITIONS
 from unrender.rendering.mitsuba.pixel_filter import is_box
@@ -70,17 +72,18 @@ class BoundaryTerm:
     Args:
         pair: both loads of the scene.
         moving: ids of the shapes that move.
-        max_depth: maximum path length in segments, >= 1.
+        paths: settings of the light paths.
     """
 
-    def __init__(self, pair: ScenePair, moving: Iterable[str], max_depth: int):
+    def __init__(self, pair: ScenePair, moving: Iterable[str], paths: LightPaths):
         scene = pair.loaded()
         loaded = {
             mesh.id(): np.array(scene.value(f"{mesh.id()}.{POSITIONS}"))
             for mesh in pair.current.shapes()
             if mesh.is_mesh() and f"{mesh.id()}.{POSITIONS}" in scene.parameters
         }
-        self._integrator = BoundaryIntegrator(EdgeTable(pair.current, set(moving), loaded), max_depth)
+        aov = AovKernel(paths.aov) if paths.aov else None
+        self._integrator = BoundaryIntegrator(EdgeTable(pair.current, set(moving), loaded), paths.max_depth, aov)
         self._resolutions = pair.resolutions
 
     def accumulate(self, scene: LoadedScene, request: SampleRequest, weights: mi.TensorXf) -> None:

@@ -9,12 +9,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.base import ConnectionRecord, ReplayState, total
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
 
-Kernel = PathPair | VolumePair | PrbKernel
+Kernel = PathPair | VolumePair | PrbKernel | AovKernel
 """Kernel that traces paths."""
 
 Tables = dict[str, Any]

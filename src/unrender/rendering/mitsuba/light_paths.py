@@ -46,12 +46,14 @@ class LightPaths:
         max_depth: maximum path length in segments, >= 1.
         rr_depth: depth from which Russian roulette may terminate a path, >= 1.
         hide_emitters: whether emitters are invisible to camera rays.
+        aov: property of the first surface that is rendered in place of radiance, see `AovKernel`; "" for radiance.
         notices: one line for each setting of the scene that is not used.
     """
 
     max_depth: int = DEFAULT_DEPTH
     rr_depth: int = _ROULETTE
     hide_emitters: bool = False
+    aov: str = ""
     notices: tuple[str, ...] = ()
 
     @classmethod
@@ -77,7 +79,7 @@ class LightPaths:
         if hidden and volumetric:
             raise InputError("hide_emitters is not supported with participating media; leave it out")
         notices = _notices(kind, own, requested, max_depth, volumetric)
-        return cls(max_depth, max(1, _number("rr_depth", text) or _ROULETTE), hidden, notices)
+        return cls(max_depth, max(1, _number("rr_depth", text) or _ROULETTE), hidden, notices=notices)
 
 
 def _notices(kind: str, own: int | None, requested: int | None, max_depth: int, volumetric: bool) -> tuple[str, ...]:

@@ -15,7 +15,8 @@ from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_filter import has_negative_lobes
 from unrender.rendering.mitsuba.session import MitsubaSession
-from unrender.rendering.renderer import PictureFormat, Rendering, SampleRequest
+from unrender.rendering.picture_format import PictureFormat
+from unrender.rendering.renderer import Rendering, SampleRequest
 from unrender.rendering.wrapper import SessionWrapper
 
 _COLOURS = {"y": "luminance", "ya": "luminance", "xyz": "xyz", "xyza": "xyz"}

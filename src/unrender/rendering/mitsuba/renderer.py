@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -28,15 +29,8 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.sphere_meshes import moving_targets
 from unrender.rendering.mitsuba.tensors import tensor
-from unrender.rendering.renderer import (
-    Camera,
-    LossWeights,
-    ParameterInfo,
-    PictureFormat,
-    ReplacedMesh,
-    Space,
-    differentiated,
-)
+from unrender.rendering.picture_format import PictureFormat
+from unrender.rendering.renderer import Camera, LossWeights, ParameterInfo, ReplacedMesh, Space, differentiated
 
 
 class MitsubaRenderer:
@@ -94,6 +88,7 @@ class MitsubaRenderer:
         ] = {}
         self._stock: StockSession | None = None
         self._differential_bsdf, self._differential = False, None
+        self._aovs: dict[str, MitsubaRenderer] = {}
         self._checked: set[tuple[tuple[str, ...], frozenset[str], Space | None]] = set()
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
@@ -157,7 +152,7 @@ class MitsubaRenderer:
         self, session: MitsubaSession, keys: list[str], derivatives: AbstractSet[str]
     ) -> MitsubaSession | CachingSession:
         """Return a session that caches its paths if the parameters allow it, else the session itself."""
-        if self._differential_bsdf:
+        if self._differential_bsdf or self.light_paths.aov:
             return session
         try:
             return CachingSession(self.pair, session, keys, sorted(derivatives), self.light_paths)
@@ -169,12 +164,28 @@ class MitsubaRenderer:
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
         """Return a renderer of the same loaded scenes with differential BSDF sampling."""
-        if self._differential_bsdf:
+        if self._differential_bsdf or self.light_paths.aov:
             return self
         if self._differential is None:
             self._differential = copy.copy(self)
             self._differential._differential_bsdf, self._differential._sessions = True, {}
         return self._differential
+
+    def with_aov(self, name: str) -> MitsubaRenderer:
+        """Return a renderer of the same loaded scenes with an AOV in place of radiance. Raise `InputError` for scenes with media."""
+        if self.pair.volumetric:
+            raise InputError(f"{name} is a property of surfaces, and the scene has media; leave it out")
+        if name not in self._aovs:
+            made = self._aovs[name] = copy.copy(self)
+            made.light_paths = LightPaths(1, hide_emitters=self.light_paths.hide_emitters, aov=name)
+            made._formats, made._sessions = [PictureFormat(signed=True, aov=name)] * len(self._formats), {}
+            made._checked, made._differential = set(), None
+            reason = f"path gradients of moving sensors do not support {name}"
+            moving = {key: info for key, info in self._info.items() if info.viewpoint}
+            made._info = self._info | {
+                key: replace(x, differentiable=False, reason=reason) for key, x in moving.items()
+            }
+        return self._aovs[name]
 
     def stock(self) -> StockSession:
         if self.pair.replaced:

@@ -19,6 +19,7 @@ from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor, moving_geometry, no_tangents
 from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.frozen import FrozenFunction
+from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
@@ -109,7 +110,7 @@ class MitsubaSession:
                     f"{next(iter(fixed))} without a derivative; use perturbed renders for both"
                 )
             shapes = {moved[key] for key in everything if key not in cameras} - {""}
-            self._boundary = BoundaryTerm(pair, shapes, paths.max_depth) if shapes else None
+            self._boundary = BoundaryTerm(pair, shapes, paths) if shapes else None
             self._camera = CameraTerm(pair, cameras, paths.max_depth, not shapes) if cameras else None
             self._geometric = any(key in poses or traits[key].geometric for key in everything if key not in cameras)
             self._replays = len(cameras) < len(everything)
@@ -135,6 +136,8 @@ class MitsubaSession:
     @cached_property
     def _path_kernel(self) -> Kernel:
         """Path tracer for the derivatives of these parameters."""
+        if self._light.aov:
+            return AovKernel(self._light.aov)
         delta = any(traits.changes_delta for traits in self._traits)
         if not self._pair.volumetric:
             return PathPair(
@@ -153,7 +156,7 @@ class MitsubaSession:
 
     @cached_property
     def _geometry_kernel(self) -> Kernel:
-        return PrbKernel(self._light.max_depth, self._light.rr_depth)
+        return self._path_kernel if self._light.aov else PrbKernel(self._light.max_depth, self._light.rr_depth)
 
     @cached_property
     def _moved_kernel(self) -> MovedPair:
@@ -161,7 +164,6 @@ class MitsubaSession:
 
     @cached_property
     def _unrelated_kernel(self) -> MovedPair:
-        """Tracer of pairs with equal random numbers and unrelated paths."""
         return MovedPair(self._light.max_depth, self._light.rr_depth, share=0.0, shared=self._only_meshes)
 
     # ------------------------------------------------------------------ rendering
@@ -213,7 +215,8 @@ class MitsubaSession:
         self.set_parameters(current)
         # A virtual call reaches both scenes' objects, and its adjoint accumulates gradients in all that are attached.
         self.set_parameters(previous, previous=True, attach=request.both_gradients)
-        if space == "primary" and not (self._geometric and self._related):
+        space = "primary" if self._light.aov else space  # rays of AOVs have one segment, which both states share
+        if space == "primary" and (self._light.aov or not (self._geometric and self._related)):
             radiance = self.kernel(ImagePass(), request)()
             radiance_previous = self.kernel(ImagePass(previous=True), request)()
         else:

@@ -26,6 +26,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.edges import EdgeTable
+from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.boundary_paths import (
     OFFSET,
     BoundarySegment,
@@ -53,12 +54,13 @@ class BoundaryIntegrator:
 
     Args:
         table: the scene's edges.
-        max_depth: maximum path length in segments, >= 1.
+        max_depth: maximum path length in segments, >= 1; 1 for AOVs.
+        aov: property whose jumps at edges count in place of radiance; None for radiance.
     """
 
     # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
-    def __init__(self, table: EdgeTable, max_depth: int):
-        self._table, self._max_depth = table, max_depth
+    def __init__(self, table: EdgeTable, max_depth: int, aov: AovKernel | None = None):
+        self._table, self._max_depth, self._aov = table, max_depth, aov
         self._radiance: Any = mi.load_dict({"type": "prb_projective", "max_depth": max_depth, "rr_depth": max_depth})
 
     def weighted_image(self, scene: Any, sensor: Any, weights: Any, seed: int, samples: int) -> Any:
@@ -136,7 +138,10 @@ class BoundaryIntegrator:
         both = dr.gather(mi.Bool, active, lane)
         ray, weight = picture.sensor.sample_ray(picture.time, 0.5, at, mi.Point2f(0.5), both)
         near = dr.gather(mi.Float, distance, lane)
-        si = _facing(picture.scene.ray_intersect(ray, both), ray, near)
+        si = picture.scene.ray_intersect(ray, both)
+        if self._aov is not None:
+            return _halves_difference(self._aov.value(si, ray, both) * weight, count)
+        si = _facing(si, ray, near)
         L = self._trace(picture.scene, ray, si, mi.UInt32(0), both, seed, count) * weight
         return _halves_difference(L, count)
 

@@ -1,0 +1,76 @@
+"""Properties of the first surface that each camera ray hits, in place of radiance: Mitsuba's arbitrary output variables (AOVs)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
+from unrender.rendering.mitsuba.integrators.base import PathContext, ReplayState
+
+
+class AovKernel:
+    """One property of the first surface as a `PathKernel`: the names and values are those of Mitsuba's `aov` integrator.
+
+    The property is 0 where a ray hits nothing. It is attached to all parameters that it depends on: vertex positions move the hit along a
+    fixed ray. The motion of silhouettes is left to `BoundaryIntegrator`.
+
+    Args:
+        name: "depth", "position", "sh_normal", "albedo", or "mask", which is 1 where a ray hits a surface.
+    """
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def sample(
+        self,
+        mode: dr.ADMode,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
+        sampler: Any,
+        ray: mi.RayDifferential3f,
+        replay: tuple[ReplayState, ...] = (),
+        pair: bool = False,
+        geometry: Any = None,
+        active: Bool | bool = True,
+    ) -> tuple[Spectrum, None]:
+        """Trace one ray per lane, see `PathKernel.sample`. Raise `ValueError` for pairs."""
+        del sampler
+        if pair:
+            raise ValueError("aov: expected one state")
+        context = PathContext(mode, scene, tables, replay, pair, geometry)
+        with context.resume_grad():
+            lanes: Any = mi.Bool(active)
+            si = context.geometry.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=lanes, active=lanes)
+            value = self.value(si, ray, active)
+            if not context.primal and dr.grad_enabled(value):
+                if context.forward:
+                    return dr.forward_to(value), None
+                dr.backward_from(context.adjoint_sum([value]))
+        return dr.detach(value) * (0 if context.forward else 1), None
+
+    def value(self, si: Any, ray: Any, active: Any) -> Any:
+        """Return the property of surface interactions, in three channels."""
+        hit = si.is_valid() & active
+        if self.name == "mask":
+            return dr.select(hit, mi.Spectrum(1), 0)
+        if self.name == "depth":
+            return mi.Spectrum(dr.select(hit, si.t, 0))
+        if self.name == "albedo":
+            return dr.select(hit, si.bsdf(ray).eval_diffuse_reflectance(si, hit), 0)
+        vector = si.p if self.name == "position" else si.sh_frame.n
+        return dr.select(hit, mi.Spectrum(vector.x, vector.y, vector.z), 0)
+
+    def vertices(
+        self,
+        scene: mi.Scene,
+        tables: Mapping[str, Any],
+        sampler: Any,
+        ray: mi.RayDifferential3f,
+        geometry: Any = None,
+    ) -> Float:
+        """Return the number of vertices per lane, see `PathKernel.vertices`: one where the ray hits a surface."""
+        return self.sample(dr.ADMode.Primal, scene, tables, sampler, ray, geometry=geometry)[0].x * 0 + 1

@@ -1,0 +1,211 @@
+# Dr.Jit's stubs know less than its functions return.
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+
+"""Views whose references are depths, positions, normals, albedos or masks: values, gradients, runs, and bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.core.errors import InputError
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.picture_format import AOVS
+from unrender.rendering.renderer import SampleRequest
+from unrender.scene.fingerprint import fingerprint
+
+pytestmark = pytest.mark.mitsuba
+
+SIZE, BALL, FLOOR = 8, "ball.vertex_positions", "floor.bsdf.reflectance.value"
+CHANNELS = {"depth": 1, "position": 3, "sh_normal": 3, "albedo": 3}
+
+
+def scene(x: float = 0.0, paint: tuple[float, ...] = (0.4, 0.5, 0.6), **more: Any) -> dict[str, Any]:
+    """A red ball above a floor, before an empty background."""
+    look = mi.ScalarTransform4f().look_at([0, 0.5, 4], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    ground = mi.ScalarTransform4f().translate([0, -0.8, 0]).rotate([1, 0, 0], -90).scale(1.5)
+    return {
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 40, "to_world": look, "film": film},
+        "light": {"type": "point", "position": [0, 3, 3], "intensity": {"type": "rgb", "value": [10.0, 10.0, 10.0]}},
+        "floor": {
+            "type": "rectangle",
+            "to_world": ground,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(paint)}},
+        },
+        "ball": {
+            "type": "sphere",
+            "radius": 0.7,
+            "center": [x, 0.0, 0.0],
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.7, 0.2, 0.1]}},
+        },
+        **more,
+    }
+
+
+@pytest.fixture(scope="module")
+def renderer() -> MitsubaRenderer:
+    return MitsubaRenderer(scene, 3, [BALL])
+
+
+def images(renderer: Any, values: dict[str, np.ndarray], seeds: range, spp: int = 1024) -> np.ndarray:
+    session = renderer.prepare(list(values), None, derivatives=False)
+    tree = {key: renderer.array(x) for key, x in values.items()}
+    return np.stack([session.image(tree, SampleRequest(0, spp, seed)).images.numpy()[0] for seed in seeds])
+
+
+def picture(name: str, **of: Any) -> np.ndarray:
+    """A picture of many samples by Mitsuba's own integrator."""
+    made = mi.load_dict(scene(**of))
+    if name == "mask":
+        return (picture("depth", **of) > 0).astype(np.float32)
+    integrator = mi.load_dict({"type": "aov", "aovs": f"a:{name}"})
+    return np.array(mi.render(made, integrator=integrator, spp=1024))
+
+
+def problem(views: list[ur.View], keys: tuple[str, ...] = (FLOOR,), **options: Any) -> ur.Problem:
+    return ur.Problem(scene, [ur.Parameter(key) for key in keys], views, **options)
+
+
+def test_values_are_those_of_mitsubas_integrator(renderer: MitsubaRenderer) -> None:
+    integrator = mi.load_dict({"type": "aov", "aovs": ",".join(f"{name}:{name}" for name in CHANNELS)})
+    theirs = np.stack(
+        [np.array(mi.render(renderer.pair.current, integrator=integrator, spp=1024, seed=seed)) for seed in range(8)]
+    )
+    first = 0
+    for name, count in CHANNELS.items():
+        ours = images(renderer.with_aov(name), {FLOOR: np.array([0.4, 0.5, 0.6])}, range(100, 108))
+        expected = theirs[..., first : first + count]
+        first += count
+        error = np.sqrt((ours[..., :count].var(axis=0, ddof=1) + expected.var(axis=0, ddof=1)) / 8)
+        difference = ours[..., :count].mean(axis=0) - expected.mean(axis=0)
+        assert (np.abs(difference) < 6 * error + 1e-4).all(), name
+        assert not (np.abs(1.05 * ours[..., :count].mean(axis=0) - expected.mean(axis=0)) < 6 * error + 1e-4).all()
+    mask = images(renderer.with_aov("mask"), {FLOOR: np.array([0.4, 0.5, 0.6])}, range(2)).mean(axis=0)
+    depth = theirs[..., 0].mean(axis=0)
+    assert (mask[..., 0][depth == 0] == 0).all()
+    assert mask[SIZE // 2, SIZE // 2] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", AOVS)
+def test_derivatives_by_positions_are_those_of_differences(renderer: MitsubaRenderer, name: str) -> None:
+    """The ball grows and is shifted: silhouettes move. Without them the derivative of all but the albedo would be wrong."""
+    of = renderer.with_aov(name)
+    positions = of.values([BALL])[BALL].numpy().reshape(-1, 3)
+    weights = np.random.default_rng(1).normal(size=(SIZE, SIZE, 3)).astype(np.float32)
+    along = positions + np.array([0.7, 0.2, 0.0], np.float32)
+
+    def moved(step: float) -> np.ndarray:
+        return images(of, {BALL: (positions + step * along).ravel()}, range(6), 1 << 14)
+
+    slopes = np.sum((moved(0.02) - moved(-0.02)) / 0.04 * weights, axis=(1, 2, 3))
+    session: Any = of.prepare([BALL], None)
+    tree = {BALL: of.array(positions.ravel())}
+
+    def agree(boundary: Any) -> bool:
+        session._boundary, found = boundary, []
+        for seed in range(50, 56):
+            rendering = session.image(tree, SampleRequest(0, 4096, seed))
+            gradient = session.adjoint(tree, rendering.paths, mi.TensorXf(weights[None]))[BALL].numpy()
+            found.append(float(np.sum(gradient.reshape(-1, 3) * along)))
+        error = np.sqrt((np.var(slopes, ddof=1) + np.var(found, ddof=1)) / 6)
+        return bool(abs(np.mean(found) - np.mean(slopes)) < 5 * error)
+
+    boundary = session._boundary
+    assert agree(boundary)
+    assert not agree(None)  # the planted fault: silhouettes that stand still
+
+
+@pytest.mark.parametrize("method", ["auto", "plain", "rcv", "coupled", "adaptive"])
+def test_albedo_and_depth_share_one_descent(method: str) -> None:
+    views = [ur.View(picture("albedo"), aov="albedo", weight=2.0), ur.View(picture("depth"), aov="depth")]
+    made = ur.Problem(scene, [ur.Parameter(FLOOR, initial=0.2)], views, truth={FLOOR: [0.4, 0.5, 0.6]})
+    result = ur.optimize(made, method, steps=60)
+    assert made.parameter_error(result.parameters)[FLOOR] < 0.05
+    assert ur.render(made, view=1, spp=64)[SIZE // 2, SIZE // 2, 0] == pytest.approx(3.3, abs=0.1)
+
+
+@pytest.mark.parametrize("name", ["depth", "mask"])
+def test_a_pose_is_recovered_from_one_picture(name: str) -> None:
+    made = problem([ur.View(picture(name, x=0.3), aov=name)], ("ball.translation.x",))
+    result = ur.optimize(made, steps=12)
+    assert result.parameters["ball.translation.x"] == pytest.approx(0.3, abs=0.02)
+
+
+def test_a_mesh_follows_masks() -> None:
+    made = problem([ur.View(picture("mask", x=0.2), aov="mask")], (BALL,))
+    result = ur.optimize(made, steps=60)
+    start, end = (
+        np.sqrt(np.mean((ur.render(made, values, spp=256) - np.asarray(made.views[0].reference)) ** 2))
+        for values in (result.initial, result.parameters)
+    )
+    assert end < 0.3 * start
+
+
+def test_a_file_names_the_aov_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
+    (tmp_path / "room.xml").write_text(XML)
+    np.save(tmp_path / "depth.npy", picture("depth"))
+    lines = ['scene = "room.xml"', "[[parameters]]", f'key = "{FLOOR}"', "[[views]]", 'reference = "depth.npy"']
+    (tmp_path / "problem.toml").write_text("\n".join([*lines, 'aov = "depth"']))
+    made = ur.Problem.from_file(tmp_path / "problem.toml")
+    (tmp_path / "other.toml").write_text("\n".join([*lines, 'aov = "mask"']))
+    with pytest.raises(InputError, match=r"other.toml:5: views\[0\].reference: expected values from 0 to 1, got"):
+        ur.Problem.from_file(tmp_path / "other.toml")
+    ur.optimize(made, "plain", steps=1, run_directory=tmp_path / "run")
+    again = ur.Problem.from_file(tmp_path / "run" / "problem.toml")
+    assert again.given_views[0].aov == "depth"
+    assert fingerprint(again) == fingerprint(made)
+
+
+def test_masks_may_be_alpha_and_integers() -> None:
+    coverage = np.zeros((SIZE, SIZE), np.uint8)
+    coverage[2:6, 2:6] = 255
+    cut = np.full((SIZE, SIZE, 4), 128, np.uint8)
+    cut[..., 3] = coverage
+    for given in (coverage, cut, coverage > 0, coverage / 255.0):
+        view = problem([ur.View(given, aov="mask")]).views[0]
+        np.testing.assert_allclose(np.asarray(view.reference)[..., 0], coverage / 255.0)
+        assert view.mask is None
+
+
+XML = f"""<scene version="3.0.0"><sensor type="perspective"><float name="fov" value="40"/>
+<film type="hdrfilm"><integer name="width" value="{SIZE}"/><integer name="height" value="{SIZE}"/><rfilter type="box"/></film></sensor>
+<shape type="rectangle" id="floor"><transform name="to_world"><translate z="3"/><rotate y="1" angle="180"/></transform>
+<bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape></scene>"""
+FOG = {"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}
+BAD: dict[str, tuple[Any, dict[str, Any], str]] = {
+    "unknown": (np.zeros((SIZE, SIZE)), {"aov": "normal"}, "view 0: aov: expected one of depth, position, sh_normal"),
+    "size": (np.zeros((SIZE, 4)), {"aov": "depth"}, "view 0: reference: 4x8 pixels"),
+    "integers": (np.zeros((SIZE, SIZE), np.uint8), {"aov": "depth"}, "8- and 16-bit values cannot be a depth"),
+    "one channel": (np.zeros((SIZE, SIZE)), {"aov": "sh_normal"}, "expected the three coordinates of a sh_normal"),
+    "colours": (np.eye(SIZE)[..., None] * [1, 2, 3], {"aov": "depth"}, "expected one channel, or three equal ones"),
+    "negative": (np.full((SIZE, SIZE), -1.0), {"aov": "depth"}, "64 pixels are negative"),
+    "range": (np.full((SIZE, SIZE), 2.0), {"aov": "mask"}, "expected values from 0 to 1, got 2 to 2"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_views_are_refused_in_one_line(case: str) -> None:
+    reference, options, message = BAD[case]
+    with pytest.raises(InputError) as caught:
+        problem([ur.View(reference, **options)])
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_has_no_such_pictures_is_refused() -> None:
+    views = [ur.View(np.zeros((SIZE, SIZE)), aov="depth")]
+    foggy = scene(**FOG)
+    with pytest.raises(InputError, match="view 0: aov: depth is a property of surfaces, and the scene has media"):
+        ur.Problem(foggy, [ur.Parameter(FLOOR)], views)
+    with pytest.raises(InputError, match="aov: not supported beside the unknown exposure"):
+        problem(views, (FLOOR, "exposure"))
+    made = problem(views, ("camera.rotation.y",))
+    with pytest.raises(InputError, match="path gradients of moving sensors do not support depth"):
+        ur.optimize(made, "plain", steps=1)
