@@ -97,6 +97,24 @@ def test_an_unknown_variant_is_refused(name: str):
         variant.use(name)
 
 
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        ("llvm_ad_spectral", "no spectral rendering"),
+        ("cuda_ad_spectral_polarized", "no spectral rendering and no polarised rendering"),
+        ("llvm_ad_mono", "no monochromatic rendering"),
+        ("scalar_rgb", "no variants of 'scalar'"),
+    ],
+)
+def test_a_variant_of_mitsuba_is_refused_with_what_is_missing(fake: FakeMitsuba, name: str, what: str):
+    line = f"'{name}' is not supported, since unrender has {what}: expected"
+    with pytest.raises(VariantError, match=line):
+        variant.use(name)
+    fake.name = name
+    with pytest.raises(VariantError, match=f"Mitsuba's variant: {line}"):
+        variant.ensure()
+
+
 def test_a_variant_that_mitsuba_refuses_is_one_line(fake: FakeMitsuba):
     fake.works = ()
     with pytest.raises(VariantError, match=r"^Mitsuba cannot use llvm_ad_rgb: no llvm_ad_rgb$"):

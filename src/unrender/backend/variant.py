@@ -100,8 +100,7 @@ def use(variant: str = "auto") -> str:
             that it would abort the process. The message contains the command that installs what is missing.
     """
     if variant not in ("auto", *VARIANTS):
-        hint = did_you_mean(variant, VARIANTS, likeness=0.3)
-        raise VariantError(f"unknown variant {variant!r}: expected 'auto', {CUDA!r} or {LLVM!r}{hint}")
+        raise VariantError(f"{_unsupported(variant)}expected 'auto', {CUDA!r} or {LLVM!r}")
     mi = _mitsuba()
     chosen = variant
     if variant == "auto":
@@ -118,6 +117,16 @@ def use(variant: str = "auto") -> str:
                 raise VariantError(f"Mitsuba cannot use {chosen}: {reason_of(error)}") from error
             _limit_threads()
     return chosen
+
+
+def _unsupported(variant: str) -> str:
+    """Return what a variant lacks, for a message."""
+    parts = variant.split("_")
+    if parts[0] not in ("scalar", "llvm", "cuda", "metal"):
+        return f"unknown variant {variant!r}{did_you_mean(variant, VARIANTS, likeness=0.3)}: "
+    what = {"spectral": "spectral rendering", "polarized": "polarised rendering", "mono": "monochromatic rendering"}
+    lacks = [name for part, name in what.items() if part in parts] or [f"variants of {parts[0]!r}"]
+    return f"{variant!r} is not supported, since unrender has no {' and no '.join(lacks)}: "
 
 
 def _limit_threads() -> None:
@@ -194,7 +203,9 @@ def ensure() -> str:
     if name is None:
         return use()
     if name not in VARIANTS:
-        raise VariantError(f"Mitsuba's variant is {name!r}, expected {CUDA!r} or {LLVM!r}: call unrender.use() instead")
+        raise VariantError(
+            f"Mitsuba's variant: {_unsupported(name)}expected {CUDA!r} or {LLVM!r}; call unrender.use() instead"
+        )
     return use(name)
 
 
