@@ -12,6 +12,7 @@ import pytest
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.rendering import picture_format
 from unrender.rendering import renderer as port
 from unrender.rendering.camera_poses import PosedCameras
 from unrender.rendering.exposure import ExposedRenderer
@@ -45,10 +46,10 @@ WRAPPERS: dict[str, Callable[[Any], Any]] = {
     "response": RespondingRenderer,
     "worlds": of_another_world,
 }
-OF_RENDERERS = {port.WithFormats, port.WithCameras, port.Remeshable, port.DifferentialBsdfRenderer}
+OF_RENDERERS = {picture_format.WithFormats, port.WithCameras, port.Remeshable, port.DifferentialBsdfRenderer}
 OF_SESSIONS = {port.CountingSession, port.EmitterSession}
-NOT_FORWARDED = {port.StockRenderer}
-"""A stock loop renders the scene alone: it knows none of the parameters that wrappers add or hold."""
+NOT_FORWARDED = {port.StockRenderer, picture_format.AovRenderer}
+"""A stock loop renders the scene alone, without the parameters that wrappers add or hold. Only the scene's renderer is asked for AOVs."""
 
 
 class Session:
@@ -142,9 +143,8 @@ def lost(renderer: Any, inner: Capable) -> list[str]:
 
 
 def test_every_capability_of_the_port_is_decided_on() -> None:
-    known = {
-        kind for _, kind in inspect.getmembers(port, inspect.isclass) if getattr(kind, "_is_runtime_protocol", False)
-    }
+    classes = [kind for module in (port, picture_format) for _, kind in inspect.getmembers(module, inspect.isclass)]
+    known = {kind for kind in classes if getattr(kind, "_is_runtime_protocol", False)}
     assert known == OF_RENDERERS | OF_SESSIONS | NOT_FORWARDED
 
 
