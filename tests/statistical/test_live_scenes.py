@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
+import fog
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -91,11 +94,16 @@ def test_beside_three_scenes_every_kernel_is_recorded(warned: list[str], recordi
     assert len(alive) == 3
 
 
-def test_without_a_second_attempt_it_would_be_traced(warned: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("built", [True, False])
+def test_one_attempt_is_enough_if_the_tables_of_all_lights_are_built(
+    built: bool, warned: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(frozen, "_ATTEMPTS", 1)
+    if not built:
+        monkeypatch.setattr(frozen, "build_emitter_tables", lambda: None)
     alive = mi.load_dict(with_textured_light())
     ur.optimize(problem(), ur.PathGradient(spp=2), ur.optimizers.Adam(0.01), steps=2)
-    assert warned
+    assert bool(warned) != built
     assert alive is not None
 
 
@@ -121,3 +129,58 @@ def test_beside_loops_over_every_material(warned: list[str], recordings: list[in
     assert not warned
     assert len(recordings) <= 16
     assert len(alive) == len(zoo.MATERIALS)
+
+
+def plain() -> dict[str, Any]:
+    return zoo.scene({"type": "diffuse", "reflectance": zoo.texture(2)})
+
+
+def foggy() -> dict[str, Any]:
+    described = zoo.scene({"type": "null"}, environment=False)
+    described["ball"]["interior"] = fog.fog()
+    return described
+
+
+def one_unknown(key: str, initial: float, make: Callable[[], dict[str, Any]] = plain) -> Callable[[], ur.Problem]:
+    """Return a function that opens a problem of one unknown in a scene of a small film."""
+
+    def scene() -> dict[str, Any]:
+        described = make()
+        described["sensor"]["film"].update(width=8, height=8)
+        return described
+
+    reference = np.full((8, 8, 3), 0.3, np.float32)
+    return lambda: ur.Problem(scene, [ur.Parameter(key, initial=initial)], [ur.View(reference)], max_depth=4)
+
+
+PROBLEMS = {
+    "paths in memory": problem,
+    "light": one_unknown("lamp.emitter.radiance.data", 2.0, with_textured_light),
+    "few numbers": one_unknown("lamp.emitter.radiance.value", 2.0),
+    "sky": one_unknown("sky.data", 0.5),
+    "roughness": one_unknown("ball.bsdf.alpha.data", 0.3, lambda: zoo.scene(zoo.rough())),
+    "fog": one_unknown("ball.interior_medium.sigma_t.value.value", 0.5, foggy),
+    "pose": one_unknown("ball.translation", 0.1),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_as_many_kernels_are_recorded_as_without_other_scenes(
+    name: str, warned: list[str], recordings: list[int]
+) -> None:
+    """Three scenes are alive: one never rendered, one in the middle of a loop with gradients pending, one behind a lens."""
+
+    def count() -> int:
+        gc.collect()
+        opened = PROBLEMS[name]()
+        before = len(recordings)
+        ur.optimize(opened, steps=4)
+        return len(recordings) - before
+
+    alone = count()
+    alive = [mi.load_dict(with_textured_light()), own_loop(with_textured_light()), mi.load_dict(through_a_lens())]
+    beside = count()
+    assert not warned
+    assert beside == alone > 0
+    assert len(alive) == 3

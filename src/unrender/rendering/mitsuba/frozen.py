@@ -12,6 +12,7 @@ from typing import Any
 import drjit as dr
 
 from unrender.core.errors import InputError
+from unrender.rendering.mitsuba.recordable import build_emitter_tables
 
 _log = logging.getLogger("unrender")
 _ATTEMPTS = 3
@@ -23,9 +24,9 @@ _INDEPENDENT = "the argument does not depend on the input variable"
 class FrozenFunction:
     """A function that Dr.Jit records at its first call and replays at later ones. If it cannot be recorded, it is traced at each call.
 
-    A virtual call sees the objects of every scene in the process, including the caller's own. Some of them, such as textured emitters,
-    build tables at their first use, which cannot be recorded. The traced call after a failure builds them. The next call therefore
-    records again, up to three consecutive times.
+    A virtual call sees the objects of every scene in the process, including the caller's own. Some of them build tables at their first
+    use, which cannot be recorded. Those of textured lights are built before the first recording. The traced call after a failure builds
+    others. The next call therefore records again, up to three consecutive times.
 
     An error in a replay is raised, since out of memory, for example, does not justify tracing at every later call.
 
@@ -54,6 +55,8 @@ class FrozenFunction:
             # Recorded reductions have one slot per thread. A replay with more threads would write out of bounds.
             self._threads, self._recorded = dr.thread_count(), False
             self._frozen = _recorder(self._function, self._tracing)
+        if not self._recorded:
+            build_emitter_tables()
         self._tracing.happened = False
         try:
             with _without_garbage_collection():

@@ -1,4 +1,4 @@
-"""Sensors that a recorded kernel supports.
+"""Sensors that a recorded kernel supports, and emitters that must be prepared for it.
 
 A recording captures an object's state through the members that its plugin declares to Dr.Jit. Mitsuba's thin lens, orthographic and
 batch sensors do not declare all of theirs, so Dr.Jit refuses to record a kernel that samples their rays.
@@ -15,7 +15,7 @@ import mitsuba as mi
 _COMPLETE = frozenset({"PerspectiveCamera", "DistantSensor", "DistantSensorImpl", "RadianceMeter", "IrradianceMeter"})
 """Sensor classes that declare all members in Mitsuba 3.9."""
 _LONGEST_GAP = 32
-"""Number of consecutive unused registry ids that ends the search for sensors. Ids of dead objects are reused."""
+"""Number of consecutive unused registry ids that ends a search. Ids of dead objects are reused."""
 
 
 def are_recordable(sensor: Any, several: bool) -> bool:
@@ -24,20 +24,32 @@ def are_recordable(sensor: Any, several: bool) -> bool:
     A virtual call sees every sensor of the process, including those of scenes that the caller has loaded. Unknown plugins are not
     supported.
     """
-    sensors = _registered() if several else [sensor]
+    sensors = _registered(mi.SensorPtr) if several else [sensor]  # pyright: ignore[reportAttributeAccessIssue]
     return all(each.class_name() in _COMPLETE for each in sensors)
 
 
-def _registered() -> Iterator[Any]:
-    """Yield the sensors of the process."""
+def build_emitter_tables() -> None:
+    """Build the tables of textured area lights of all scenes in the process, since a recording cannot build them.
+
+    A virtual call sees the emitters of every scene, including those that the caller has loaded and never rendered.
+    """
+    vertex: Any = dr.zeros(mi.SurfaceInteraction3f)
+    for emitter in _registered(mi.EmitterPtr):
+        if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying) and emitter.get_shape() is not None:
+            with dr.suspend_grad():
+                emitter.sample_direction(vertex, mi.Point2f(0.5), True)
+
+
+def _registered(kind: Any) -> Iterator[Any]:
+    """Yield the objects of the process that pointers of a type can refer to."""
     number, missing = 1, 0
     while missing < _LONGEST_GAP:
-        pointer: Any = dr.reinterpret_array(mi.SensorPtr, mi.UInt32(number))  # pyright: ignore[reportAttributeAccessIssue]
+        pointer: Any = dr.reinterpret_array(kind, mi.UInt32(number))
         try:
-            sensor = pointer[0]
+            found = pointer[0]
         except RuntimeError:
-            sensor = None
-        if sensor is not None:  # an object has that id
-            yield sensor
-        missing = 0 if sensor is not None else missing + 1
+            found = None
+        if found is not None:  # an object has that id
+            yield found
+        missing = 0 if found is not None else missing + 1
         number += 1
