@@ -18,6 +18,7 @@ import unrender as ur
 from unrender.app.cli import tasks
 from unrender.app.cli.signals import WAITING
 from unrender.app.sweeps.record import write_sweep
+from unrender.runs.budget import Budget
 
 TOY = ["quad", "--method", "plain", "--steps", 20, "--final-spp", 1]
 GRID = [*TOY, "--over", "learning_rate=0.03,0.3"]
@@ -137,6 +138,39 @@ def test_pruned_runs_are_run_folders_without_pictures(unrender, mitsuba_variant:
     assert all(steps < 20 for _, status, _, steps in found if status == "pruned")
     assert not Path("s/trial-007-seed0/pictures.npz").exists()
     assert "(pruned at 20%)" in answer.out
+
+
+COMPARED = ["compare", "quad", "--methods", "plain", "--seconds", 1, "--final-spp", 1]
+SWEPT = ["sweep", "quad", "--method", "plain", "--over", "learning_rate=0.03,0.3", "--seconds", 1, "--final-spp", 1]
+
+
+@pytest.mark.parametrize("command", [COMPARED, SWEPT])
+def test_the_seconds_of_a_run_cover_its_compilation_and_pictures(
+    unrender, monkeypatch: pytest.MonkeyPatch, command: list, mitsuba_variant: str
+) -> None:
+    """As in `unrender run`. The budget of each run begins with it."""
+    check, left, began = Budget.on_start, [], []
+
+    def on_start(self: Budget, descent: Any) -> None:
+        check(self, descent)
+        left.append(descent.run.time_left())
+        began.append(descent.run.deadline - 1.0)
+
+    monkeypatch.setattr(Budget, "on_start", on_start)
+    monkeypatch.setattr(Budget, "on_update", lambda self, descent, *_: descent.run.stop("seconds"))
+    answer = unrender(*command, "--out", "s", "--variant", mitsuba_variant)
+    assert answer.status in (0, 3), answer.error
+    assert len(left) == (2 if command is SWEPT else 1)
+    assert all(seconds < 1.0 for seconds in left)
+    assert began == sorted(set(began))
+
+
+def test_a_sweep_tells_once_of_seconds_that_allow_few_steps(
+    unrender, monkeypatch: pytest.MonkeyPatch, mitsuba_variant: str
+) -> None:
+    monkeypatch.setattr(Budget, "on_update", lambda self, descent, *_: descent.run.stop("seconds"))
+    answer = unrender(*SWEPT, "--out", "s", "--variant", mitsuba_variant)
+    assert answer.out.count("note: the budget of 1 s allows about 1 steps") == 1
 
 
 @pytest.mark.parametrize("command", [["sweep", *GRID], ["compare", "quad", "--seconds", 1]])

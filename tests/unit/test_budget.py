@@ -63,7 +63,7 @@ def test_a_budget_may_cover_more_than_the_steps(
             run.clock = float(run.step)
 
     monkeypatch.setattr(loop.Descent, "warm_up", compiled)
-    annotations = RunAnnotations(within_seconds=within)
+    annotations = RunAnnotations(began=now[0] if within else None)
     result = ur.optimize(problem(), "plain", seconds=20, callbacks=[Seconds()], annotations=annotations)
     assert result.stopped == "seconds"
     assert result.steps == steps
@@ -98,7 +98,7 @@ def test_a_resumed_run_has_what_is_left_of_its_budget(tmp_path: Path, monkeypatc
     parts = ur.PathGradient(), ur.optimizers.Adam(0.01)
     clock = ur.optimize(problem(), *parts, steps=5, run_directory=tmp_path / "run").seconds
     seen.clear()
-    resume_run(load_run(tmp_path / "run", seconds=clock + 0.5), problem(), within_seconds=True)
+    resume_run(load_run(tmp_path / "run", seconds=clock + 0.5), problem(), began=time.perf_counter())
     assert seen[0] <= 0.5
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -152,6 +152,10 @@ class AveragedNewton:
         return vectors.unravel(step, parameters), AveragedNewtonState(
             state.learning_rates, matrix, target, noise, shares, counts, lengths, scatter, radii, step
         )
+
+    def averages(self, keys: Iterable[str]) -> frozenset[str]:
+        """Return all keys."""
+        return frozenset(keys)
 
     def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:
         """Return the standard errors of A⁻¹ b, from the scatter of the models' gradients about those of the mean.

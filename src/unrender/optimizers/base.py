@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any, Protocol, runtime_checkable
 
@@ -41,6 +41,20 @@ class Measuring(Protocol):
         Parameters without an estimate are omitted.
         """
         ...
+
+
+@runtime_checkable
+class Averaging(Protocol):
+    """An optimizer whose steps lead some parameters to a mean over all steps."""
+
+    def averages(self, keys: Iterable[str]) -> frozenset[str]:
+        """Return those of these parameters that it averages."""
+        ...
+
+
+def averaged_by(optimizer: Optimizer, keys: Iterable[str]) -> frozenset[str]:
+    """Return the parameters that the optimizer averages itself."""
+    return optimizer.averages(keys) if isinstance(optimizer, Averaging) else frozenset()
 
 
 @runtime_checkable

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate, Capabilities, FreshGradient, Gradient
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.base import Choosing, Measuring, Optimizer
+from unrender.optimizers.base import Choosing, Measuring, Optimizer, averaged_by
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
 
@@ -103,6 +103,13 @@ class Partitioned:
             steps |= part_steps
             states.append(after)
         return {key: steps[key] for key in parameters}, PartitionedState(*states)
+
+    def averages(self, keys: Iterable[str]) -> frozenset[str]:
+        """Return the keys that one of the two optimizers averages."""
+        given = frozenset(keys)
+        return averaged_by(self.optimizer, given.intersection(self.keys)) | averaged_by(
+            self.others, given.difference(self.keys)
+        )
 
     def standard_errors(self, state: PartitionedState, parameters: Tree) -> Tree:
         """Return the standard errors from the optimizers that estimate them."""

@@ -95,11 +95,18 @@ def _warn_of_few_steps(run: Run) -> None:
     if run.seconds is None or run.clock <= 0.0:
         return
     steps = int(run.allowed_seconds() * run.step / run.clock)
-    if steps < min(_FEW_STEPS, run.steps or _FEW_STEPS):
-        run.warnings.append(
-            f"the budget of {run.seconds:g} s allows about {steps} steps; use fewer pixels a step (--set pixels=4096), fewer samples "
-            "(--set spp=1), a smaller picture (resolution), or more seconds"
-        )
+    if line := few_steps(run.seconds, steps, run.steps):
+        run.warnings.append(line)
+
+
+def few_steps(seconds: float, steps: int, most: int | None = None) -> str:
+    """Return a line with advice if a budget allows only so many steps, fewer than 20 and than `most`; else ""."""
+    if steps >= min(_FEW_STEPS, most or _FEW_STEPS):
+        return ""
+    return (
+        f"the budget of {seconds:g} s allows about {steps} steps; use fewer pixels a step (--set pixels=4096), fewer samples "
+        "(--set spp=1), a smaller picture (resolution), or more seconds"
+    )
 
 
 def check_budget(steps: int | None, seconds: float | None) -> None:

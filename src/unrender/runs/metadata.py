@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from typing import Any
@@ -33,8 +32,8 @@ class RunAnnotations:
         command: the command line.
         final_spp: samples per pixel of the final images; None chooses.
         phases: {phase: seconds} before the run, such as loading.
-        within_seconds: Whether the budget in seconds includes compiling and final images, not only the steps.
-        spent: Seconds of that budget that have passed before the run, such as those of loading.
+        began: Time of `time.perf_counter` from which a budget in seconds counts, with loading, compiling and final images; None if it
+            covers the steps alone.
     """
 
     method: str = ""
@@ -43,12 +42,7 @@ class RunAnnotations:
     command: str = ""
     final_spp: int | None = None
     phases: Mapping[str, float] = field(default_factory=dict)
-    within_seconds: bool = False
-    spent: float = 0.0
-
-    def deadline(self, seconds: float | None) -> float | None:
-        """Return when a run that begins now and has this budget should be done, see `Run.deadline`; None where the steps alone count."""
-        return time.perf_counter() + seconds - self.spent if self.within_seconds and seconds is not None else None
+    began: float | None = None
 
 
 def first_values(run: Run) -> dict[str, np.ndarray]:

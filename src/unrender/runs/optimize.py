@@ -34,6 +34,7 @@ from unrender.runs.metadata import (
     to_numpy,
 )
 from unrender.runs.notebook import NotebookProgress
+from unrender.runs.number_means import NumberMeans
 from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import Refinement
 from unrender.runs.remeshing import MeshRefinement
@@ -104,7 +105,7 @@ def optimize(
     if isinstance(estimator, str) and not annotations.method:
         annotations = replace(annotations, method=estimator, choices=plan.lines)
     run, state = prepare(plan, steps, seconds, seed)
-    run.deadline = annotations.deadline(seconds)
+    run.begin_budget(annotations.began)
     run.warnings += advice.remarks(problem, plan.optimizer)
     log = RunMetadata(describe_run(run, annotations), first_values(run))
     with _progress(progress) as shown, _folder(run, log, annotations, run_directory, checkpoint_every) as writers:
@@ -155,6 +156,7 @@ def assemble_hooks(
         Budget(),
         Refinement(),
         MeshRefinement(),
+        NumberMeans(),
         Verify(),
         *folder,
         CallbackHook(callbacks),

@@ -33,7 +33,7 @@ class Progress(Callback):
         console: console for the output; None for standard output.
 
     Attributes:
-        budget_began: time of `time.perf_counter` at which this object was created, or a stage started.
+        budget_began: time of `time.perf_counter` at which this object was created, or the latest run of several began.
     """
 
     def __init__(self, console: Console | None = None):

@@ -36,9 +36,10 @@ class Result:
     """Result of `optimize`.
 
     Attributes:
-        parameters: {key: array}, float32, the recovered values: the best ones that new images verify, see `verification`.
+        parameters: {key: array}, float32, the recovered values: the best ones that new images verify, see `verification`. Numbers and
+            colours are means over the last steps where these have become stationary; `adapted` tells how many steps.
         initial: {key: array}, the initial values.
-        last: {key: array}, the values after the last step; equal to `parameters` unless earlier values were better.
+        last: {key: array}, the values after the last step; equal to `parameters` unless means or earlier values were better.
         history: one dictionary per step (in a run folder with millions of steps, per second, fourth, ... of the earlier ones): "step"
             (from 0), "seconds" (of optimisation so far, without warm-up and callbacks), "loss", "samples" (paths traced so far),
             "gradient_noise" (fraction in [0, 1] or None), and, if the truth is known, "parameter_error" ({key: error}, see
@@ -63,7 +64,8 @@ class Result:
             and the image's expectation, without rendering noise; see `statistics.debiased`.
         standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings,
             without the noise of the references and errors of other unknowns. Available for numbers optimised by `AveragedNewton`, after
-            its last step, except for those with a share in a direction that the images hardly determine; {} for others.
+            its last step, except for those with a share in a direction that the images hardly determine; and for numbers that are means
+            over enough steps.
         phases: {phase: seconds} in order: "compiling", "steps", "checkpoints and callbacks", "final pictures", and, on the command line,
             earlier phases. For a resumed run, those of the last session.
         sensitivity: {key: array} of the parameters' shapes: change of the images per unit of each element, as root sum of squares over

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from unrender.runs.folder.writer import RunWriter
 from unrender.runs.hooks import Hook
 from unrender.runs.loop import Descent, descend, initialize, prepare
 from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, fingerprint_of, first_values
+from unrender.runs.number_trace import NumberTrace
 from unrender.runs.optimize import assemble_hooks, check, open_writer
 from unrender.runs.result import NON_FINITE, Result, deciding_versions
 from unrender.runs.run import SNAPSHOT_COUNTS, Run, restore, terminate_if_told
@@ -39,8 +39,8 @@ from unrender.scene.serialization import origin
 
 _MOST_SHOWN = 6
 _WARNINGS = "warnings"
-_SENT, _CANDIDATE, _AHEAD = "sent", "candidate", "ahead"
-_OPTIONAL = (_CANDIDATE, _AHEAD)
+_SENT, _CANDIDATE, _AHEAD, _NUMBERS = "sent", "candidate", "ahead", "numbers"
+_OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS)
 """Parts of a snapshot that only some runs have."""
 
 
@@ -96,16 +96,15 @@ def resume_run(
     estimator: Estimator | None = None,
     optimizer: Optimizer | None = None,
     earlier: Mapping[str, float] | None = None,
-    within_seconds: bool = False,
+    began: float | None = None,
 ) -> Result:
-    """Resume the run. See `unrender.resume`; `earlier` contains the seconds of earlier phases; `within_seconds`: see `RunAnnotations`."""
+    """Resume the run. See `unrender.resume`; `earlier` contains the seconds of earlier phases; `began`: see `RunAnnotations`."""
     folder, method = stored.folder, stored.method
     plan = Plan.from_table(problem, method.model_dump(), str(folder / METHOD), estimator, optimizer)
     check(plan.estimator, plan.optimizer, method.steps, method.seconds)
     run, state = prepare(plan, method.steps, method.seconds, method.seed)
     run.folder = folder
-    if within_seconds and method.seconds is not None:
-        run.deadline = time.perf_counter() + method.seconds - sum((earlier or {}).values())
+    run.begin_budget(began)
     initial, fingerprint = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
         for source in _sources(stored):
@@ -298,6 +297,8 @@ def _unpack(
         _check_sent(saved[_SENT], expected, f"{where}: {_SENT}")
     if _CANDIDATE in saved:
         _check_candidate(saved[_CANDIDATE], full_shapes, f"{where}: {_CANDIDATE}")
+    if _NUMBERS in saved:
+        NumberTrace.check(saved[_NUMBERS], f"{where}: {_NUMBERS}")
     return saved
 
 

@@ -21,6 +21,7 @@ from unrender.estimators.base import Estimate, Estimator
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.runs.noise import GradientNoise
+from unrender.runs.number_trace import NumberTrace
 from unrender.runs.result import INTERRUPTED, TERMINATED
 from unrender.scene.problem import Problem
 
@@ -66,6 +67,10 @@ class Run:
     stopped: str = ""
     last_step: float | None = None
     deadline: float | None = None
+
+    def begin_budget(self, began: float | None) -> None:
+        """Set the deadline of a budget in seconds that counts from `began`; None for one that covers the steps alone."""
+        self.deadline = None if began is None or self.seconds is None else began + self.seconds
 
     def time_left(self) -> float:
         """Return the seconds until the deadline, which may be below 0; infinity without one."""
@@ -138,6 +143,7 @@ class RunState:
         skipped_in_a_row: number of steps since the last applied one.
         next_error: time on the run's clock at which the parameters' error is measured again.
         candidate: best of the tested earlier parameters; None before the first.
+        numbers: values of the numbers at each step.
     """
 
     estimator: Any
@@ -148,12 +154,14 @@ class RunState:
     skipped_in_a_row: int = 0
     next_error: float = 0.0
     candidate: Candidate | None = None
+    numbers: NumberTrace = field(default_factory=NumberTrace)
 
 
 def snapshot(run: Run, state: RunState) -> dict[str, Any]:
     """Return everything that determines the next steps, for checkpoints (`state.pack`)."""
     noise, executor = state.noise, run.problem.executor
     parts = {"sent": executor.snapshot(), "candidate": _packed(state.candidate), "ahead": run.ahead or None}
+    parts["numbers"] = state.numbers.snapshot()
     return {
         "parameters": run.parameters,
         "step": run.step,
@@ -187,6 +195,7 @@ def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
     state.zero_gradient, state.samples = saved["zero_gradient"], saved["samples"]
     state.skipped_in_a_row, state.next_error = saved["skipped_in_a_row"], saved["next_error"]
     state.candidate = Candidate(**saved["candidate"]) if "candidate" in saved else None
+    state.numbers = NumberTrace.restored(saved.get("numbers"))
     run.problem.executor.restore(saved.get("sent"))
 
 

@@ -16,6 +16,7 @@ from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import phase_times
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.hooks import Hook
+from unrender.runs.number_means import averaged
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
@@ -128,7 +129,7 @@ class Verify(Hook):
         run, problem = descent.run, descent.run.problem
         pictures = FreshPictures(problem, run.seed, _SHARE * descent.state.samples, _END)
         first = pictures.picture(result.initial, problem.remeshed_from or problem)
-        last = pictures.picture(result.parameters)
+        result, last = _end(descent, result, pictures)
         worse = _is_worse(pictures, first, last)
         places: dict[str, tuple[Picture, Mapping[str, np.ndarray]]] = {}
         if worse and problem.remeshed_from is None:
@@ -162,7 +163,6 @@ class Verify(Hook):
         return replace(
             result,
             parameters=dict(places[best][1]) if places else result.parameters,
-            last=result.parameters,
             standard_error={} if places else result.standard_error,
             verification=verification,
             warnings=[*result.warnings, *lines],
@@ -237,6 +237,16 @@ class _Earlier:
         """Render the parameters of a step."""
         picture = pictures.picture(values)
         return cls(step, picture.loss[0], np.concatenate(picture.images, axis=1) - pictures.references)
+
+
+def _end(descent: Descent, result: Result, pictures: FreshPictures) -> tuple[Result, Picture]:
+    """Return the result with means of its numbers, unless its picture is worse than with the last values, and that picture."""
+    mean = averaged(descent, result)
+    picture = pictures.picture(mean.parameters)
+    if mean is result:
+        return result, picture
+    last = pictures.picture(result.parameters)
+    return (result, last) if _is_worse(pictures, last, picture) else (mean, picture)
 
 
 def _at_truth(problem: Problem, pictures: FreshPictures, result: Result) -> float:

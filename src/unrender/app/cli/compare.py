@@ -65,7 +65,9 @@ def compare(
             "--set", "-s", metavar="[METHOD.]NAME=VALUE", help="An option of one or all methods, such as rcv.spp=4."
         ),
     ] = None,
-    seconds: Annotated[float | None, typer.Option(help="Time for each run, without compilation. [default: 20]")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Time for each run, with compilation and final pictures. [default: 20]")
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each method.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="The first run's seed.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: a new folder in out/.")] = None,
@@ -80,8 +82,8 @@ def compare(
 ) -> None:
     """Compare methods at equal time on one problem, or compare earlier runs.
 
-    Every run has the same time of optimization, without the compilation of kernels before the first step. With workers, several runs
-    are concurrent, each with its share of the machine.
+    Every run has the same time, as in `unrender run --seconds`. The tables compare at equal times of the steps alone, up to the shortest
+    run. With workers, several runs are concurrent, each with its share of the machine.
     """
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
@@ -157,7 +159,7 @@ def _report(console: Console, directories: Sequence[Path], folder: Path) -> None
         comparison, notices = report.load_comparison(directories)
         page = report.write_comparison(comparison, notices, folder)
     show(console, comparison)
-    console.print("Compilation time is excluded for every method.")
+    console.print("Times are those of the steps, without compilation and final pictures.")
     console.print(f"page: {plain(str(page))}", soft_wrap=True)
 
 

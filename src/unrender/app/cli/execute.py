@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,13 +39,12 @@ class RunOrder:
     Attributes:
         method: the method.
         settings: settings of the method that differ from the defaults.
-        steps, seconds, seed: see `optimize`.
+        steps, seed: see `optimize`.
+        seconds: time limit with compilation and final pictures; None for no limit.
         final_spp: samples per pixel of the final pictures; None for an automatic choice.
         command: typed command, which is saved with the results.
         problem_settings: options of a gallery problem, which are saved with the results.
         checkpoint_every: see `optimize`.
-        within_seconds: whether `seconds` includes compilation and final pictures; in comparisons it only limits steps.
-        began: start of the budget, on the clock of `time.perf_counter`; None for the start of the run.
     """
 
     method: Method | PlanFile
@@ -58,7 +56,6 @@ class RunOrder:
     command: str
     problem_settings: Mapping[str, Any]
     checkpoint_every: int | None = None
-    within_seconds: bool = False
 
 
 @contextmanager
@@ -83,9 +80,8 @@ def execution(
     for line in advice.remarks(problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # earlier runs
-    spent = time.perf_counter() - progress.budget_began
     annotations = RunAnnotations(
-        order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, order.within_seconds, spent
+        order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, progress.budget_began
     )
     live = Live(directory, problem.name, order.method.name, order.command)
     yield {

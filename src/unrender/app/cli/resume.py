@@ -68,6 +68,7 @@ def resume(
         live = Live(directory, problem.name, stored.record.method, stored.record.command)
         theirs = dealing.variant_again(variant, stored.record)
         with dealing.dealt(problem, processes, compress, theirs, threads or alone, console) as dealt:
-            result = resume_run(stored, dealt, force, [progress, live], earlier=progress.seconds, within_seconds=True)
+            listeners, spent = [progress, live], progress.seconds
+            result = resume_run(stored, dealt, force, listeners, earlier=spent, began=progress.budget_began)
         live.clear()
         conclude(console, problem, result, directory, progress)

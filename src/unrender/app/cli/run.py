@@ -103,9 +103,7 @@ def run(
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
-                task = RunOrder(
-                    chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every, True
-                )
+                task = RunOrder(chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every)
                 with execution(dealt, task, folder, console, progress) as order:
                     result = optimize(**order)
         finally:

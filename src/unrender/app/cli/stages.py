@@ -237,7 +237,8 @@ def _run_stage(
         problem = runs.problem_of(folder)
         introduce(console, problem, run.variant)
         live = Live(folder, problem.name, stored.record.method, stored.record.command)
-        result = resume_run(stored, problem, False, [progress, live], earlier=progress.seconds, within_seconds=True)
+        listeners, spent = [progress, live], progress.seconds
+        result = resume_run(stored, problem, False, listeners, earlier=spent, began=progress.budget_began)
         live.clear()
         return problem, result
     with phases.phase("loading"):
@@ -249,7 +250,7 @@ def _run_stage(
     last = index == len(stages.stages) - 1
     spp = run.options.final_spp or (None if last else 1)  # final pictures of many views take minutes
     every = run.options.checkpoint_every
-    order = RunOrder(chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every, True)
+    order = RunOrder(chosen, settings, steps, seconds, stages.seed + index, spp, run.command, {}, every)
     with execution(problem, order, folder, console, progress) as arguments_of_run:
         return problem, optimize(**arguments_of_run)
 

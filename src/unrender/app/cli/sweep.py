@@ -68,7 +68,7 @@ _Window = Annotated[
     typer.Option(min=1, max=MOST_TRIALS, help="Maximum number of concurrent trials. [default: 4, or two per worker]"),
 ]
 _Steps = Annotated[int | None, typer.Option(help="Steps of each run. [default: 300, or --seconds]")]
-_Seconds = Annotated[float | None, typer.Option(help="Time for each run, without compilation.")]
+_Seconds = Annotated[float | None, typer.Option(help="Time for each run, with compilation and final pictures.")]
 _Seeds = Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each trial.")]
 _Seed = Annotated[int, typer.Option(min=0, help="Seed of the search, and of the first run of each trial.")]
 _Out = Annotated[Path | None, typer.Option(help="Output folder. Default: a new folder in out/.")]

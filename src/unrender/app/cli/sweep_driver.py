@@ -32,8 +32,9 @@ from unrender.core.text import visible
 from unrender.display import formatting
 from unrender.display.terminal import Console
 from unrender.io import files
+from unrender.runs.budget import few_steps
 from unrender.runs.folder.lock import Lock
-from unrender.runs.folder.schema import DOUBTFUL
+from unrender.runs.folder.schema import DOUBTFUL, ENDED
 from unrender.runs.result import TERMINATED as TOLD_TO_TERMINATE
 from unrender.scene.problem import Problem
 
@@ -172,6 +173,7 @@ class _State:
     began: float = field(default_factory=time.monotonic)
     before: float = 0.0
     stopped: str = ""
+    told: bool = False
 
     def save(self, folder: Path, status: str = "running") -> None:
         """Write the current sweep.json."""
@@ -300,7 +302,22 @@ def _drive(console: Console, session: Session, state: _State, executor: Executor
                     break
                 trials.end(record)
                 display.end(record.number, line(record))
+                _tell_of_few_steps(state, record, display)
                 state.save(session.folder)
+
+
+def _tell_of_few_steps(state: _State, record: TrialRecord, display: TaskDisplay) -> None:
+    """Print advice, once, if the seconds of a run allowed few steps."""
+    plan = state.record.plan
+    ends = [run.steps for run in record.runs if run.status in ENDED]
+    if (
+        plan.seconds is not None
+        and ends
+        and not state.told
+        and (advice := few_steps(plan.seconds, min(ends), plan.steps))
+    ):
+        state.told = True
+        display.say(f"note: {advice}")
 
 
 def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:

@@ -110,7 +110,7 @@ def carry_out(
     folder = Path(job.folder, task.name)
     _wait_until_free(folder)
     record = reader.read_run_record(folder) if (folder / RECORD).is_file() else None
-    started = time.perf_counter()
+    started = progress.budget_began = time.perf_counter()
     if record is None or record.status not in ENDED:
         looking = [] if task.limits is None else [Pruning(folder, task.limits)]
         listeners = [progress, *looking, *callbacks]
@@ -217,7 +217,7 @@ def _resumed(folder: Path, problem: Problem, callbacks: Sequence[Callback], comm
     try:
         stored = load_run(folder)
         live = Live(folder, problem.name, stored.record.method, command)
-        resume_run(stored, problem, callbacks=[*callbacks, live])
+        resume_run(stored, problem, callbacks=[*callbacks, live], began=time.perf_counter())
         live.clear()
     except InputError:
         return False

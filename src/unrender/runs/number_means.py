@@ -1,0 +1,83 @@
+"""Means of the numbers of a run over its last steps, which have less noise than the last values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from unrender.core import arrays, vectors
+from unrender.core.text import grouped
+from unrender.core.trees import Tree
+from unrender.optimizers.base import averaged_by
+from unrender.runs.hooks import Hook
+from unrender.runs.result import Result
+from unrender.scene.problem import Problem
+from unrender.statistics.stationary import stationary_mean
+
+if TYPE_CHECKING:
+    from unrender.runs.loop import Descent
+
+_MOST_OF_ONE, _MOST_ELEMENTS = 4, 256
+"""Elements of one number, and of all numbers, up to which they are averaged."""
+
+
+class NumberMeans(Hook):
+    """Hook that records the numbers of a run at each step, for `averaged`."""
+
+    def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
+        del record
+        if shapes := numbers_of(descent.run.problem, descent.run.optimizer):
+            values = [arrays.numpy(descent.run.parameters[key]).astype(np.float64).ravel() for key in shapes]
+            descent.state.numbers.append(np.concatenate(values))
+
+
+def numbers_of(problem: Problem, optimizer: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the numbers and colours of a problem, without those that the optimizer averages itself."""
+    own, shapes = averaged_by(optimizer, problem.shapes()), problem.shapes()
+    found = {
+        key: shape
+        for key, shape in shapes.items()
+        if key not in own and len(shape) <= 1 and np.prod(shape, dtype=int) <= _MOST_OF_ONE
+    }
+    return found if sum(int(np.prod(shape, dtype=int)) for shape in found.values()) <= _MOST_ELEMENTS else {}
+
+
+def averaged(descent: Descent, result: Result) -> Result:
+    """Return the result with the mean of each number over its last steps, where these are stationary, and its standard error."""
+    run, trace = descent.run, descent.state.numbers
+    shapes = numbers_of(run.problem, run.optimizer)
+    if not shapes or not trace.rows:
+        return result
+    last = {key: result.parameters[key] for key in shapes}
+    means, errors, steps = _means(np.array(trace.rows), trace.size, last)
+    if not steps:
+        return result
+    return replace(
+        result,
+        parameters={**result.parameters, **means},
+        last=result.parameters,
+        standard_error={**errors, **result.standard_error},
+        adapted=[*result.adapted, f"numbers are means of their last steps: {grouped(steps)}"],
+    )
+
+
+def _means(
+    rows: np.ndarray, size: int, last: dict[str, np.ndarray]
+) -> tuple[dict[str, np.ndarray], Tree, dict[str, str]]:
+    """Return the means of rows (B, n) by key, the standard errors of those that have one, and the least number of steps of each key."""
+    means: dict[str, np.ndarray] = {}
+    errors: Tree = {}
+    steps: dict[str, str] = {}
+    for key, columns in vectors.parts(rows, last).items():
+        found = [stationary_mean(column) for column in columns.reshape(len(rows), -1).T]
+        if not any(found):
+            continue
+        values = [x if mean is None else mean.value for x, mean in zip(last[key].ravel(), found, strict=True)]
+        means[key] = np.array(values, last[key].dtype).reshape(last[key].shape)
+        steps[key] = str(min(len(rows) - mean.start for mean in found if mean) * size)
+        own = np.array([np.nan if mean is None else mean.error for mean in found], np.float32)
+        if np.isfinite(own).all():
+            errors[key] = own.reshape(last[key].shape)
+    return means, errors, steps
