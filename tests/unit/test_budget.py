@@ -42,20 +42,31 @@ def slow(pause: float) -> ur.PathGradient:
     return estimator
 
 
-@pytest.mark.parametrize(("within", "compiling", "steps"), [(False, 12.0, 21), (True, 0.0, 18), (True, 12.0, 11)])
+@pytest.mark.parametrize(
+    ("within", "warming", "compiles", "steps"),
+    [
+        (False, 12.0, True, 21),
+        (True, 0.0, False, 18),
+        (True, 12.0, False, 10),
+        (True, 12.0, True, 11),
+        (True, 18.0, False, 4),
+    ],
+)
 def test_a_budget_may_cover_more_than_the_steps(
-    within: bool, compiling: float, steps: int, monkeypatch: pytest.MonkeyPatch
+    within: bool, warming: float, compiles: bool, steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Steps alone have all 20 seconds. Otherwise 3 are for the final pictures, and a warm-up of 12 leaves half of them. Each step takes a
-    second, which the next one sees."""
-    now, warm_up = [100.0], loop.Descent.warm_up
+    """Steps alone have all 20 seconds. Otherwise 3 are for the final pictures, and the steps have half of the budget, as long as all ends
+    within 5 seconds of it, or 15 if kernels were compiled. Each step takes a second, which the next one sees."""
+    now, warm_up, kernels = [100.0], loop.Descent.warm_up, [0]
 
     def compiled(descent: loop.Descent) -> Any:
-        now[0] += compiling
+        now[0] += warming
+        kernels[0] += compiles
         return warm_up(descent)
 
     monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(budget, "slowdown", lambda: 1.0)
+    monkeypatch.setattr(budget.cache, "kernels_changed", lambda: kernels[0])
 
     class Seconds(Callback):
         def on_step(self, run: Any, record: Any) -> None:

@@ -87,6 +87,15 @@ def use_for_kernels() -> None:
         tidy(place, LARGEST[KERNELS])
 
 
+def kernels_changed() -> int | None:
+    """Return the time at which a kernel was last added to Dr.Jit's cache, in nanoseconds of its file system; None if unknown."""
+    place = os.environ.get(_DRJIT_VARIABLE) or os.path.expanduser("~/.drjit")
+    try:
+        return os.stat(place).st_mtime_ns
+    except OSError:
+        return None
+
+
 def tidy(place: Path, largest: int) -> None:
     """Call `trim` at most once a day."""
     stamp = place / _STAMP

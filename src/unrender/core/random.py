@@ -33,6 +33,10 @@ def check_seed(owner: str, seed: Any, runs: int = 1) -> int:
     raise InputError(f"{owner}: expected a whole number from -2**63 to 2**63 - {max(runs, 1)}, got {got}")
 
 
+WARM_UP = 1
+"""Stream of the keys of steps whose results are discarded, because they only compile kernels."""
+
+
 @dataclass(frozen=True)
 class Key:
     """Identifier of one random draw of a run.

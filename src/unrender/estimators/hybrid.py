@@ -8,7 +8,7 @@ from typing import Any
 
 from unrender.core import arrays, checks, trees
 from unrender.core.errors import InputError
-from unrender.core.random import Key
+from unrender.core.random import WARM_UP, Key
 from unrender.core.registry import register
 from unrender.core.suggestions import did_you_mean
 from unrender.core.trees import Tree
@@ -182,7 +182,8 @@ class HybridGradient:
         part = {name: parameters[name] for name in own}
         own_key = key.fold(_PERTURBED)
         if self._is_block:
-            perturbed_estimate, perturbed_state, samples = self._block(perturbed, part, state, own_key)
+            compiles = key.stream == WARM_UP and not state.step
+            perturbed_estimate, perturbed_state, samples = self._block(perturbed, part, state, own_key, compiles)
         else:
             perturbed_estimate, perturbed_state = self.perturbed.estimate(perturbed, part, state.perturbed, own_key)  # pyright: ignore[reportArgumentType]
             samples = int(perturbed_estimate.info.get("samples", 0))
@@ -215,13 +216,12 @@ class HybridGradient:
         return isinstance(self.perturbed, GaussNewton)
 
     def _block(
-        self, problem: Problem, part: Tree, state: HybridState, key: Key
+        self, problem: Problem, part: Tree, state: HybridState, key: Key, compiles: bool
     ) -> tuple[Estimate, GaussNewtonState | SmoothedState, int]:
-        """Return the estimate with a block, the state, and the paths traced. The first step is always estimated, to compile its
-        kernels."""
+        """Return the estimate with a block, the state, and the paths traced. With `compiles`, the block is estimated in any case."""
         fixed = Estimate(0.0, trees.zeros_like(part), (BlockEstimate(tuple(part), None),))
         moves = state.step >= self.wait and (state.step - self.wait) % self.every == 0
-        if not moves and state.step:
+        if not (moves or compiles):
             return fixed, state.perturbed, 0
         estimate, after = self.perturbed.estimate(problem, part, state.perturbed, key)  # pyright: ignore[reportArgumentType]
         samples = int(estimate.info.get("samples", 0))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import glob
 import math
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from unrender.backend import cache
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.runs.hooks import Hook
@@ -24,7 +25,11 @@ _END_SHARE, _END_SECONDS = 0.1, 1.0
 _LOOK_SECONDS, _MOST_SLOWDOWN = 0.5, 3.0
 """Seconds between two measurements of the load of the machine; the largest slowdown that is taken into account."""
 _LEAST_SHARE = 0.5
-"""Fraction of the budget that the steps always get, even if compiling takes long."""
+"""Fraction of the budget that the steps get even if the warm-up takes long, as far as the following limits allow."""
+_LATE_SHARE, _LATE_SECONDS, _LATE_COMPILED = 0.1, 3.0, 15.0
+"""Time beyond the budget at which everything is finished: a fraction of it plus seconds, or the last number if kernels were compiled."""
+_PAGE_SECONDS = 1.0
+"""Time of the page and the summary on an idle machine."""
 _MOST_STEPS = 1 << 63
 """Exclusive limit that the files of a run folder can store."""
 
@@ -34,12 +39,21 @@ class Budget(Hook):
 
     def __init__(self) -> None:
         self._least = self._looked = -math.inf
+        self._kernels = cache.kernels_changed()
+
+    def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+        del fresh, warm
+        descent.run.compiled = cache.kernels_changed() != self._kernels
 
     def on_start(self, descent: Descent) -> None:
         run = descent.run
         if run.deadline is not None:
             run.deadline -= run.clock  # of a resumed run, before
         self._least = time.perf_counter() + _LEAST_SHARE * max((run.seconds or 0.0) - run.clock, 0.0)
+        if run.deadline is not None and run.seconds is not None:
+            late = _LATE_COMPILED if run.compiled else _LATE_SHARE * run.seconds + _LATE_SECONDS
+            rest = (_END_SHARE * run.seconds + _END_SECONDS + _PAGE_SECONDS) * min(slowdown(), _MOST_SLOWDOWN)
+            self._least = min(self._least, run.deadline + late - rest)
         self._check(descent)
 
     def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
@@ -94,7 +108,7 @@ def _warn_of_few_steps(run: Run) -> None:
     """Warn if the time of the first steps shows that the budget allows few steps."""
     if run.seconds is None or run.clock <= 0.0:
         return
-    steps = int(run.allowed_seconds() * run.step / run.clock)
+    steps = max(int(run.allowed_seconds() * run.step / run.clock), run.step)
     if line := few_steps(run.seconds, steps, run.steps):
         run.warnings.append(line)
 

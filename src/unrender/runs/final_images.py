@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core import phases
 from unrender.io.thumbnails import resize_nearest
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
-from unrender.runs.least_squares import check_numbers
+from unrender.runs.least_squares import check_numbers, compile_check
 from unrender.runs.result import Result
 from unrender.runs.sensitivity import sensitivity
 from unrender.scene.problem import Problem
@@ -68,18 +68,23 @@ def render_pictures(problem: Problem, result: Result, spp: int | None = None) ->
     return render_final_images(problem, result, spp).pictures
 
 
-def warm_up(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
-    """Compile the kernels of `render_final_images` with an image of one pass per view and one probe of the sensitivity."""
+def warm_up(problem: Problem, values: Mapping[str, np.ndarray], tested: bool = True) -> None:
+    """Compile the kernels of `render_final_images` with an image of one pass per view and, if `tested`, one pass of each test."""
     pass_spp, count = _pass_spp(problem), len(problem.views)
     own = count if count < MANY_SENSORS else 1  # more of them share their kernels
     for view in range(own):
         render(problem, values, view, pass_spp, per_pass=pass_spp)
-    if len(_chosen(problem)) == count:
+    if tested and len(_chosen(problem)) == count:
         sensitivity(problem, values, probes=1, views=own)
+        compile_check(problem, values)
 
 
 def render_final_images(
-    problem: Problem, result: Result, spp: int | None = None, left: Callable[[], float] = lambda: math.inf
+    problem: Problem,
+    result: Result,
+    spp: int | None = None,
+    left: Callable[[], float] = lambda: math.inf,
+    tested: bool = True,
 ) -> FinalImages:
     """Render the reference, initial and final image of each view, and collect control weights, pixel probabilities and sensitivities.
 
@@ -93,6 +98,7 @@ def render_final_images(
             second if that is longer, and into about four million paths per image. That time excludes compiling.
         left: function that returns the remaining seconds. If few remain, images have fewer samples, and tests of undetermined parameters
             are omitted.
+        tested: whether to estimate sensitivities and to test what the images determine.
     """
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
     pictures: dict[str, np.ndarray] = {}
@@ -116,7 +122,7 @@ def render_final_images(
                 density = np.asarray(probabilities[index], np.float32)
                 pictures[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * left())
-        everything = len(chosen) == len(problem.views) and seconds > 0.0
+        everything = tested and len(chosen) == len(problem.views) and seconds > 0.0
         sensitivities = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
         lines, warnings = _undetermined(problem, result, sensitivities, 0.25 * left()) if everything else ([], ())
     return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), tuple(warnings))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two
 
-__all__ = ["NumbersCheck", "check_numbers"]
+__all__ = ["NumbersCheck", "check_numbers", "compile_check"]
 
 _MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
 """Elements of all numbers and of one, up to which they are tested."""
@@ -95,6 +96,15 @@ def check_numbers(
         np.linalg.LinAlgError,
     ):  # a value that the renderer rejects, or matrices without eigenvalues in double precision
         return NumbersCheck()
+
+
+@exclusive("compile_check")
+def compile_check(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
+    """Compile the kernels of `check_numbers`."""
+    if (numbers := _Numbers.of(problem, values, values)) is not None:
+        with contextlib.suppress(InputError):  # a value that the renderer rejects
+            for count in (1, 2 * numbers.point.size):
+                numbers.pictures(np.tile(numbers.point, (count, 1)), Key(0, 0, _STREAM))
 
 
 @dataclass(frozen=True)

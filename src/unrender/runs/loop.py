@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core import arrays, memory, phases, trees
 from unrender.core.errors import InputError
-from unrender.core.random import Key, check_seed
+from unrender.core.random import WARM_UP, Key, check_seed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
@@ -83,7 +83,7 @@ class Descent:
         run, state = replace(self.run, warnings=[]), replace(self.state, noise=GradientNoise())
         for _ in range(2):
             found, state.estimator = run.estimator.estimate(
-                run.problem, run.parameters, state.estimator, Key(run.seed, 0, stream=1)
+                run.problem, run.parameters, state.estimator, Key(run.seed, 0, WARM_UP)
             )
             found = penalized(found, run.problem, run.parameters)
             memory.trim_cache(run.parameters)

@@ -66,7 +66,7 @@ def averaged(descent: Descent, result: Result) -> Result:
 def _means(
     rows: np.ndarray, size: int, last: dict[str, np.ndarray]
 ) -> tuple[dict[str, np.ndarray], Tree, dict[str, str]]:
-    """Return the means of rows (B, n) by key, the standard errors of those that have one, and the least number of steps of each key."""
+    """Return the means of rows (B, n) by key, the standard errors of those that have one, and the steps of each key."""
     means: dict[str, np.ndarray] = {}
     errors: Tree = {}
     steps: dict[str, str] = {}
@@ -77,7 +77,7 @@ def _means(
         values = [x if mean is None else mean.value for x, mean in zip(last[key].ravel(), found, strict=True)]
         means[key] = np.array(values, last[key].dtype).reshape(last[key].shape)
         steps[key] = str(min(len(rows) - mean.start for mean in found if mean) * size)
-        own = np.array([np.nan if mean is None else mean.error for mean in found], np.float32)
-        if np.isfinite(own).all():
+        if all(found):
+            own = np.array([mean.error for mean in found if mean], np.float32)
             errors[key] = own.reshape(last[key].shape)
     return means, errors, steps

@@ -47,6 +47,7 @@ class Run:
         deadline: time of `time.perf_counter` at which everything should be finished, with final images; None without such a budget.
         last_step: time of `time.perf_counter` at which the steps should end, so that everything fits into the budget; None if the budget
             covers the steps only.
+        compiled: whether the warm-up has added kernels to the cache.
     """
 
     plan: Plan
@@ -67,6 +68,7 @@ class Run:
     stopped: str = ""
     last_step: float | None = None
     deadline: float | None = None
+    compiled: bool = False
 
     def begin_budget(self, began: float | None) -> None:
         """Set the deadline of a budget in seconds that counts from `began`; None for one that covers the steps alone."""

@@ -10,12 +10,12 @@ _STARTS = np.arange(1, 11) / 20
 """First values of the windows, as fractions of the sequence. Each window has half of the sequence at least."""
 _FEWEST, _CROSSINGS = 16, 4
 """Number of values of a window, and number of times that they cross their mean, below which drift and noise look alike."""
-_FEW, _MANY = 4.0, 10.0
-"""Length of a window relative to its correlation time from which its mean is used, and from which it has a standard error."""
+_FEW = 4.0
+"""Length of a window relative to its correlation time up to which it shows no mean."""
 _DIFFERENT = 2.0
 """Standard errors between the means of two parts of a window from which it is not stationary."""
-_BIAS = 2.0
-"""Correction of the variance for the mean that is estimated from the same values, in correlation times over the length."""
+_LONGEST = 0.7
+"""Largest fraction of a sequence whose autocovariances are summed."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class StationaryMean:
     Attributes:
         start: index of its first value.
         value: mean.
-        error: standard error; NaN if the window is too short for one.
+        error: standard error.
     """
 
     start: int
@@ -47,16 +47,16 @@ def stationary_mean(sequence: np.ndarray) -> StationaryMean | None:
             return None
         quarter, half = length // 4, length // 2
         deviations = window - window.mean()
-        variance, correlated = long_run_variance(window[quarter:])
+        variance, correlated = long_run_variance(_without_trend(window[quarter:]))
         crossings = np.count_nonzero(deviations[1:] * deviations[:-1] < 0.0)
         if variance <= 0.0 or crossings < _CROSSINGS or length - quarter <= _FEW * correlated:
             continue
         early = _distance(window, quarter, variance)
         if max(early, _distance(window, half, variance)) < _DIFFERENT:
-            own, time = long_run_variance(window)
-            error = np.sqrt(max(own, variance) / length)
+            own = max(long_run_variance(part)[0] for part in (window, window[quarter:]))
+            # Where few correlation times make up the window, the variance itself has a large error.
             return StationaryMean(
-                start, float(window.mean()), float(error) if length >= _MANY * max(time, correlated) else np.nan
+                start, float(window.mean()), float(np.sqrt(own * (1.0 + 2.0 * correlated / length) / length))
             )
     return None
 
@@ -64,7 +64,8 @@ def stationary_mean(sequence: np.ndarray) -> StationaryMean | None:
 def long_run_variance(values: np.ndarray) -> tuple[float, float]:
     """Return n times the variance of the mean of n correlated values (n,), and their correlation time, which is 1 for independent ones.
 
-    The autocovariances are summed in pairs until a pair is not positive (Geyer 1992).
+    The autocovariances up to some lag M are summed: in pairs, until a pair is not positive (Geyer 1992). The mean that is subtracted
+    makes the sum of all of them smaller by (2 M + 1) / n, which is corrected.
     """
     n = len(values)
     spectrum = np.fft.rfft(values - values.mean(), 2 * n)
@@ -73,9 +74,15 @@ def long_run_variance(values: np.ndarray) -> tuple[float, float]:
         return 0.0, 1.0
     pairs = covariances[: n - n % 2].reshape(-1, 2).sum(axis=1)
     ends = np.flatnonzero(pairs <= 0.0)
-    total = max(2.0 * pairs[: ends[0] if ends.size else len(pairs)].sum() - covariances[0], 0.0)
-    time = total / covariances[0]
-    return float(total * (1.0 + _BIAS * time / n)), float(time)
+    count = int(ends[0]) if ends.size else len(pairs)
+    total = max(2.0 * pairs[:count].sum() - covariances[0], 0.0) / (1.0 - min((4 * count - 1) / n, _LONGEST))
+    return float(total), float(total / covariances[0])
+
+
+def _without_trend(values: np.ndarray) -> np.ndarray:
+    """Return the values minus the straight line of least squares."""
+    places = np.arange(len(values)) - 0.5 * (len(values) - 1)
+    return values - (places @ values) / (places @ places) * places
 
 
 def _distance(window: np.ndarray, place: int, variance: float) -> float:

@@ -47,6 +47,9 @@ _POLL_SECONDS = 0.5
 _MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
 
+_Seconds = Annotated[
+    float | None, typer.Option(help="Time for each run, with compilation and final pictures. [default: 20]")
+]
 _Methods = Annotated[
     str | None, typer.Option(metavar="NAME,NAME", help="The first measures the others. [default: stock,auto]")
 ]
@@ -65,9 +68,7 @@ def compare(
             "--set", "-s", metavar="[METHOD.]NAME=VALUE", help="An option of one or all methods, such as rcv.spp=4."
         ),
     ] = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="Time for each run, with compilation and final pictures. [default: 20]")
-    ] = None,
+    seconds: _Seconds = None,
     seeds: Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each method.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="The first run's seed.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: a new folder in out/.")] = None,
@@ -82,9 +83,9 @@ def compare(
 ) -> None:
     """Compare methods at equal time on one problem, or compare earlier runs.
 
-    Every run has the same time, as in `unrender run --seconds`. The tables compare at equal times of the steps alone, up to the shortest
-    run. With workers, several runs are concurrent, each with its share of the machine.
+    Every run has the same time, as in `unrender run`. With workers, several runs are concurrent, each with its share of the machine.
     """
+    arguments.budget(None, seconds)
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 

@@ -78,18 +78,19 @@ def run(
     SIGTERM stop after the current step and save the state; `unrender resume` continues from there.
     """
     arguments.check_file(problem)
+    given, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
+    steps, seconds = _budget_settings(given, steps, seconds)
+    arguments.budget(steps, seconds)
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
     console, command = Console(highlight=False), arguments.command_line(context)
-    given, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
         with phases.phase("loading"):
             from unrender.app.cli.execute import RunOrder, execution, introduce
             from unrender.runs.optimize import optimize
 
             chosen, processes = _method(method_name), dealing.check(workers, compress, insecure)
-            steps, seconds = _budget_settings(given, steps, seconds)
             if stages.is_stages(problem):
                 stages.refuse_settings(method_name, given, options, workers)
                 plan = (steps, seconds), seed, out, overwrite, variant, threads, command, checkpoint_every, final_spp

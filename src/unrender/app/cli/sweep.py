@@ -104,6 +104,7 @@ def sweep_command(
     The error is that of the parameters if the ground truth is known, else that of the final pictures. Each trial is a normal run
     folder, one per seed, in one folder with sweep.json. `unrender sweep DIR` continues an interrupted or killed sweep.
     """
+    arguments.budget(steps, seconds)
     from unrender.app.cli.sweep_driver import Session, run_trials
     from unrender.app.sweeps.record import read_sweep
     from unrender.display.terminal import Console

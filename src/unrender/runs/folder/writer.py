@@ -59,6 +59,8 @@ _FILES = (
 _STEPS, _MOST_SECONDS = 50, 60.0
 _SHARE = 1 / 100
 _CHECK_SECONDS = 1.0
+_TESTED_SHARE = (0.7, 0.3)
+"""Share of the budget that must be left after the warm-up for tests of what the images determine; less if kernels were compiled."""
 _EXPORT = "scene"
 
 _log = logging.getLogger("unrender")
@@ -98,6 +100,7 @@ class RunWriter(Hook):
     _written_at: float = field(default_factory=time.perf_counter)
     _cost: float = 0.0
     _thin_from: int = 0
+    _tested: bool = True
 
     def __post_init__(self) -> None:
         self._lock = Lock(self.folder)
@@ -149,8 +152,11 @@ class RunWriter(Hook):
         """Compile the kernels of the final pictures, so that nothing compiles after the last step."""
         del fresh, warm
         if self.final_spp != 1 and not descent.run.stopped:
+            run = descent.run
+            share = _TESTED_SHARE[run.compiled]
+            self._tested = run.seconds is None or run.time_left() > share * run.seconds
             with phases.phase(phase_times.COMPILING):
-                warm_up(descent.run.problem, descent.run.full())
+                warm_up(run.problem, run.full(), self._tested)
 
     def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
         """Append the step to the history, and write a checkpoint if due."""
@@ -171,7 +177,8 @@ class RunWriter(Hook):
                 # Save the long computation and its outcome before the final images take more time.
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
-            images = render_final_images(descent.run.problem, result, self.final_spp, descent.run.time_left)
+            run = descent.run
+            images = render_final_images(run.problem, result, self.final_spp, run.time_left, self._tested)
             result = replace(
                 result,
                 pictures=images.pictures,

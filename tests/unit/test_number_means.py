@@ -1,0 +1,104 @@
+"""Numbers of a result as means over the last steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.optimizers import Adam, AveragedNewton, Partitioned
+from unrender.optimizers.base import averaged_by
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs import number_means, verify
+from unrender.runs.number_trace import NumberTrace
+
+TRUTH = {"gain": np.array([0.5, 0.3], np.float32)}
+SEEDS = range(12)
+
+
+def problem(noise: float = 0.3) -> ur.Problem:
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (48, 2))
+    renderer = AnalyticRenderer(TRUTH, matrix, 0.1, noise)
+    return ur.Problem(renderer, [ur.Parameter("gain", initial=0.2)], [ur.View(renderer.exact(TRUTH))], truth=TRUTH)
+
+
+def run(seed: int = 0, steps: int = 200, **options: Any) -> ur.Result:
+    return ur.optimize(problem(), ur.PathGradient(spp=2), Adam(0.02, beta_1=0.5), steps=steps, seed=seed, **options)
+
+
+def test_means_are_nearer_to_the_truth_than_the_last_values() -> None:
+    results = [run(seed) for seed in SEEDS]
+    assert all("numbers are means of their last steps" in line for result in results for line in result.adapted)
+    squares = [
+        [np.mean(np.square(values["gain"] - TRUTH["gain"])) for values in (result.parameters, result.last)]
+        for result in results
+    ]
+    mean, last = np.mean(squares, axis=0)
+    assert mean < 0.5 * last
+    scores = [(r.parameters["gain"] - TRUTH["gain"]) / r.standard_error["gain"] for r in results]
+    assert 0.4 < np.sqrt(np.mean(np.square(scores))) < 1.8
+
+
+def test_a_run_that_has_not_arrived_keeps_its_last_values() -> None:
+    result = ur.optimize(problem(), ur.PathGradient(spp=2), Adam(0.0005), steps=60)
+    assert result.parameters is result.last
+    assert not result.standard_error
+    assert not result.adapted
+
+
+@pytest.mark.mitsuba
+def test_means_of_a_resumed_run_are_those_of_one_run(tmp_path: Path) -> None:
+    whole = run(steps=120)
+    run(steps=70, run_directory=tmp_path / "run")
+    resumed = ur.resume(tmp_path / "run", steps=120, problem=problem())
+    assert np.array_equal(resumed.parameters["gain"], whole.parameters["gain"])
+    assert np.array_equal(resumed.standard_error["gain"], whole.standard_error["gain"])
+    assert not np.array_equal(resumed.parameters["gain"], resumed.last["gain"])
+
+
+def test_last_values_are_kept_where_their_picture_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The planted fault is a mean of something else."""
+    monkeypatch.setattr(
+        number_means, "_means", lambda rows, size, last: ({"gain": np.full(2, 0.9, np.float32)}, {}, {"gain": "100"})
+    )
+    result = run()
+    assert np.array_equal(result.parameters["gain"], result.last["gain"])
+    monkeypatch.setattr(verify, "_is_worse", lambda *_: False)
+    assert np.array_equal(run().parameters["gain"], np.full(2, 0.9, np.float32))
+
+
+def test_numbers_that_the_optimizer_averages_are_left_to_it() -> None:
+    blocks = Partitioned(("a", "b"), AveragedNewton(), Adam())
+    assert averaged_by(AveragedNewton(), ("a", "c")) == {"a", "c"}
+    assert averaged_by(blocks, ("a", "c")) == {"a"}
+    assert averaged_by(Adam(), ("a",)) == frozenset()
+    shapes = number_means.numbers_of(problem(), Adam())
+    assert shapes == {"gain": (2,)}
+    assert number_means.numbers_of(problem(), AveragedNewton()) == {}
+
+
+def test_a_trace_of_many_steps_has_few_rows_of_equal_means(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("unrender.runs.number_trace._MOST_ROWS", 8)
+    trace = NumberTrace()
+    for step in range(50):
+        trace.append(np.array([step, -step], np.float64))
+    assert trace.size == 8
+    assert [row[0] for row in trace.rows] == [3.5 + 8 * k for k in range(6)]
+    again = NumberTrace.restored(trace.snapshot())
+    for each in (trace, again):
+        for step in range(50, 57):
+            each.append(np.array([step, -step], np.float64))
+    assert np.array_equal(np.array(trace.rows), np.array(again.rows))
+
+
+@pytest.mark.parametrize(
+    "fault", [{"size": 0.5}, {"rows": np.zeros((2, 3))}, {"count": 9}, {"total": np.zeros(2, np.float32)}]
+)
+def test_a_malformed_trace_is_refused(fault: dict[str, Any]) -> None:
+    saved = {"rows": np.zeros((2, 2)), "size": 2, "total": np.zeros(2), "count": 1}
+    NumberTrace.check(saved, "here")
+    with pytest.raises(ur.InputError, match="here: expected the values of numbers"):
+        NumberTrace.check({**saved, **fault}, "here")
