@@ -38,7 +38,9 @@ def test_means_are_nearer_to_the_truth_than_the_last_values() -> None:
     ]
     mean, last = np.mean(squares, axis=0)
     assert mean < 0.5 * last
-    scores = [(r.parameters["gain"] - TRUTH["gain"]) / r.standard_error["gain"] for r in results]
+    known = [r for r in results if r.standard_error]
+    assert len(known) > 0.6 * len(results)
+    scores = [(r.parameters["gain"] - TRUTH["gain"]) / r.standard_error["gain"] for r in known]
     assert 0.4 < np.sqrt(np.mean(np.square(scores))) < 1.8
 
 
