@@ -66,6 +66,18 @@ def lens() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     )
 
 
+def view() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
+    made = {
+        "type": "scene",
+        "cam": camera("perspective", [0, 1, 5], principal_point_offset_x=0.05),
+        "floor": floor(checkers(12), -0.6, 5),
+        "ball": {"type": "sphere", "radius": 0.5, "bsdf": {"type": "diffuse", "reflectance": rgb(0.5, 0.1, 0.1)}},
+        "sky": {"type": "constant"},
+    }
+    truth = {"cam.x_fov": 40.0, "cam.principal_point_offset_x": 0.05}
+    return made, truth, {"cam.x_fov": 37.0, "cam.principal_point_offset_x": 0.0}, 0.02
+
+
 def glass() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     back = mi.ScalarTransform4f().translate([0, 0, -2]).scale(3)
     made = {
@@ -109,6 +121,7 @@ def pose() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
 CASES: dict[str, Callable[[], tuple[Scene, dict[str, Any], dict[str, Any], float]]] = {
     "lamps": lamps,
     "lens": lens,
+    "view": view,
     "glass": glass,
     "sky": sky,
     "pose": pose,

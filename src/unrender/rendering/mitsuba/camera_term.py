@@ -76,7 +76,7 @@ def lens_parameters(pair: ScenePair) -> dict[str, ParameterInfo]:
                 limits = pair.physical_range(key)
                 reason = "it changes what the sensor sees"
                 parameters[key] = ParameterInfo(
-                    (), True, False, reason, limits.low, limits.high, viewpoint=True, sensor=index
+                    (), True, False, reason, limits.low, limits.high, viewpoint=True, sensor=index, nonlinear=True
                 )
     return parameters
 
