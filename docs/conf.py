@@ -6,7 +6,7 @@ from importlib.metadata import version as version_of
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE / "extensions"), str(HERE.parent)]
+sys.path[:0] = [str(HERE.parent / "scripts" / "site"), str(HERE.parent)]
 
 from benchmarks.runner.results_page import write_pages  # noqa: E402
 from unrender.backend import variant  # noqa: E402
@@ -24,7 +24,7 @@ release = version_of("unrender")
 copyright = "unrender contributors, BSD-3-Clause"
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "markdown_docstrings", "mathml"]
-exclude_patterns = ["_build", "extensions"]
+exclude_patterns = ["_build"]
 
 # Pages: Markdown; those with {code-cell} are notebooks, executed at each build.
 myst_enable_extensions = ["colon_fence", "dollarmath"]

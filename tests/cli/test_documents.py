@@ -21,7 +21,8 @@ import unrender as ur
 from tiers import quick
 
 DOCS = ROOT / "docs"
-sys.path.insert(0, str(DOCS / "extensions"))
+SITE = ROOT / "scripts" / "site"
+sys.path.insert(0, str(SITE))
 import reference_pages  # noqa: E402
 
 # docs/extending has tests of its own, which install its files; the commands of results.md take hours.
@@ -31,8 +32,9 @@ PAGES = [
         page
         for page in DOCS.rglob("*.md")
         if page.name not in ("results.md", "contributing.md")
-        and not {"benchmarks", "extending", "gallery"} & set(page.relative_to(DOCS).parts)
+        and not {"benchmarks", "extending", "gallery", "tutorials"} & set(page.relative_to(DOCS).parts)
     ),
+    *sorted((ROOT / "examples" / "tutorials").glob("*.md")),
 ]
 SLOW = {
     "README.md",
@@ -84,7 +86,7 @@ SLOW_EXAMPLES = {
     "unrender.estimators.smoothing.grey_box",
 }
 ILLUSTRATIONS = {
-    "unrender.optimizers.chain.Chain": "the names are not imported; docs/reference/optimizers.md runs such one",
+    "unrender.optimizers.chain.Chain": "the names are not imported; the page of optimizers runs such one",
     "unrender.optimizers.partitioned.Partitioned": "the names are not imported; tests/unit/test_mesh_descent.py makes such ones",
     "unrender.core.registry": "a class is shown without its methods",
     "unrender.app.distributed.distribute.distribute": "it starts worker processes, as tests/render/test_dealt_runs.py does",
@@ -172,6 +174,16 @@ def test_few_blocks_are_skipped_and_each_says_why():
     assert len(skipped) <= 10
 
 
+def test_pages_are_short():
+    """All text below docs has at most 150 KiB, and no page of the guide more than 150 lines. Built pages have other folders or names."""
+    built = {"benchmarks", "gallery", "tutorials", "reference"}
+    pages = [page for page in DOCS.rglob("*.md") if not built & set(page.relative_to(DOCS).parts)]
+    assert sum(len(page.read_bytes()) for page in pages if page.name != "equations.md") < 150 << 10
+    assert [
+        page.name for page in (DOCS / "guide").glob("*.md") if page.read_text(encoding="utf-8").count("\n") > 150
+    ] == []
+
+
 def _source(module: str) -> Path:
     base = ROOT / "src" / Path(*module.split("."))
     return base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
@@ -242,9 +254,7 @@ PUBLIC_MODULES = {
 
 def test_the_reference_has_every_public_name():
     """By a directive of its own, or by one for its module, which documents what `__all__` lists."""
-    pages = [DOCS / "reference" / name for name in ("optimizers.md", "protocols.md")]
-    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
-    text += "\n".join(page.markdown() for page in reference_pages.PAGES.values())
+    text = "\n".join(page.markdown() for page in reference_pages.PAGES.values())
     single = set(re.findall(r"auto(?:class|function|exception):: (\w+)$", text, re.MULTILINE))
     whole = set(re.findall(r"automodule:: ([\w.]+)$", text, re.MULTILINE))
     for name in ur.__all__:
@@ -260,7 +270,7 @@ def test_the_reference_has_every_public_name():
 @pytest.fixture
 def site_pages(mitsuba_variant: str, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The module that builds pages of the site."""
-    monkeypatch.syspath_prepend(str(DOCS / "extensions"))
+    monkeypatch.syspath_prepend(str(SITE))
     return importlib.import_module("site_pages")
 
 

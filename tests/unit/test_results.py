@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+import pytest
+
 from benchmarks.runner.catalogue import ROOT, benchmarks
 from benchmarks.runner.results_page import section
 
+pytestmark = pytest.mark.mitsuba  # tables of some benchmarks name problems of the gallery
 PAGE = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 NUMBER = r"(?<![\w.,])\d+(?:\.\d+)?(?![\w³])"

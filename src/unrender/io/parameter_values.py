@@ -1,4 +1,19 @@
-"""Conversion of an initial or true value to an array of the parameter's shape: a number, a colour, an image, a grid or an array."""
+"""Conversion of an initial or true value to an array of the parameter's shape: a number, a colour, an image, a grid or an array.
+
+Files are converted as Mitsuba converts a file of the scene. The scene's own file therefore has error 0.
+
+| parameter | file | conversion |
+|---|---|---|
+| `data` of a `bitmap` | picture | 8 and 16 bits: sRGB, or linear if the texture has `raw`; row 0 at the top |
+| `data` of an `envmap` | picture of H × W | linearised; each end gets a copy of the opposite column: H × (W + 2) |
+| `data` of a `gridvolume` | `.vol` | none |
+| `vertex_positions`, `vertex_normals`, `vertex_texcoords`, attributes | `.obj`, `.ply`, `.serialized` | see below |
+| any | `.npy`, `.npz` | none; the parameter's shape |
+
+Values of a texture in half precision are rounded. Meshes are loaded with the settings of the shape. They need the same vertices in the
+same order, with Mitsuba's duplicates at seams. A picture or grid of another resolution is resized, with a note. A colour picture fills a
+one-channel texture by its luminance, a grey one all channels.
+"""
 
 from __future__ import annotations
 

@@ -26,15 +26,23 @@ from unrender.scene.problem import Problem
 class AutoMethod(Options):
     """chooses estimator, optimizer and preconditioner from the problem: control variates, Sobolev gradients, schedule-free Adam
 
-    The image estimator is a recursive control variate, which reuses earlier samples. It reduces noise, and the bias that noise causes for
-    losses other than L2. Its errors are forgotten after about 20 steps (33 for losses such as L1), so that the optimizer does not follow
-    them. If the scene cannot be loaded twice, or a mesh moves and the loss is unbiased anyway, each step has a new rendering.
+    The first rule (`unrender.methods.rules`) that fits the problem decides. Options override every choice.
 
-    Textures, grids and values at mesh vertices use Sobolev gradients. Vertex positions use large steps with one step scale. Other
-    parameters take steps in proportion to their range. Parameters without path gradients, such as poses, take Gauss-Newton steps from
-    perturbed renders, together with path gradients of the others, or steps of a smoothed loss where these are unsuitable (`hybrid`,
-    `smoothed`). Cameras alone take Gauss-Newton steps, and so do poses of shapes alone if the initial images overlap enough. Grids of
-    volumes have a coarse resolution in the first steps. Options override every choice.
+    | part | decision | option |
+    |---|---|---|
+    | image | a control variate that forgets after about 20 steps, 33 where noise biases the loss | `image` |
+    | the same, scene not loadable twice or moving mesh with an unbiased loss | a new rendering per step | |
+    | noise-biased losses | pixels whose noise exceeds their residual are damped | `tolerance` |
+    | samples | 32,768 paths per step, 2 to 16 per pixel | `spp` |
+    | pixels | all of them up to 2¹⁹; beyond, 2¹⁵ per step at 4 samples | `pixels` |
+    | smoothing | Sobolev gradients over at most an eighth of a texture, grid or mesh, less where gradients confirm detail | `smooth` |
+    | steps | schedule-free Adam; the rate follows the agreement of successive gradients | `learning_rate` |
+    | first rate | a tenth of the parameter's range or size; 0.3 of that for a number or a colour with two bounds | `learning_rate` |
+    | logarithms | positive numbers, colours and textures without an upper bound | `parameterise` |
+    | grids of media | a quarter of the resolution before step 8, half before step 20 | `coarse` |
+    | vertices | large steps, one rate for all | |
+    | cameras; up to 24 numbers that change the form of the picture | Gauss-Newton steps | `image` |
+    | poses, and what path gradients refuse | perturbed renders: Gauss-Newton steps, or a smoothed loss | `sigma` |
     """
 
     image: Literal["plain", "rcv"] | None = Field(

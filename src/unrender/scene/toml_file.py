@@ -122,6 +122,10 @@ class _Problem(Table):
     )
 
 
+TABLES: dict[str, type[Table]] = {"": _Problem, "parameters": _Parameter, "views": _View}
+"""Models of a problem file's tables, by name; "" is the file itself."""
+
+
 def read(path: str | Path) -> Problem:
     """Return the problem of a TOML file.
 

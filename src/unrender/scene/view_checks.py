@@ -1,4 +1,18 @@
-"""Validation of views and of their images."""
+"""Validation of views and of their images.
+
+References are linear in what the camera saw. Files with 8 and 16 bits per channel are taken as sRGB and linearised, with a notice. `.exr`,
+`.hdr` and floating-point arrays are linear. Masks are taken as they are.
+
+| `pixel_format` of the film | array or `.npy` | comparison |
+|---|---|---|
+| `rgb`, `rgba` | (H, W, 3) or (H, W, 4) | red, green and blue |
+| `xyz`, `xyza` | (H, W, 3) or (H, W, 4) | converted to RGB |
+| `luminance`, `luminance_alpha` | (H, W), (H, W, 1) or (H, W, 2) | with the luminance of the image |
+
+A floating-point file with channels R, G and B is refused for a film of XYZ, since `mi.util.write_bitmap` names XYZ values so. Alpha of
+8- and 16-bit pictures multiplies the view's mask. Alpha of floating-point pictures is left out, since Mitsuba's films multiply colours
+with it. Negative values are refused, unless the film's reconstruction filter has negative lobes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,17 @@
-"""Unknowns of an asset by name: their keys, textures, bounds and initial values, and the stages that recover them."""
+"""Unknowns of an asset by name: their keys, textures, bounds and initial values, and the stages that recover them.
+
+Unknowns of the camera:
+
+| unknown | shape | model |
+|---|---|---|
+| `exposure` | three per training view | factor 2^e per channel, less the mean over views |
+| `vignetting` | three | factor 2^(a₁ r² + a₂ r⁴ + a₃ r⁶), r = 1 at the corners |
+| `response` | two per channel | a rising curve from 0 to 0 and 1 to 1; 0 is sRGB |
+| `poses` | six per training view | rotation in degrees and a shift of similar effect; common motions are projected out |
+
+The curve of `--response fit` is f(x) = m(x)^γ with m(x) = eᵇ x / (1 + (eᵇ - 1) x), γ = exp(c) and b = d + 1.6 c, with unknown contrast c
+and brightness d. If light and object stand still together, the colour can explain any curve.
+"""
 
 from __future__ import annotations
 

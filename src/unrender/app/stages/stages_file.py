@@ -142,6 +142,10 @@ class _Stages(Table):
     run: _Run | None = Field(None, description="a table of a run's options")
 
 
+TABLES: dict[str, type[Table]] = {"": _Stages, "stages": _Stage}
+"""Models of the tables of a file of stages, by name; "" is the file itself."""
+
+
 def is_stages(path: Path) -> bool:
     """Return whether a TOML file describes stages, not a problem; False for a file that cannot be read, whose error a later reader
     reports."""

@@ -4,19 +4,28 @@ A run writes what these models describe, and `reader` checks its input against t
 
 | file | contents |
 |---|---|
-| `run.json` | `RunRecord` |
-| `method.toml` | `method_file.Method` |
-| `problem.toml`, `problem/` | see `scene.serialization` |
+| `report.html` | the page: result and reference under a slider, errors, curves, settings; one file, no network |
+| `run.json` | `RunRecord`: status, verification, settings, seed, versions, hardware, warnings, plan of `auto` (`choices`, `adapted`) |
+| `method.toml` | `method_file.Method`: the method in full |
+| `problem.toml`, `problem/` | the problem in full, see `scene.serialization` |
 | `history.jsonl` | one JSON object per step, see `HISTORY_COLUMNS` |
-| `parameters.npz`, `initial.npz`, `truth.npz` | {key: array}: the latest, the initial, and the known true values |
+| `parameters.npz`, `initial.npz`, `truth.npz` | {key: array}, float32: the best verified, the initial, and the known true values |
 | `last.npz` | {key: array} after the last step, if `parameters.npz` contains better ones of an earlier step |
-| `pictures.npz` | {"view0/reference": (H, W, 3), ...}, see `PICTURE_NAME` |
-| `sensitivity.npz` | {key: array}: see `Result.sensitivity` |
+| `pictures.npz` | {"view0/reference": (H, W, 3), ...}, linear: `reference`, `initial`, `result`, `control_weight` |
+| `sensitivity.npz` | {key: array}: change of the images per unit of each element; where it is small, the value is noise or smoothing |
 | `meshes.npz`, `meshes/` | see `meshes.arrays_of`; PLY and OBJ files of the recovered meshes |
-| `checkpoints/00000050/` | `state.safetensors` and `manifest.json`, see `Manifest` |
+| `checkpoints/00000050/` | `state.safetensors` and `manifest.json`, see `Manifest`; the last three are kept |
 | `live/` | current state of a run, see `live.Live`; `status.json` is a `LiveStatus` |
 | `control.json` | {"command": one of `COMMANDS`} |
 | `lock` | the process that holds the folder, see `lock` |
+
+| number | meaning |
+|---|---|
+| `seconds` | time of the steps alone, without compilation (`warmup_seconds`), checkpoints and reports |
+| `loss` | loss of the step's own noisy image; compare methods by image and parameter errors |
+| `gradient_noise` | share of noise in the gradient's energy; near 1 a descent has converged, or needs more samples |
+| `image_errors` | RMS difference of the converged picture from its reference, ± standard error, without the rendering's noise |
+| `parameter_error` | RMS difference from the truth; degrees for normals and directions; distance between surfaces for meshes |
 """
 
 from __future__ import annotations

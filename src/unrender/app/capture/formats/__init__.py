@@ -1,4 +1,27 @@
-"""Formats of posed photographs: recognition and reading."""
+"""Formats of posed photographs: recognition and reading.
+
+| format | files | poses | lens |
+|---|---|---|---|
+| `transforms` | `transforms.json` (NeRF, instant-ngp, nerfstudio) | camera to world, `opengl` | `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h` |
+| | or `transforms_train.json` and `transforms_test.json` (held out) | | or `camera_angle_x`; `k1`, `k2`, `p1`, `p2`, `k3` |
+| | | | `k1` to `k4` of `OPENCV_FISHEYE` |
+| `colmap` | `cameras`, `images` (`.bin` or `.txt`) | world to camera, `opencv` | all models but `FOV` and the thin prism |
+| | in the folder, `sparse/0`, `sparse`, `colmap/sparse/0` | | |
+| `llff` | `poses_bounds.npy`; photographs in `images`, by name | camera to world, `llff` | one focal length, centred |
+| `lights` | `lights.txt`: one camera under known lights | none | orthographic |
+
+Poses without a photograph, and photographs without a pose, are left out with a note. Masks are looked for in this order: `--masks`;
+`mask_path` of a frame; `NAME_mask.png`; a folder such as `train_mask`; `masks` or `mask`; the alpha channel. All photographs have a mask,
+or none has. White (above 0.5) is inside.
+
+| topic | convention |
+|---|---|
+| world | axes, origin and unit of the files, also for `--mesh`; mirrored matrices are refused |
+| pixels | from the upper left corner; the centre of the first pixel is (0.5, 0.5) |
+| distortion | OpenCV's model, removed on import |
+| EXIF rotation | pixels as stored, unless the camera's proportions say otherwise, with a note |
+| values | 8 and 16 bits are sRGB (`--response` names another curve); floating point is linear |
+"""
 
 from __future__ import annotations
 

@@ -16,9 +16,17 @@ from benchmarks.coverage.cli import RECORD
 from benchmarks.runner import records
 from benchmarks.runner.catalogue import benchmarks
 from unrender import gallery
+from unrender.app import distributed, exporting
+from unrender.app.capture import conventions, formats, unknowns
+from unrender.app.capture.formats import lights
+from unrender.app.stages import stages_file
 from unrender.core import registry
 from unrender.display.pictures import png, shown_image
+from unrender.io import parameter_values
 from unrender.methods import method
+from unrender.rendering.mitsuba import turntable_light
+from unrender.runs.folder import schema
+from unrender.scene import toml_file, view_checks
 
 PIXELS, SAMPLES = 96, 64
 """Side and samples per pixel of the gallery's pictures."""
@@ -35,7 +43,11 @@ def write_pages(docs: Path) -> None:
     ranges_page.PAGE.write_text(ranges_page.page())
     (docs / "reference" / "arguments.md").write_text(arguments_page())
     (docs / "reference" / "commands.md").write_text(commands_page())
+    (docs / "reference" / "files.md").write_text(files_page())
     reference_pages.write_pages(docs / "reference")
+    (docs / "equations.md").write_text((docs.parent / "src" / "unrender" / "EQUATIONS.md").read_text())
+    for notebook in sorted((docs.parent / "examples" / "tutorials").glob("*.md")):
+        (docs / "tutorials" / notebook.name).write_text(notebook.read_text().replace("(../../docs/", "(../"))
     folder = docs / "gallery"
     folder.mkdir(exist_ok=True)
     (folder / "index.md").write_text(gallery_page(folder))
@@ -107,13 +119,46 @@ def arguments_page() -> str:
     parts.append("## Methods")
     for name in registry.components("method"):
         made = method(name)
-        parts.append(f"**`{name}`**: {_cell(made.summary)}")
+        parts += [f"### {name}", _cell(made.summary[0].upper() + made.summary[1:]) + "."]
+        parts += inspect.cleandoc(made.options.__doc__ or "").split("\n\n")[1:]
         rows = []
         for key, field in made.options.model_fields.items():
             default = _code(field.get_default(call_default_factory=True))
             rows.append(f"| `{key}` | {default} | {_cell(field.description or '')} ({_cell(made.expected(key))}) |")
         if rows:
             parts.append("| option | default | meaning |\n|---|---|---|\n" + "\n".join(rows))
+    return "\n\n".join(parts) + "\n"
+
+
+FILES = {
+    "References": view_checks,
+    "Run folders": schema,
+    "Values from files": parameter_values,
+    "Photographs": formats,
+    "Axes of cameras": conventions,
+    "Photographs under known lights": lights,
+    "Turntable lights": turntable_light,
+    "Unknowns of photographs": unknowns,
+    "Exports": exporting,
+    "Distributed runs": distributed,
+}
+"""Modules whose docstrings are sections of the page of files, by heading."""
+
+
+def files_page() -> str:
+    """Return a page with the fields of problem files and files of stages, and the conventions of all other files."""
+    parts = ["# Files and conventions", "Fields without a default are required."]
+    for heading, tables in (("Problem files", toml_file.TABLES), ("Files of stages", stages_file.TABLES)):
+        parts.append(f"## {heading}")
+        for name, model in tables.items():
+            rows = []
+            for own, field in model.model_fields.items():
+                default = "required" if field.is_required() else _code(field.get_default(call_default_factory=True))
+                rows.append(f"| `{field.alias or own}` | {default} | {_cell(field.description or '')} |")
+            title = f"`[[{name}]]`" if name else "The file"
+            parts.append(f"| {title} | default | value |\n|---|---|---|\n" + "\n".join(rows))
+    for heading, module in FILES.items():
+        parts += [f"## {heading}", inspect.cleandoc(module.__doc__ or "")]
     return "\n\n".join(parts) + "\n"
 
 
@@ -128,6 +173,11 @@ def commands_page() -> str:
         "What `unrender COMMAND -h` prints. [The command line](../guide/command-line.md) has exit statuses, memory and variables.",
     ]
     commands: Any = get_command(app)
+    rows = [
+        f"| [`unrender {name}`](#unrender-{name}) | {_summary_line(command.help)} |"
+        for name, command in commands.commands.items()
+    ]
+    parts.append("| command | purpose |\n|---|---|\n" + "\n".join(rows))
     for name, command in commands.commands.items():
         arguments = " ".join(
             each.metavar or each.name.upper() for each in command.params if each.param_type_name == "argument"
@@ -139,6 +189,10 @@ def commands_page() -> str:
                 rows.append(f"| {', '.join(f'`{flag}`' for flag in each.opts)} | {_cell(each.help or '')} |")
         parts.append("| option | meaning |\n|---|---|\n" + "\n".join(rows))
     return "\n\n".join(parts) + "\n"
+
+
+def _summary_line(text: str) -> str:
+    return _cell(_paragraph(text).partition("\n\n")[0])
 
 
 def _paragraph(text: str) -> str:

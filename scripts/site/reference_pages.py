@@ -103,6 +103,27 @@ problem = problem.replaced(loss=ur.losses.Huber(delta=0.1))
         ("unrender.losses",),
         "Loss",
     ),
+    "optimizers": Page(
+        "`ur.optimizers`",
+        "From an estimate to a step. Optimizers are chains of transforms. The protocols are [`Optimizer` and "
+        "`StepTransform`](protocols.md).",
+        """
+from unrender.optimizers.transforms import GradientMean, ScaleByRms
+
+adam = ur.optimizers.Chain((GradientMean(0.9), ScaleByRms(0.999)), learning_rate=0.01)
+""",
+        ("unrender.optimizers", "unrender.optimizers.transforms"),
+        "Optimizer",
+    ),
+    "protocols": Page(
+        "Protocols of components",
+        "A component is an object with the methods of a protocol. [Add a component](../extending/index.md) has a complete "
+        "file of each kind, the tutorial [your own estimator](../tutorials/own-estimator.md) runs one. Kinds for `register` "
+        "are loss, schedule, parameterisation, preconditioner, pixel sampler, image estimator, estimator, optimizer, step "
+        "transform, method and gallery problem.",
+        "print(ur.PathGradient().provides)  # an optimizer that requires more is refused",
+        ("function register", "unrender.protocols"),
+    ),
     "schedules": Page(
         "`ur.schedules`",
         "Factors of a learning rate or of a smoothing width. The protocol is [`Schedule`](protocols.md).",
