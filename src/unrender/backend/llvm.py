@@ -129,8 +129,8 @@ def choose(paths: Iterable[Path] | None = None) -> Library | None:
     """
     paths = [path for path in (candidates() if paths is None else paths) if _is_for_this_machine(path)]
     named = [Library(path, version_by_name(path)) for path in paths]
-    asked = (Library(library.path, version_by_asking(library.path)) for library in named if library.major is None)
-    return _best(named) or _best(asked)
+    versions = (Library(library.path, version_by_asking(library.path)) for library in named if library.major is None)
+    return _best(named) or _best(versions)
 
 
 def is_usable(major: int | None) -> bool:

@@ -66,9 +66,9 @@ def prepare() -> None:
         install = install_hints.command(missing)
         raise VariantError(f"{' and '.join(missing)} not found, which Dr.Jit needs; install: {install}")
     cache.use_for_kernels()
-    given = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
-    if given:
-        usable = llvm.is_usable(llvm.identify(Path(given)).major)
+    chosen = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
+    if chosen:
+        usable = llvm.is_usable(llvm.identify(Path(chosen)).major)
     else:
         library = llvm.choose()
         usable = library is not None
@@ -239,10 +239,10 @@ def llvm_version() -> tuple[int, ...] | None:
     Dr.Jit is not asked if the configured library is unusable or no usable one exists. It would deadlock: it waits for its own
     initialisation, whose thread waits for the interpreter lock of this call to report the failure.
     """
-    given = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
-    if given and not llvm.is_usable(major := llvm.identify(Path(given)).major):
+    library = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
+    if library and not llvm.is_usable(major := llvm.identify(Path(library)).major):
         return None if major is None else (major,)
-    if not given and llvm.choose() is None:
+    if not library and llvm.choose() is None:
         return None
     import drjit as dr
 
@@ -290,24 +290,24 @@ def _check_llvm() -> None:
     version = llvm_version()
     if version is not None and llvm.is_usable(version[0]):
         return
-    given = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
-    what = f"{_describe_llvm(version, given)}, unrender needs LLVM {llvm.OLDEST} or newer"
+    chosen = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
+    what = f"{_describe_llvm(version, chosen)}, unrender needs LLVM {llvm.OLDEST} or newer"
     library = llvm.choose()
-    if library is None or (given and Path(given).resolve() == library.path.resolve()):
+    if library is None or (chosen and Path(chosen).resolve() == library.path.resolve()):
         raise VariantError(f"{what}; install: {install_hints.command(['llvm'])}")
-    first = "" if given else "import unrender first, or "
+    first = "" if chosen else "import unrender first, or "
     raise VariantError(f"{what}; {first}set {llvm.ENVIRONMENT_VARIABLE}={library.path}")
 
 
-def _describe_llvm(version: tuple[int, ...] | None, given: str | None) -> str:
+def _describe_llvm(version: tuple[int, ...] | None, library: str | None) -> str:
     """Describe the unusable LLVM: loaded as `version`, or configured by the path `given`."""
-    if given:
-        path = Path(given)
+    if library:
+        path = Path(library)
         major = version[0] if version else llvm.identify(path).major
         if version is None and llvm.is_usable(major):
-            return f"Dr.Jit cannot load {llvm.ENVIRONMENT_VARIABLE}={given}"
+            return f"Dr.Jit cannot load {llvm.ENVIRONMENT_VARIABLE}={library}"
         actual = f"LLVM {major}" if major else ("not LLVM" if path.exists() else "no such file")
-        return f"{llvm.ENVIRONMENT_VARIABLE}={given} is {actual}"
+        return f"{llvm.ENVIRONMENT_VARIABLE}={library} is {actual}"
     if version is not None and llvm.choose():
         return f"Dr.Jit was imported before unrender and loaded LLVM {version[0]}"
     newest = max((llvm.version_by_name(path) or 0 for path in llvm.candidates()), default=0)

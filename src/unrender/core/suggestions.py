@@ -46,6 +46,6 @@ def did_you_mean(name: str, known: Iterable[str], likeness: float = 0.6) -> str:
         return ""
     names = [each for each in itertools.islice(known, _MOST) if len(each) <= _LONGEST]
     same = [each for each in names if each.lower() == name.lower()]
-    meant = [each for each in _SYNONYMS.get(name.lower(), ()) if each in names]
-    near = same[:1] or meant[:1] or difflib.get_close_matches(name, names, n=1, cutoff=likeness)
+    synonyms = [each for each in _SYNONYMS.get(name.lower(), ()) if each in names]
+    near = same[:1] or synonyms[:1] or difflib.get_close_matches(name, names, n=1, cutoff=likeness)
     return f"; did you mean {near[0]}?" if near else ""

@@ -47,11 +47,11 @@ def parse(text: str, kind: str) -> Any:
         raise InputError(f"{kind}: unknown {(match[1] if match else text)!r}{hint}")
     every = [field for field in dataclasses.fields(known[name]) if field.init]
     numbers = [field for field in every if field.name != _NEXT]
-    given = [part.strip() for part in match[2].split(",")] if match[2] and match[2].strip() else []
+    texts = [part.strip() for part in match[2].split(",")] if match[2] and match[2].strip() else []
     required = [field.name for field in numbers if field.default is dataclasses.MISSING]
-    if not len(required) <= len(given) <= len(numbers):
+    if not len(required) <= len(texts) <= len(numbers):
         raise InputError(f"{kind}: expected {name}({', '.join(field.name for field in numbers)}), got {text!r}")
-    arguments: dict[str, Any] = {field.name: _number(part, kind) for field, part in zip(numbers, given, strict=False)}
+    arguments: dict[str, Any] = {field.name: _number(part, kind) for field, part in zip(numbers, texts, strict=False)}
     if rest:
         if len(numbers) == len(every):
             raise InputError(f'{kind}: only {_with_next(known)} can have something after "then", got {text!r}')
@@ -112,11 +112,11 @@ def fields(value: Any) -> dict[str, Any]:
     return values | ({_NONE: none} if none else {})
 
 
-def component(given: Any, kind: str | None = None, where: str = "", folder: Path | None = None) -> Any:
+def component(table: Any, kind: str | None = None, where: str = "", folder: Path | None = None) -> Any:
     """Return the component of a table, or of the short text form of its kind.
 
     Args:
-        given: {"type": name, field: value, ...}; if `kind` is set also "name", or the short form of a kind that has one.
+        table: {"type": name, field: value, ...}; if `kind` is set also "name", or the short form of a kind that has one.
         kind: kind of component, one of `registry.KINDS`; None accepts every kind that tables can store.
         where: prefix of messages.
         folder: folder to which relative paths refer; None leaves them unchanged.
@@ -125,55 +125,55 @@ def component(given: Any, kind: str | None = None, where: str = "", folder: Path
         InputError: unknown types or fields (with the nearest known one), missing fields, values of the wrong type or out of range.
     """
     try:
-        return _component(given, kind, folder, 0)
+        return _component(table, kind, folder, 0)
     except InputError as error:
         if not where:
             raise
         raise InputError(f"{where}: {error}") from error
 
 
-def build(made_by: type[_T], given: Mapping[str, Any]) -> _T:
+def build(made_by: type[_T], fields: Mapping[str, Any]) -> _T:
     """Return a dataclass from a table of its fields. Raises `InputError` as `component` does."""
-    return _build(made_by, made_by.__name__, given, None, 0)
+    return _build(made_by, made_by.__name__, fields, None, 0)
 
 
-def options(made_by: type[_T], given: Any, example: str) -> _T:
+def options(made_by: type[_T], table: Any, example: str) -> _T:
     """Return a dataclass from an instance, or from a table of its fields such as `example`. Raises `InputError`."""
-    if isinstance(given, made_by):
-        return given
-    if not isinstance(given, Mapping):
-        raise InputError(f"expected a table such as {example}, got {given!r:.60}")
-    return build(made_by, given)
+    if isinstance(table, made_by):
+        return table
+    if not isinstance(table, Mapping):
+        raise InputError(f"expected a table such as {example}, got {table!r:.60}")
+    return build(made_by, table)
 
 
-def _component(given: Any, kind: str | None, folder: Path | None, depth: int) -> Any:
+def _component(table: Any, kind: str | None, folder: Path | None, depth: int) -> Any:
     if depth > _DEEPEST:
         raise InputError("nested too deeply")
-    if kind in _IN_SHORT and isinstance(given, str):
-        return parse(given, kind)
-    given = {_TYPE: given} if kind is not None and isinstance(given, str) else given
+    if kind in _IN_SHORT and isinstance(table, str):
+        return parse(table, kind)
+    table = {_TYPE: table} if kind is not None and isinstance(table, str) else table
     known = registry.table_components() if kind is None else registry.components(kind)
-    if not isinstance(given, Mapping) or not isinstance(given.get(_TYPE), str):
+    if not isinstance(table, Mapping) or not isinstance(table.get(_TYPE), str):
         example = f'{{ type = "{"Adam" if kind is None else next(iter(known), "Name")}" }}'
         expected = f"a table such as {example}"
         expected = expected if kind is None else f"{_one_of(known)}, or {expected}"
-        raise InputError(f"expected {expected}, got {repr(given)[:80]}")
-    name = given[_TYPE]
+        raise InputError(f"expected {expected}, got {repr(table)[:80]}")
+    name = table[_TYPE]
     if name not in known:
         raise InputError(_unknown(name, kind, known))
-    return _build(known[name], name, {key: value for key, value in given.items() if key != _TYPE}, folder, depth)
+    return _build(known[name], name, {key: value for key, value in table.items() if key != _TYPE}, folder, depth)
 
 
-def _build(made_by: type[_T], name: str, given: Mapping[str, Any], folder: Path | None, depth: int) -> _T:
+def _build(made_by: type[_T], name: str, fields: Mapping[str, Any], folder: Path | None, depth: int) -> _T:
     known = {field.name: field for field in dataclasses.fields(made_by) if field.init}  # pyright: ignore[reportArgumentType]
-    none = given.get(_NONE, [])
+    none = fields.get(_NONE, [])
     if _NONE not in known and (
         not isinstance(none, list) or any(not isinstance(key, str) or key not in known for key in none)
     ):
         raise InputError(f"none: expected a list of fields of {name}, got {repr(none)[:80]}")
     arguments: dict[str, Any] = {} if _NONE in known else dict.fromkeys(none)
     hints = _hints(made_by)
-    for key, value in given.items():
+    for key, value in fields.items():
         if key == _NONE and _NONE not in known:
             continue
         if key not in known:

@@ -53,9 +53,9 @@ def picture_row(shown: Mapping[str, np.ndarray]) -> str:
     return f'<div style="display:flex;flex-wrap:wrap;gap:10px;margin:.4em 0">{"".join(figures)}</div>'
 
 
-def charts(drawn: Sequence[Chart | None]) -> str:
+def charts(curves: Sequence[Chart | None]) -> str:
     """Return charts side by side; None entries are skipped."""
-    parts = "".join(_chart(chart) for chart in drawn if chart is not None)
+    parts = "".join(_chart(chart) for chart in curves if chart is not None)
     return f'<div style="display:flex;flex-wrap:wrap;gap:14px;margin:.4em 0">{parts}</div>' if parts else ""
 
 

@@ -287,8 +287,10 @@ class MetaEstimator:
         see `_sample`."""
         spp, difference_spp = self.proportional_spp or _PROPORTIONAL_SPP, self.difference_spp or _DIFFERENCE_SPP
         at_once = self.difference_images == "proportional" and not fresh
-        asked = replace(pair_request, difference_spp=difference_spp) if at_once else None
-        step, pixels = self._sample(problem, parameters, state, spp, key.fold(_PROPORTIONAL), asked, first=first)
+        difference_request = replace(pair_request, difference_spp=difference_spp) if at_once else None
+        step, pixels = self._sample(
+            problem, parameters, state, spp, key.fold(_PROPORTIONAL), difference_request, first=first
+        )
         coordinates = problem.coordinates
         slopes, before = coordinates.slopes(parameters), coordinates.slopes(pair_request.previous)
         F = coordinates.pull_back(step.gradient, slopes)
@@ -337,8 +339,8 @@ class MetaEstimator:
         """Return a gradient with its own pixel sample, and the pixel sampler's next state. That state only advances for the `first`
         sample of a step."""
         draw_key = key.fold(PIXELS)
-        drawn = draws_pixels(self.pixels)
-        if drawn and self._renders_full_views(parameters, state):
+        mini_batch = draws_pixels(self.pixels)
+        if mini_batch and self._renders_full_views(parameters, state):
             batch, pixels = MiniBatch(None), state.pixels
         elif first or not isinstance(self.pixels, RepeatableSampler):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, draw_key)
@@ -349,7 +351,7 @@ class MetaEstimator:
         if first:
             pixels = self.pixels.observe(problem, pixels, problem.coordinates.wrt_u(step.gradient, parameters))
             pixels = learned(self.pixels, problem, pixels, batch.sample, step.draws)
-            if drawn and batch.sample is None:
+            if mini_batch and batch.sample is None:
                 step = replace(step, image=problem.executor.prepare_images(problem, self.image, step.image))
         return step, pixels
 

@@ -90,8 +90,8 @@ def denoise(
     return np.ascontiguousarray(denoised * np.float32(scale), np.float32)
 
 
-def _checked(name: str, given: Any) -> np.ndarray:
-    array = np.asarray(given)
+def _checked(name: str, image: Any) -> np.ndarray:
+    array = np.asarray(image)
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
         raise InputError(f"denoise: {name} must be an array of numbers, got {array.dtype}")
     if (array.ndim not in (2, 3)) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
@@ -109,8 +109,8 @@ def _oidn(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.
     except (ImportError, OSError) as error:
         raise InputError(f"denoising needs pyoidn, which cannot be loaded here: {error}") from error
     names = {"albedo": "albedo", "normals": "normal"}
-    given: dict[str, Any] = {names[name]: _continued(guide) for name, guide in guides.items()}
-    return _as(pyoidn.denoise(_continued(picture), **given, hdr=True, quality="fast" if fast else "high"), picture)
+    arguments: dict[str, Any] = {names[name]: _continued(guide) for name, guide in guides.items()}
+    return _as(pyoidn.denoise(_continued(picture), **arguments, hdr=True, quality="fast" if fast else "high"), picture)
 
 
 def _optix(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.ndarray:

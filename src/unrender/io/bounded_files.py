@@ -87,12 +87,12 @@ def no_file(path: Path) -> str:
     try:
         if path.exists():
             return "not a file"
-        beside = [
+        neighbours = [
             visible(entry.name) for entry in itertools.islice(path.parent.iterdir(), _MOST_BESIDE) if entry.is_file()
         ]
     except (OSError, ValueError):  # ValueError: a name with a zero byte
-        beside = []
-    return f"no such file{did_you_mean(path.name, beside)}"
+        neighbours = []
+    return f"no such file{did_you_mean(path.name, neighbours)}"
 
 
 # ---------------------------------------------------------------------- bytes and text

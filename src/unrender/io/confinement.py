@@ -28,11 +28,11 @@ def is_outside_allowed() -> bool:
     return os.environ.get(VARIABLE, "0") not in ("", "0")
 
 
-def allow(wanted: bool) -> bool:
+def allow(everything: bool) -> bool:
     """Allow outside files for this process and its children if `wanted`. Returns `wanted`."""
-    if wanted:
+    if everything:
         os.environ[VARIABLE] = "1"
-    return wanted
+    return everything
 
 
 @contextmanager

@@ -79,7 +79,7 @@ def _from_file(path: Path, shape: tuple[int, ...], conversion: FileConversion) -
     if ending in MESH_FILES:
         return _from_mesh(path, shape, conversion), ""
     if ending in (".npy", ".npz"):
-        array = volumes.read_numpy(path, lambda found: _check_shape(found, shape, conversion))
+        array = volumes.read_numpy(path, lambda array_shape: _check_shape(array_shape, shape, conversion))
         return fill(array.reshape(shape) if array.shape == shape[:-1] else array, shape, conversion)
     picture = images.read(path, not conversion.raw)
     if len(shape) != 3:
@@ -113,11 +113,11 @@ def _from_mesh(path: Path, shape: tuple[int, ...], conversion: FileConversion) -
 
 
 def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
-    def check(found: tuple[int, ...]) -> None:
+    def check(grid_shape: tuple[int, ...]) -> None:
         if len(shape) != 4:
             raise InputError(f"a grid cannot fill a parameter of shape {shape}, expected {_expected(shape)}")
-        if found[-1] != shape[-1]:
-            raise InputError(f"a grid of {found[-1]} channels cannot fill a parameter of {shape[-1]}")
+        if grid_shape[-1] != shape[-1]:
+            raise InputError(f"a grid of {grid_shape[-1]} channels cannot fill a parameter of {shape[-1]}")
 
     grid = volumes.read_grid(path, check).values
     if grid.shape == shape:
@@ -126,12 +126,12 @@ def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
     return resampling.resize(grid, shape[:-1]), f"{path.name}: scaled from {sizes[0]} to {sizes[1]} voxels"
 
 
-def _check_shape(found: tuple[int, ...], shape: tuple[int, ...], conversion: FileConversion) -> None:
+def _check_shape(array_shape: tuple[int, ...], shape: tuple[int, ...], conversion: FileConversion) -> None:
     """Raise `InputError` if an array of this shape cannot fill the parameter; called before the array is read."""
-    number, colour = found in ((), (1,)), len(found) == 1 and len(shape) > 1 and found[0] == shape[-1]
-    bare = len(shape) > 1 and shape[-1] == 1 and found == shape[:-1]
-    if not (number or colour or bare or found in (shape, conversion.picture_shape(shape))):
-        raise InputError(f"expected {_expected(shape, conversion)}, got an array of shape {found}")
+    number, colour = array_shape in ((), (1,)), len(array_shape) == 1 and len(shape) > 1 and array_shape[0] == shape[-1]
+    bare = len(shape) > 1 and shape[-1] == 1 and array_shape == shape[:-1]
+    if not (number or colour or bare or array_shape in (shape, conversion.picture_shape(shape))):
+        raise InputError(f"expected {_expected(shape, conversion)}, got an array of shape {array_shape}")
 
 
 def _expected(shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> str:

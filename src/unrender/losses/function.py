@@ -60,11 +60,11 @@ class FunctionLoss:
             parameters = inspect.signature(self.function).parameters.values()
         except (TypeError, ValueError):  # compiled code may have no signature
             return True
-        given = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-        required = [p.name for p in given if p.default is p.empty]
+        positional = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+        required = [p.name for p in positional if p.default is p.empty]
         open_ended = any(p.kind is p.VAR_POSITIONAL for p in parameters)
         named = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
-        if named or len(required) > 2 or not (given or open_ended):
+        if named or len(required) > 2 or not (positional or open_ended):
             names = ", ".join([*required, *named]) or "nothing"
             raise InputError(f"{self!r}: expected a function of (image) or of (image, reference), it takes {names}")
         return len(required) == 2 or (len(required) < 2 and open_ended)

@@ -74,8 +74,8 @@ def psnr(image: np.ndarray, reference: np.ndarray) -> float:
 
     Larger is better.
     """
-    shown, wanted = displayed(image, reference)
-    error = float(np.mean((shown - wanted) ** 2))
+    shown, target = displayed(image, reference)
+    error = float(np.mean((shown - target) ** 2))
     return 10 * math.log10(1 / error) if error > 0 else math.inf
 
 
@@ -86,12 +86,12 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float | None:
     """
     from skimage.metrics import structural_similarity
 
-    shown, wanted = displayed(image, reference)
+    shown, target = displayed(image, reference)
     side = min(_SSIM_WINDOW, *shown.shape[:2])
     if side < 3:
         return None
     window = side if side % 2 else side - 1
-    similarity: Any = structural_similarity(wanted, shown, data_range=1.0, channel_axis=2, win_size=window)
+    similarity: Any = structural_similarity(target, shown, data_range=1.0, channel_axis=2, win_size=window)
     return float(similarity)
 
 
@@ -104,8 +104,8 @@ def flip(image: np.ndarray, reference: np.ndarray) -> float:
         import flip_evaluator
     except ImportError as error:
         raise InputError("metrics: FLIP needs another package: pip install 'unrender[flip]'") from error
-    shown, wanted = (np.ascontiguousarray(x, np.float32) for x in displayed(image, reference))
-    _, mean, _ = flip_evaluator.evaluate(wanted, shown, "LDR", inputsRGB=True, applyMagma=False)
+    shown, target = (np.ascontiguousarray(x, np.float32) for x in displayed(image, reference))
+    _, mean, _ = flip_evaluator.evaluate(target, shown, "LDR", inputsRGB=True, applyMagma=False)
     return float(mean)
 
 

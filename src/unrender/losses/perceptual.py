@@ -87,15 +87,15 @@ class Perceptual:
 
     def value(self, image: Array, reference: Array) -> Array:
         """Return the loss of each image (..., H, W, 3), repeated in all its elements."""
-        seen = arrays.numpy(image)
-        losses, _ = self._compare(seen, arrays.numpy(reference), derivative=False)
-        return arrays.like(np.broadcast_to(losses[..., None, None, None], seen.shape), image)
+        values = arrays.numpy(image)
+        losses, _ = self._compare(values, arrays.numpy(reference), derivative=False)
+        return arrays.like(np.broadcast_to(losses[..., None, None, None], values.shape), image)
 
     def derivative(self, image: Array, reference: Array) -> Array:
         """Return H · W · 3 times the derivative of each image's loss, (..., H, W, 3)."""
-        seen = arrays.numpy(image)
-        _, slope = self._compare(seen, arrays.numpy(reference), derivative=True)
-        return arrays.like(slope * float(np.prod(seen.shape[-3:])), image)
+        values = arrays.numpy(image)
+        _, slope = self._compare(values, arrays.numpy(reference), derivative=True)
+        return arrays.like(slope * float(np.prod(values.shape[-3:])), image)
 
     def _compare(self, image: np.ndarray, reference: np.ndarray, derivative: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return the loss of each image, (...), and its derivative, (..., H, W, 3); zeros if it is not requested."""
@@ -110,10 +110,11 @@ class Perceptual:
         )
         target = torch.from_numpy(np.array(reference.reshape(-1, height, width, 3), network.dtype))
         with torch.no_grad():
-            wanted = network.features(target)
+            target_features = network.features(target)
         with torch.set_grad_enabled(derivative):
             losses: Any = sum(
-                ((a - b) ** 2).mean(dim=(1, 2, 3)) for a, b in zip(network.features(batch), wanted, strict=True)
+                ((a - b) ** 2).mean(dim=(1, 2, 3))
+                for a, b in zip(network.features(batch), target_features, strict=True)
             )
             losses = losses * (self.strength / len(self.layers))
             slope = torch.autograd.grad(losses.sum(), batch)[0] if derivative else torch.zeros_like(batch)

@@ -66,5 +66,5 @@ class PathOptions(SamplingOptions):
     def estimator(self, image: ImageEstimator) -> Estimator:
         """Return the path gradient of the loss at this image estimator's images."""
         sampler = AdaptiveCounts() if self.counts == "adaptive" else All()
-        seen = Denoised(image) if self.denoise else image
-        return PathGradient(seen, sampler, self.spp, self.adjoint_spp, **self.sampling())
+        image_estimator = Denoised(image) if self.denoise else image
+        return PathGradient(image_estimator, sampler, self.spp, self.adjoint_spp, **self.sampling())

@@ -117,8 +117,10 @@ class Method:
 
 def parameterised(problem: Problem) -> tuple[str, ...]:
     """Return a line with the parameterisations of parameters, such as "moved as log (lamp.radiance)"; empty if there are none."""
-    given = {key: u.parameterisation for key, u in problem.unknowns.items() if u.parameterisation is not None}
-    named = {key: type(own).__name__.lower() for key, own in given.items()}
+    parameterisations = {
+        key: u.parameterisation for key, u in problem.unknowns.items() if u.parameterisation is not None
+    }
+    named = {key: type(own).__name__.lower() for key, own in parameterisations.items()}
     return (f"moved as {grouped(named)}",) if named else ()
 
 

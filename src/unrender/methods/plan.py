@@ -81,10 +81,10 @@ class Plan:
         Raises:
             InputError: A component is not described, is of another kind, or does not suit the problem.
         """
-        given = {"estimator": estimator, "optimizer": optimizer}
-        made = {name: given[name] or _component(table.get(name), name, where) for name in _COMPONENTS}
-        for name, asked in zip(_COMPONENTS, ("estimate", "update"), strict=True):
-            if not callable(getattr(made[name], asked, None)):
+        parts = {"estimator": estimator, "optimizer": optimizer}
+        made = {name: parts[name] or _component(table.get(name), name, where) for name in _COMPONENTS}
+        for name, method in zip(_COMPONENTS, ("estimate", "update"), strict=True):
+            if not callable(getattr(made[name], method, None)):
                 raise InputError(f"{where}: {name}: {type(made[name]).__name__} is not an {name}")
         settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in table.get("settings", {}).items()}
         return cls(problem, made["estimator"], made["optimizer"], settings)

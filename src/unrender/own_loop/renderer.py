@@ -107,13 +107,13 @@ class Renderer:
         port, names = open_scene(scene, keys, max_depth)
         single = not isinstance(sensor, Sequence)
         sensors = (sensor,) if single else tuple(sensor)
-        given = () if references is None else (references,) if single else tuple(references)
-        if not sensors or len(set(sensors)) < len(sensors) or (given and len(given) != len(sensors)):
+        targets = () if references is None else (references,) if single else tuple(references)
+        if not sensors or len(set(sensors)) < len(sensors) or (targets and len(targets) != len(sensors)):
             raise InputError(
                 f"Renderer: expected different sensors, each with a reference if any has one, got {sensor!r}"
             )
         options = (image or Plain(), pixels or All(), spp, adjoint_spp, groups, coupled, sensors, single)
-        self._options = Options(names, *options, max_depth or longest_path(port), seed, given, loss)
+        self._options = Options(names, *options, max_depth or longest_path(port), seed, targets, loss)
         self._port, self._scene = port, scene
         self._streams: dict[str, Stream] = {}
         self._step = 0
@@ -134,20 +134,20 @@ class Renderer:
             values: parameters, see the class; None for the scene's.
             sensor: another sensor than the renderer's; each sensor has its own state. Not supported with mini-batches.
         """
-        given, records, images = self._render(values, sensor)
+        inputs, records, images = self._render(values, sensor)
 
         def backward(derivatives: tuple[Any, ...]) -> Tree:
             return self._backward(records, derivatives)
 
-        match given.framework:
+        match inputs.framework:
             case "numpy":
                 attached = images
             case "drjit":
                 from unrender.own_loop import drjit_operation
 
-                attached = drjit_operation.apply(backward, images, self._exchange.attached(given))
+                attached = drjit_operation.apply(backward, images, self._exchange.attached(inputs))
             case "torch":
-                attached = self._with_torch(given, images, backward)
+                attached = self._with_torch(inputs, images, backward)
         return attached[0] if self._alone(sensor) else attached
 
     def render(self, values: Any = None, sensor: int | None = None) -> Any:
@@ -168,13 +168,13 @@ class Renderer:
         if self._last is None:
             raise InputError("Renderer: call render before backward")
         self._check_thread("backward")
-        given, records = self._last
+        inputs, records = self._last
         derivatives = tuple(derivative) if isinstance(derivative, (tuple, list)) else (derivative,)
         if len(derivatives) != len(records):
             raise InputError(
                 f"Renderer: expected {len(records)} derivatives, one for each image, got {len(derivatives)}"
             )
-        return self._exchange.gradient(self._backward(records, derivatives), given)
+        return self._exchange.gradient(self._backward(records, derivatives), inputs)
 
     def preview(self, values: Any = None, spp: int = 64, sensor: int | None = None, seed: int = 0) -> np.ndarray:
         """Return an image (H, W, 3) of `values` in NumPy, rendered plainly with all pixels. The renderer's state is unchanged."""
@@ -190,15 +190,15 @@ class Renderer:
         if self._last is None or (batch := self._last[1][0][1].batch) is None:
             raise InputError("Renderer: there is no mini-batch; it has pixels=All(), or nothing was rendered yet")
         self._check_thread("batch")
-        given = self._last[0]
-        if given.framework == "drjit":
+        inputs = self._last[0]
+        if inputs.framework == "drjit":
             return batch
         on_host = Batch(arrays.numpy(batch.sensors), arrays.numpy(batch.pixels), arrays.numpy(batch.weights))
-        if given.framework == "numpy":
+        if inputs.framework == "numpy":
             return on_host
         import torch  # pyright: ignore[reportMissingImports]
 
-        like = next(value for value in given.values.values() if frameworks.is_torch(value))
+        like = next(value for value in inputs.values.values() if frameworks.is_torch(value))
         indices = [
             torch.from_numpy(part.astype(np.int64)).to(like.device) for part in (on_host.sensors, on_host.pixels)
         ]
@@ -278,8 +278,8 @@ class Renderer:
 
     @exclusive("Renderer")
     def _render(self, values: Any, sensor: int | None) -> tuple[Given, list[tuple[Stream, Rendered]], tuple[Any, ...]]:
-        given = self._exchange.read(values)
-        parameters = self._exchange.tree(given)
+        inputs = self._exchange.read(values)
+        parameters = self._exchange.tree(inputs)
         self._exchange.warn_outside(parameters)
         parameters = off_ends(parameters, self._exchange.known)
         key, records, images = Key(self._options.seed, self._step), [], []
@@ -288,10 +288,10 @@ class Renderer:
             number = 0 if name == _MINI_BATCHES else int(name)
             rendered, image = stream.render(parameters, key.fold(number))
             records.append((stream, rendered))
-            images.append(self._exchange.image(image, given))
+            images.append(self._exchange.image(image, inputs))
         self._step += 1
-        self._last, self._thread = (given.detached(), records), threading.current_thread()
-        return given, records, tuple(images)
+        self._last, self._thread = (inputs.detached(), records), threading.current_thread()
+        return inputs, records, tuple(images)
 
     @exclusive("Renderer")
     def _backward(self, records: list[tuple[Stream, Rendered]], derivatives: Sequence[Any]) -> Tree:
@@ -313,10 +313,10 @@ class Renderer:
                 f"Renderer: {what} in another thread than the last render, to whose image it belongs; use one Renderer per thread"
             )
 
-    def _with_torch(self, given: Given, images: tuple[Any, ...], backward: Callable[..., Tree]) -> tuple[Any, ...]:
+    def _with_torch(self, inputs: Given, images: tuple[Any, ...], backward: Callable[..., Tree]) -> tuple[Any, ...]:
         from unrender.own_loop import torch_operation
 
-        tensors = {key: value for key, value in given.values.items() if frameworks.is_torch(value)}
+        tensors = {key: value for key, value in inputs.values.items() if frameworks.is_torch(value)}
         detached = {key: value.detach() for key, value in tensors.items()}
         device = images[0].device
 

@@ -265,12 +265,12 @@ class Stream:
             start = end
         return parts
 
-    def _batch(self, drawn: MiniBatch, like: Array) -> Batch:
+    def _batch(self, mini_batch: MiniBatch, like: Array) -> Batch:
         resolutions = self.problem.renderer.resolutions()
         sizes = [int(np.prod(resolutions[view.sensor])) for view in self.problem.views]
         total = sum(sizes)
-        if drawn.sample is not None:
-            return Batch(drawn.sample.views, drawn.sample.pixels, drawn.sample.weights / (3.0 * total))
+        if mini_batch.sample is not None:
+            return Batch(mini_batch.sample.views, mini_batch.sample.pixels, mini_batch.sample.weights / (3.0 * total))
         flat = like if self._options.groups == 1 else like[0]
         sensors = arrays.like_integers(np.repeat(np.arange(len(sizes)), sizes), flat)
         pixels = arrays.like_integers(np.concatenate([np.arange(size) for size in sizes]), flat)

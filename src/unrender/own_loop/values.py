@@ -94,15 +94,15 @@ class Exchange:
                 f"it was created for {', '.join(self._keys)}, and would ignore it"
             )
 
-    def tree(self, given: Given) -> Tree:
+    def tree(self, inputs: Given) -> Tree:
         """Return the parameters as arrays of the renderer, detached. Raises `InputError` for a wrong shape."""
-        if given.framework == "drjit" and self._on_device:
+        if inputs.framework == "drjit" and self._on_device:
             from unrender.rendering.mitsuba.tensors import to_tensor
 
-            tree = {key: self._fit(key, self._native(key, value, to_tensor)) for key, value in given.values.items()}
+            tree = {key: self._fit(key, self._native(key, value, to_tensor)) for key, value in inputs.values.items()}
             dr.make_opaque(tree)
             return tree
-        return {key: self._renderer.array(self._host(key, value)) for key, value in given.values.items()}
+        return {key: self._renderer.array(self._host(key, value)) for key, value in inputs.values.items()}
 
     def warn_outside(self, tree: Tree) -> None:
         """Warn once per parameter whose values leave their physical range. An optimizer of the loop knows no bounds."""
@@ -115,7 +115,7 @@ class Exchange:
             text = f"Renderer: {key} is expected to be {limits}, and has values outside: clip it after each step"
             warnings.warn(text, stacklevel=5)
 
-    def attached(self, given: Given) -> Tree:
+    def attached(self, inputs: Given) -> Tree:
         """Return the parameters as Dr.Jit arrays that are still attached to the loop's derivative graph."""
         import mitsuba as mi
 
@@ -127,19 +127,19 @@ class Exchange:
 
         return {
             key: tensor(key, value) if arrays.is_drjit(value) else self._renderer.array(self._host(key, value))
-            for key, value in given.values.items()
+            for key, value in inputs.values.items()
         }
 
-    def image(self, image: Array, given: Given) -> Any:
+    def image(self, image: Array, inputs: Given) -> Any:
         """Convert an image of the renderer to the loop's framework: float32, or float64 if its parameters are."""
-        match given.framework:
+        match inputs.framework:
             case "numpy":
                 return arrays.numpy(image)
             case "drjit":
                 self._check_device()
                 return image
             case "torch":
-                like = next(x for x in given.values.values() if frameworks.is_torch(x))
+                like = next(x for x in inputs.values.values() if frameworks.is_torch(x))
                 return frameworks.to_torch(arrays.numpy(image), like)
 
     def derivative(self, derivative: Any, shape: tuple[int, ...]) -> Array:
@@ -160,16 +160,18 @@ class Exchange:
             _refuse_derivative(values)
         return self._renderer.array(values)
 
-    def gradient(self, gradient: Tree, given: Given) -> dict[str, Any]:
+    def gradient(self, gradient: Tree, inputs: Given) -> dict[str, Any]:
         """Return a gradient as arrays of the loop, each of the type of its parameter."""
-        return {key: self._like(gradient[key], value, given) for key, value in given.values.items()}
+        return {key: self._like(gradient[key], value, inputs) for key, value in inputs.values.items()}
 
-    def _like(self, gradient: Array, value: Any, given: Given) -> Any:
-        match given.framework:
+    def _like(self, gradient: Array, value: Any, inputs: Given) -> Any:
+        match inputs.framework:
             case "numpy":
                 return arrays.numpy(gradient)
             case "torch":
-                like = value if frameworks.is_torch(value) else next(filter(frameworks.is_torch, given.values.values()))
+                like = (
+                    value if frameworks.is_torch(value) else next(filter(frameworks.is_torch, inputs.values.values()))
+                )
                 return frameworks.to_torch(arrays.numpy(gradient), like)
             case "drjit":
                 if not arrays.is_drjit(value):

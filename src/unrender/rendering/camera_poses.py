@@ -147,12 +147,14 @@ class PosedCameras(WithParameter):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        wanted, own = differentiated(keys, derivatives), [key for key in keys if key != POSES]
+        differentiable, own = differentiated(keys, derivatives), [key for key in keys if key != POSES]
         if len(own) == len(keys):
-            return self.inner.prepare(own, space, wanted)
+            return self.inner.prepare(own, space, differentiable)
         cameras = self.corrections.cameras.values()
         poses = [key for camera in cameras for key in (camera.rotation, camera.translation)]
-        inner = self.inner.prepare([*own, *poses], space, wanted - {POSES} | (set(poses) if POSES in wanted else set()))
+        inner = self.inner.prepare(
+            [*own, *poses], space, differentiable - {POSES} | (set(poses) if POSES in differentiable else set())
+        )
         return PosedCamerasSession(self, inner)
 
 

@@ -52,13 +52,13 @@ class Expression:
     text: str | None = None
 
     @classmethod
-    def of(cls, key: str, given: Any) -> Expression:
+    def of(cls, key: str, expression: Any) -> Expression:
         """Return the expression that a user gives: a function, or a text. Raises `KeyedError`."""
-        if isinstance(given, str):
-            return cls(key, parse(key, given), given)
-        if not callable(given):
-            raise KeyedError(key, f"expected a function or a text such as '2 * strength', got {given!r:.60}")
-        return cls(key, given)
+        if isinstance(expression, str):
+            return cls(key, parse(key, expression), expression)
+        if not callable(expression):
+            raise KeyedError(key, f"expected a function or a text such as '2 * strength', got {expression!r:.60}")
+        return cls(key, expression)
 
 
 class _Reads(Mapping[str, Any]):
@@ -129,9 +129,9 @@ class ExpressionRenderer(RendererWrapper):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        wanted = differentiated(keys, derivatives)
-        inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(wanted)))
-        return _ExpressionSession(self, inner, wanted)
+        differentiable = differentiated(keys, derivatives)
+        inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(differentiable)))
+        return _ExpressionSession(self, inner, differentiable)
 
     def expanded(self, keys: Iterable[str]) -> list[str]:
         """Return the parameters of the scene that depend on these."""
@@ -144,9 +144,9 @@ class ExpressionRenderer(RendererWrapper):
     def evaluated(self, values: Mapping[str, Any]) -> Tree:
         """Return the scene's parameters that depend on any of `values`; unknowns that are not among these have their initial values."""
         missing = {name: self.array(x) for name, x in self.unknowns.items() if name not in values}
-        whole, shapes = _Reads({**missing, **values}), self.inner.parameters()
+        reads, shapes = _Reads({**missing, **values}), self.inner.parameters()
         needed = {key for name in values if name in self.unknowns for key in self._targets[name]}
-        return {one.key: _shaped(one, whole, shapes[one.key].shape) for one in self.expressions if one.key in needed}
+        return {one.key: _shaped(one, reads, shapes[one.key].shape) for one in self.expressions if one.key in needed}
 
     def scene_values(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return {key of the scene: value} for values of unknowns and of the scene's parameters."""
@@ -183,12 +183,12 @@ class ExpressionRenderer(RendererWrapper):
         return tuple(reads.names)
 
 
-def with_expressions(renderer: Renderer, given: Mapping[str, Any], unknowns: Mapping[str, Any]) -> Renderer:
+def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknowns: Mapping[str, Any]) -> Renderer:
     """Return the renderer with expressions, or itself where it has those already or there are none.
 
     Args:
         renderer: Renders the scene.
-        given: {key of the scene: function or text}.
+        expressions: {key of the scene: function or text}.
         unknowns: {key: initial value} of all unknowns; those that are parameters of the scene stay so.
 
     Raises:
@@ -197,7 +197,7 @@ def with_expressions(renderer: Renderer, given: Mapping[str, Any], unknowns: Map
     """
     layer = expression_layer(renderer)
     held = {} if layer is None else {one.key: one.text or one.function for one in layer.expressions}
-    if not given or held == dict(given):
+    if not expressions or held == dict(expressions):
         return renderer
     known, starts = renderer.parameters(), dict[str, np.ndarray]()
     for name, value in unknowns.items():
@@ -213,9 +213,9 @@ def with_expressions(renderer: Renderer, given: Mapping[str, Any], unknowns: Map
                 f"{name}: an unknown of expressions needs an initial value: a number, or a list or array of these"
             )
     if not starts:
-        first = next(iter(given))
+        first = next(iter(expressions))
         raise KeyedError(first, "there is no unknown to read; name one that is no parameter of the scene")
-    return ExpressionRenderer(renderer, [Expression.of(key, one) for key, one in given.items()], starts)
+    return ExpressionRenderer(renderer, [Expression.of(key, one) for key, one in expressions.items()], starts)
 
 
 def expression_layer(renderer: Any) -> ExpressionRenderer | None:
@@ -269,9 +269,9 @@ def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:
 class _ExpressionSession(SessionWrapper):
     """Images and derivatives with respect to unknowns that parameters of the scene depend on. See `RenderSession`."""
 
-    def __init__(self, renderer: ExpressionRenderer, inner: RenderSession, wanted: frozenset[str]):
+    def __init__(self, renderer: ExpressionRenderer, inner: RenderSession, differentiable: frozenset[str]):
         super().__init__(inner)
-        self._renderer, self._wanted = renderer, wanted
+        self._renderer, self._wanted = renderer, differentiable
         self._known: list[tuple[Tree, Tree]] = []
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:

@@ -34,8 +34,8 @@ class PartialDerivatives(RendererWrapper):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        wanted = differentiated(keys, derivatives) - self.constant
-        return _PartialSession(self.inner.prepare(keys, space, wanted), self.constant)
+        differentiable = differentiated(keys, derivatives) - self.constant
+        return _PartialSession(self.inner.prepare(keys, space, differentiable), self.constant)
 
 
 class _PartialSession(SessionWrapper):

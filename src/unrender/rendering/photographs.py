@@ -85,20 +85,20 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
         InputError: the keys include the poses, and a sensor cannot be moved; or they include both response and exposure.
     """
     check_response(keys)
-    wanted = [key for key in OF_PHOTOGRAPHS if key in keys]
-    if not wanted:
+    camera_keys = [key for key in OF_PHOTOGRAPHS if key in keys]
+    if not camera_keys:
         return renderer
     rows = sensors_with_rows(renderer)
-    if set(wanted) <= renderer.parameters().keys() and (rows is None or set(rows) >= set(sensors)):
+    if set(camera_keys) <= renderer.parameters().keys() and (rows is None or set(rows) >= set(sensors)):
         return renderer
     wrapped = _without_photographs(renderer)
-    if POSES in wanted:
+    if POSES in camera_keys:
         wrapped = PosedCameras(wrapped, list(sensors))
-    if VIGNETTING in wanted:
+    if VIGNETTING in camera_keys:
         wrapped = VignettedRenderer(wrapped)
-    if EXPOSURE in wanted:
+    if EXPOSURE in camera_keys:
         wrapped = ExposedRenderer(wrapped, sensors)
-    return RespondingRenderer(wrapped) if RESPONSE in wanted else wrapped
+    return RespondingRenderer(wrapped) if RESPONSE in camera_keys else wrapped
 
 
 def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

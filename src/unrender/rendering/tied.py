@@ -160,8 +160,8 @@ class TiedRenderer(RendererWrapper):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        wanted = differentiated(keys, derivatives)
-        inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(wanted)))
+        differentiable = differentiated(keys, derivatives)
+        inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(differentiable)))
         return TiedSession(self, inner)
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:

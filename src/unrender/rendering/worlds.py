@@ -151,12 +151,12 @@ class WorldsRenderer(RendererWrapper):
     def prepare(
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
-        wanted, sessions = differentiated(keys, derivatives), {}
+        differentiable, sessions = differentiated(keys, derivatives), {}
         for renderer in self.renderers:
             known = renderer.parameters()
             own = list(dict.fromkeys([*(key for key in keys if key in known), *self.known_keys(renderer)]))
-            sessions[id(renderer)] = renderer.prepare(own, space, wanted & frozenset(own))
-        return WorldsSession(self, sessions, wanted)
+            sessions[id(renderer)] = renderer.prepare(own, space, differentiable & frozenset(own))
+        return WorldsSession(self, sessions, differentiable)
 
     def known_keys(self, renderer: Renderer) -> list[str]:
         """Return the keys that some world of a renderer gives a value of its own."""
@@ -211,11 +211,11 @@ class WorldsRenderer(RendererWrapper):
         ]
         return candidates[0] if len(candidates) == 1 else None
 
-    def _part(self, request: SampleRequest, asked: np.ndarray, chosen: np.ndarray) -> SampleRequest:
+    def _part(self, request: SampleRequest, numbers: np.ndarray, chosen: np.ndarray) -> SampleRequest:
         pixels, positions = request.pixels, request.positions
-        inner = self._sensor[asked[chosen]]
+        inner = self._sensor[numbers[chosen]]
         sensors = arrays.like_integers(inner, request.sensors) if len(set(inner)) > 1 else None
-        if len(chosen) < len(asked):
+        if len(chosen) < len(numbers):
             index = arrays.like_integers(chosen, request.sensors)
             pixels = arrays.gather(pixels, index)
             positions = index if positions is None else arrays.gather(positions, index)
@@ -242,8 +242,8 @@ class _Part:
 class WorldsSession:
     """Images and derivatives of views of different worlds. See `RenderSession`."""
 
-    def __init__(self, renderer: WorldsRenderer, sessions: Mapping[int, RenderSession], wanted: frozenset[str]):
-        self._renderer, self._sessions, self._wanted = renderer, sessions, wanted
+    def __init__(self, renderer: WorldsRenderer, sessions: Mapping[int, RenderSession], differentiable: frozenset[str]):
+        self._renderer, self._sessions, self._wanted = renderer, sessions, differentiable
         self._known = [{key: renderer.array(x) for key, x in state.values.items()} for state in renderer.states]
         self._keys = [frozenset(state.renderer.parameters()) for state in renderer.states]
         self._own = [state.renderer.values(renderer.known_keys(state.renderer)) for state in renderer.states]

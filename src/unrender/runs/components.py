@@ -52,29 +52,29 @@ def resolve_estimator(problem: Problem, estimator: Any, owner: str = "optimize")
     return estimator
 
 
-def _is_component(given: Any, *members: str) -> bool:
-    return not isinstance(given, type) and all(
-        callable(getattr(type(given), m, None)) or hasattr(given, m) for m in members
+def _is_component(value: Any, *members: str) -> bool:
+    return not isinstance(value, type) and all(
+        callable(getattr(type(value), m, None)) or hasattr(value, m) for m in members
     )
 
 
-def _instead_of_optimizer(given: Any) -> str:
+def _instead_of_optimizer(value: Any) -> str:
     """Return what is wrong with an invalid optimizer, and what is expected."""
     from unrender import optimizers
 
-    kind = given if isinstance(given, type) else type(given)
+    kind = value if isinstance(value, type) else type(value)
     known = {name: getattr(optimizers, name) for name in optimizers.__all__}
     package = kind.__module__.partition(".")[0]
-    if isinstance(given, type) and given in known.values():
-        return f"expected an object, got the class {given.__name__}; write {given.__name__}()"
+    if isinstance(value, type) and value in known.values():
+        return f"expected an object, got the class {value.__name__}; write {value.__name__}()"
     if package in ("mitsuba", "drjit", "torch"):
         owner = {"mitsuba": "Mitsuba", "drjit": "Dr.Jit", "torch": "PyTorch"}[package]
         same = kind.__name__ if kind.__name__ in known else "Adam"
         return f"{owner}'s {kind.__name__} updates parameters of its own; expected unrender.optimizers.{same}(learning_rate=...)"
     expected = "expected one of unrender.optimizers, such as Adam(learning_rate=0.01)"
-    hint = did_you_mean(given, known) if isinstance(given, str) else ""
-    return f"{expected}, got {_shown(given)}{hint}"
+    hint = did_you_mean(value, known) if isinstance(value, str) else ""
+    return f"{expected}, got {_shown(value)}{hint}"
 
 
-def _shown(given: Any) -> str:
-    return f"the class {given.__name__}" if isinstance(given, type) else repr(given)[:80]
+def _shown(value: Any) -> str:
+    return f"the class {value.__name__}" if isinstance(value, type) else repr(value)[:80]

@@ -56,20 +56,20 @@ def plot(result: Result) -> ResultFigure:
     return figure
 
 
-def _draw(axes: Axes, title: str, drawn: dict[str, notebook.Curve]) -> None:
+def _draw(axes: Axes, title: str, curves: dict[str, notebook.Curve]) -> None:
     axes.set_title(title, fontsize=9, loc="left")
     axes.set_xlabel("seconds", fontsize=9)
     axes.tick_params(which="both", labelsize=8)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    for key, (seconds, values) in drawn.items():
+    for key, (seconds, values) in curves.items():
         axes.plot(seconds, values, label=_title(key), linewidth=1.6)
-    finite = [values[np.isfinite(values)] for _, values in drawn.values()]
+    finite = [values[np.isfinite(values)] for _, values in curves.values()]
     if finite and plots.is_logarithmic(np.concatenate(finite)):
         axes.set_yscale("log")
-    if len(drawn) > 1:
+    if len(curves) > 1:
         axes.legend(frameon=False, fontsize=8)
-    if not drawn:
+    if not curves:
         axes.text(0.5, 0.5, "the truth is not known", transform=axes.transAxes, ha="center", fontsize=9, alpha=0.6)
 
 

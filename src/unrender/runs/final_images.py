@@ -179,9 +179,9 @@ def _picture(
     one, other = (
         render(problem, values, view, first, seed + offset, per_pass=per_pass) for offset in (0, _SECOND_HALF)
     )
-    seen = problem.views[view]
-    mask = None if seen.mask is None else np.asarray(seen.mask)
-    return (one + other) / 2, debiased.rmse(one, other, np.asarray(seen.reference), mask)
+    own = problem.views[view]
+    mask = None if own.mask is None else np.asarray(own.mask)
+    return (one + other) / 2, debiased.rmse(one, other, np.asarray(own.reference), mask)
 
 
 def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:

@@ -85,12 +85,12 @@ def check_numbers(
         start: {key: array} at the start.
         seconds: time after which nothing further is started; there is no result then.
     """
-    found = _Numbers.of(problem, values, start)
-    if found is None:
+    numbers = _Numbers.of(problem, values, start)
+    if numbers is None:
         return NumbersCheck()
     until = time.perf_counter() + seconds
     try:
-        return _check(found, until)
+        return _check(numbers, until)
     except (
         InputError,
         np.linalg.LinAlgError,
@@ -225,12 +225,12 @@ class _Numbers:
         batch = {k: np.broadcast_to(x, (count, *x.shape)) for k, x in self.values.items()}
         batch.update({k: x.astype(np.float32) for k, x in self.parts(points).items()})
         session: RenderSession = self.problem.renderer.prepare(list(batch), None, derivatives=False)
-        found = []
+        parts = []
         for view in self.views:
             request = SampleRequest(self.problem.views[view].sensor, self.spp, key.fold(view).uint32())
             images = arrays.numpy(session.image_batch(batch, request)).astype(np.float64)
-            found.append(images.reshape(count, -1, 3) * self._roots(view))
-        return np.concatenate(found, axis=1)
+            parts.append(images.reshape(count, -1, 3) * self._roots(view))
+        return np.concatenate(parts, axis=1)
 
     def references(self) -> np.ndarray:
         """Return the references (P, 3) with the roots of the pixels' weights."""
@@ -265,49 +265,51 @@ class _Numbers:
 
 def _check(numbers: _Numbers, until: float) -> NumbersCheck:
     """Return the lines, or none where there is no time."""
-    key, wanted = Key(0, 0, _STREAM), _SHIFT * numbers.slope()
+    key, change = Key(0, 0, _STREAM), _SHIFT * numbers.slope()
     widths, longest = 0.01 * np.where(numbers.sizes > 0.0, numbers.sizes, 1.0), 0.0
     for index in range(_PASSES + 1):
         started = time.perf_counter()
         if started + longest > until:
             return NumbersCheck()
-        found = numbers.differences(np.diag(widths), key.fold(index))
+        differences = numbers.differences(np.diag(widths), key.fold(index))
         longest = time.perf_counter() - started
         if index < _PASSES:
-            squares, errors = found.squares()
-            changes = np.sqrt(np.maximum(squares, errors) / found.one[0].size)
-            factors = np.clip(wanted / np.maximum(changes, 1e-30), 1.0 / _CHANGES[index], _CHANGES[index])
+            squares, errors = differences.squares()
+            changes = np.sqrt(np.maximum(squares, errors) / differences.one[0].size)
+            factors = np.clip(change / np.maximum(changes, 1e-30), 1.0 / _CHANGES[index], _CHANGES[index])
             widths = np.minimum(factors * widths, numbers.limits)
-    matrix = found.matrix()
+    matrix = differences.matrix()
     if not (np.isfinite(matrix).all() and matrix.any()):
         return NumbersCheck()  # pictures that are not finite, or that no number changes
-    directions, repeats = _directions(found, numbers.limits, wanted), 0
+    directions, repeats = _directions(differences, numbers.limits, change), 0
     residuals = np.zeros((2, *numbers.references().shape))
     while repeats < _REPEATS and (not repeats or time.perf_counter() + 2.0 * longest < until):
         own = key.fold(_PASSES + 1 + repeats)
         more = numbers.differences(directions, own)
-        found = more if repeats == 0 else found.mean(more, repeats)
+        differences = more if repeats == 0 else differences.mean(more, repeats)
         for half in (0, 1):  # as many pictures as for the differences
             for index in range(len(widths)):
                 picture = numbers.pictures(numbers.point[None], own.fold(2 + 2 * index + half))[0]
                 residuals[half] += picture - numbers.references()
         repeats += 1
-    return _judged(numbers, found, residuals / (repeats * len(widths)), widths)
+    return _judged(numbers, differences, residuals / (repeats * len(widths)), widths)
 
 
-def _directions(found: _Differences, limits: np.ndarray, wanted: float) -> np.ndarray:
+def _directions(differences: _Differences, limits: np.ndarray, change: float) -> np.ndarray:
     """Return directions (n, n) along which the pictures change independently and by `wanted`, within the limits."""
-    matrix = found.matrix()
+    matrix = differences.matrix()
     units = np.sqrt(np.maximum(np.diag(matrix), 1e-12 * np.abs(matrix).max())) + 1e-300
     eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
-    lengths = wanted * math.sqrt(found.one[0].size) / np.sqrt(np.maximum(eigenvalues, _WEAKEST * eigenvalues.max()))
-    columns = found.directions @ (vectors * lengths / units[:, None])
+    lengths = (
+        change * math.sqrt(differences.one[0].size) / np.sqrt(np.maximum(eigenvalues, _WEAKEST * eigenvalues.max()))
+    )
+    columns = differences.directions @ (vectors * lengths / units[:, None])
     return columns / np.maximum(np.max(np.abs(columns) / limits[:, None], axis=0), 1.0)
 
 
-def _judged(numbers: _Numbers, found: _Differences, residuals: np.ndarray, widths: np.ndarray) -> NumbersCheck:
+def _judged(numbers: _Numbers, differences: _Differences, residuals: np.ndarray, widths: np.ndarray) -> NumbersCheck:
     """Return the lines from differences along directions and two independent residuals (2, P, 3)."""
-    matrix, (squares, errors) = found.matrix(), found.squares()
+    matrix, (squares, errors) = differences.matrix(), differences.squares()
     # Along these no change is seen: the variance is at least that of the largest change that noise may hide.
     hidden = squares <= _ERRORS * errors
     matrix[hidden, :] = matrix[:, hidden] = 0.0
@@ -315,7 +317,7 @@ def _judged(numbers: _Numbers, found: _Differences, residuals: np.ndarray, width
     np.fill_diagonal(matrix, np.where(hidden, np.maximum(squares, 0.0) + _ERRORS * errors + least, np.diag(matrix)))
     units = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     inverse = np.linalg.pinv(matrix / np.outer(units, units), rcond=1e-6, hermitian=True) / np.outer(units, units)
-    slopes = 0.5 * (found.one + found.other).reshape(len(units), -1)
+    slopes = 0.5 * (differences.one + differences.other).reshape(len(units), -1)
     residual, noise = (0.5 * (residuals[0] + sign * residuals[1]).reshape(-1) for sign in (1.0, -1.0))
     share = math.sqrt(len(numbers.views) / len(numbers.problem.views))
 
@@ -323,27 +325,27 @@ def _judged(numbers: _Numbers, found: _Differences, residuals: np.ndarray, width
         middle = (slopes * of**2) @ slopes.T
         middle[hidden, :] = middle[:, hidden] = 0.0
         middle += np.diag(np.where(hidden, np.mean(of**2) * units**2, 0.0))
-        return share**2 * (found.directions @ inverse @ middle @ inverse @ found.directions.T)
+        return share**2 * (differences.directions @ inverse @ middle @ inverse @ differences.directions.T)
 
     along = -inverse @ np.where(hidden, 0.0, slopes @ residual)
-    whole = covariance(residual + along @ slopes)  # as after the step: a run that ended early leaves more
-    error, own = (np.sqrt(np.maximum(np.diag(x), 0.0)) for x in (whole, covariance(noise)))
+    step_covariance = covariance(residual + along @ slopes)  # as after the step: a run that ended early leaves more
+    error, own = (np.sqrt(np.maximum(np.diag(x), 0.0)) for x in (step_covariance, covariance(noise)))
     spread = np.outer(error, error)
     freedom = residual.size - error.size
     error = error * math.sqrt(residual.size / freedom) if freedom > 0 else np.full(error.size, np.inf)
-    step = numbers.inside((numbers.point + found.directions @ along)[None])[0] - numbers.point
+    step = numbers.inside((numbers.point + differences.directions @ along)[None])[0] - numbers.point
     posed = numbers.rigid | (numbers.sizes <= 0.0)
     sizes = np.where(posed, np.maximum(numbers.sizes, _OF_WIDTHS * widths), numbers.sizes)
-    open_, together = error > _DOUBTFUL * sizes, np.abs(whole) > _TOGETHER * spread
+    open_, together = error > _DOUBTFUL * sizes, np.abs(step_covariance) > _TOGETHER * spread
     further = np.abs(step) > np.maximum(_STEP_ERRORS * np.maximum(error, own), _FURTHER * sizes)
     shown, more = np.minimum(error, sizes), np.where(error > sizes, " or more", "")
     undetermined, unfinished = {}, {}
     for key, of in numbers.places().items():
         if open_[of].any():
             others = [k for k, x in numbers.places().items() if k != key and together[of][open_[of]][:, x].any()]
-            beside = f", together with {listed(others)}" if others else ""
+            together_with = f", together with {listed(others)}" if others else ""
             undetermined[key] = (
-                f"{key}: the references leave it open by ± {_numbers(shown[of])}{max(more[of])}{beside} (standard error with their "
+                f"{key}: the references leave it open by ± {_numbers(shown[of])}{max(more[of])}{together_with} (standard error with their "
                 "noise); fix one of these, add views, or narrow the bounds"
             )
         elif further[of].any() and numbers.problem.loss.linear:

@@ -294,8 +294,8 @@ def _images(run: Run) -> dict[str, np.ndarray]:
     """Return {"view0": (H, W, 3)}, the images at which the loss was evaluated, of the views in the last estimate."""
     info = run.estimate.info if run.estimate is not None else {}
     images = {i: arrays.numpy(image) for i, image in info.get("images", {}).items() if i < _VIEWS}
-    wanted = {i: (*size, 3) for i, size in enumerate(run.problem.sizes)}
-    return {f"view{i}": reduced(image, _PICTURE) for i, image in images.items() if image.shape == wanted.get(i)}
+    shapes = {i: (*size, 3) for i, size in enumerate(run.problem.sizes)}
+    return {f"view{i}": reduced(image, _PICTURE) for i, image in images.items() if image.shape == shapes.get(i)}
 
 
 def _views(run: Run) -> dict[str, np.ndarray]:

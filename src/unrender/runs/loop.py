@@ -82,16 +82,16 @@ class Descent:
         started = time.perf_counter()
         run, state = replace(self.run, warnings=[]), replace(self.state, noise=GradientNoise())
         for _ in range(2):
-            found, state.estimator = run.estimator.estimate(
+            estimate, state.estimator = run.estimator.estimate(
                 run.problem, run.parameters, state.estimator, Key(run.seed, 0, WARM_UP)
             )
-            found = penalized(found, run.problem, run.parameters)
+            estimate = penalized(estimate, run.problem, run.parameters)
             memory.trim_cache(run.parameters)
-            update = _apply(run.problem, found, state.optimizer, run.optimizer, run.parameters)
+            update = _apply(run.problem, estimate, state.optimizer, run.optimizer, run.parameters)
             run.parameters, state.optimizer = update.parameters, update.state
             del update
             memory.evaluate_in_turn(state.optimizer)
-            state.noise.update(found.gradient, found.variance)
+            state.noise.update(estimate.gradient, estimate.variance)
         return time.perf_counter() - started, snapshot(run, state)
 
 
@@ -268,10 +268,10 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
         return _Update(bounded, state, culprit)
     shortened = []
     for key, faces in problem.faces.items():
-        wanted = arrays.numpy(bounded[key])
+        values = arrays.numpy(bounded[key])
         crossing = problem.unknowns[key].given.self_intersection != "prevent"
-        allowed = guarded(arrays.numpy(parameters[key]), wanted, faces, crossing)
-        if allowed is not wanted:
+        allowed = guarded(arrays.numpy(parameters[key]), values, faces, crossing)
+        if allowed is not values:
             bounded[key] = arrays.like(allowed, bounded[key])
             shortened.append(key)
     return _Update(bounded, state, "", tuple(shortened))

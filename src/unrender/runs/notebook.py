@@ -101,7 +101,7 @@ def html(result: Result) -> str:
     seconds, loss = loss_curve(result.history)
     errors = error_curves(result.history, start_errors(result))
     lines = [Line(key, x, y, colour=index) for index, (key, (x, y)) in enumerate(errors.items())]
-    drawn = [
+    charts = [
         chart(error_title(result), lines, "seconds", end),
         chart("Loss, of the steps' samples", [Line("loss", seconds, loss)], "seconds", end) if len(loss) else None,
     ]
@@ -109,7 +109,7 @@ def html(result: Result) -> str:
     return notebook.block(
         f"Result of {result.name}, {_summary(result)}",
         notebook.picture_row(shown_pictures(result)),
-        notebook.charts(drawn),
+        notebook.charts(charts),
         notebook.facts({name: text for name, text in rows.items() if text}),
         notebook.lines(result.warnings, "warning: "),
     )

@@ -114,9 +114,9 @@ def optimize(
 
 
 @contextmanager
-def _progress(wanted: bool | None) -> Iterator[list[Callback]]:
+def _progress(show: bool | None) -> Iterator[list[Callback]]:
     """Yield the callback of the progress bar while it is displayed; none if it is not wanted."""
-    if wanted is False or (wanted is None and not in_notebook()):
+    if show is False or (show is None and not in_notebook()):
         yield []
         return
     from unrender.runs.progress import Progress  # imports rich, which is slow

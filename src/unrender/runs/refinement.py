@@ -59,7 +59,7 @@ def refine(run: Run, state: RunState) -> float:
     """Convert parameters and states to the resolution of the next step. Returns the elapsed seconds."""
     started = time.perf_counter()
     upsampler = Upsampler(run.problem, run.step + run.ahead, run.parameters)
-    modes = {way.states for key, way in run.problem.coarse_to_fine.items() if key in upsampler.shares}
+    modes = {schedule.states for key, schedule in run.problem.coarse_to_fine.items() if key in upsampler.shares}
     carry = {"estimator": "reset" not in modes, "optimizer": modes == {"carry"}}
     run.parameters = upsampler.tree(run.parameters)
     fresh = (

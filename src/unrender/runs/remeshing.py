@@ -31,17 +31,17 @@ def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
     """
     if not isinstance(problem.renderer, Remeshable):
         raise InputError(f"{', '.join(meshes)}: this renderer does not support remeshing")
-    given = [
+    schedules = [
         replace(p, initial=meshes[p.key].vertices.reshape(-1).astype(np.float32)) if p.key in meshes else p
         for p in problem.parameters
     ]
     shapes = {key.rpartition(".")[0]: mesh for key, mesh in meshes.items()}
-    renderer = problem.renderer.with_meshes(shapes, [p.key for p in given])
+    renderer = problem.renderer.with_meshes(shapes, [p.key for p in schedules])
     # Checked views are RGB; films of other formats would misinterpret them.
     plain = all(format_of(renderer, view.sensor).colour == "rgb" for view in problem.views)
     made = Problem(
         renderer,
-        given,
+        schedules,
         problem.views if plain else problem.given_views,
         problem.loss,
         problem.max_depth,

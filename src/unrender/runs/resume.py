@@ -174,23 +174,23 @@ def _sources(stored: StoredRun) -> Iterator[_Source]:
     path = stored.folder / HISTORY
     records, malformed = history.read_records(path, stored.folder) if path.exists() else ([], "")
 
-    def reject(found: Checkpoint) -> str:
-        if found.manifest.step <= history.steps_in(records):
+    def reject(candidate: Checkpoint) -> str:
+        if candidate.manifest.step <= history.steps_in(records):
             return ""
-        reason = f"of step {found.manifest.step}, but {HISTORY} has only {history.steps_in(records)} steps"
+        reason = f"of step {candidate.manifest.step}, but {HISTORY} has only {history.steps_in(records)} steps"
         return reason + (f" ({malformed})" if malformed else "")
 
-    for found, passed_over in checkpoint.candidates(stored.folder, reject):
-        yield _Source(found, records, passed_over)
+    for candidate, passed_over in checkpoint.candidates(stored.folder, reject):
+        yield _Source(candidate, records, passed_over)
 
 
-def _changes(stored: StoredRun, found: Checkpoint | None, fingerprint: dict[str, str]) -> str:
+def _changes(stored: StoredRun, source: Checkpoint | None, fingerprint: dict[str, str]) -> str:
     """Return the changes since the checkpoint was written (or the run started), as phrases on one line."""
-    before = stored.record.problem.fingerprint if found is None else found.manifest.problem
+    before = stored.record.problem.fingerprint if source is None else source.manifest.problem
     changed = [] if before is None else differences(before, fingerprint)
-    if found is not None:
-        changed += differences(found.manifest.versions, deciding_versions())
-        changed += differences({"seed": str(found.manifest.seed)}, {"seed": str(stored.method.seed)})
+    if source is not None:
+        changed += differences(source.manifest.versions, deciding_versions())
+        changed += differences({"seed": str(source.manifest.seed)}, {"seed": str(stored.method.seed)})
     more = f" and {len(changed) - _MOST_SHOWN} more" if len(changed) > _MOST_SHOWN else ""
     return "; ".join(changed[:_MOST_SHOWN]) + more
 
@@ -200,9 +200,9 @@ def _method_settings(record: RunRecord) -> dict[str, Any]:
     return {k: v for k, v in record.settings.items() if k not in ("estimator", "optimizer", "steps", "seconds")}
 
 
-def _check_budget_left(folder: Path, method: Method, found: Checkpoint | None) -> None:
+def _check_budget_left(folder: Path, method: Method, source: Checkpoint | None) -> None:
     """Raise `InputError` if the budget ends before the checkpoint."""
-    done = 0 if found is None else found.manifest.step
+    done = 0 if source is None else source.manifest.step
     if method.steps is not None and method.steps < done:
         raise InputError(
             f"run folder {folder}: {done} steps are done, expected a budget of more, got steps={method.steps}"
@@ -245,13 +245,13 @@ class _Restore(Hook):
 
     def _unpack(
         self,
-        found: Checkpoint,
+        source: Checkpoint,
         fresh: dict[str, Any],
         warm: dict[str, Any],
         shapes: Mapping[str, tuple[int, ...]],
     ) -> dict[str, Any]:
         try:
-            return _unpack(found, fresh, warm, shapes)
+            return _unpack(source, fresh, warm, shapes)
         except _SentOtherwise:
             raise
         except InputError as error:
@@ -259,11 +259,11 @@ class _Restore(Hook):
 
 
 def _unpack(
-    found: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any], full_shapes: Mapping[str, tuple[int, ...]]
+    source: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any], full_shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, Any]:
     """Return the snapshot of a checkpoint, after checking its types and shapes against this run's."""
-    saved = unpack(found.packed, [fresh, warm])
-    where = f"checkpoint of step {found.manifest.step}"
+    saved = unpack(source.packed, [fresh, warm])
+    where = f"checkpoint of step {source.manifest.step}"
     if isinstance(saved, dict) and (_SENT in saved) != (_SENT in fresh):
         words = (
             "whole: resume it without --compress",
@@ -283,10 +283,10 @@ def _unpack(
     for name in SNAPSHOT_COUNTS:
         if not 0 <= saved[name] < float("inf"):
             raise InputError(f"{where}: {name}: expected a number of at least 0, got {saved[name]}")
-    if saved.get(_AHEAD, 0) != _ahead(found):
+    if saved.get(_AHEAD, 0) != _ahead(source):
         raise InputError(f"{where}: {_AHEAD}: expected a number of steps, got {saved[_AHEAD]!r:.60}")
-    if saved["step"] != found.manifest.step:
-        raise InputError(f"{where}: step: expected {found.manifest.step}, got {saved['step']}")
+    if saved["step"] != source.manifest.step:
+        raise InputError(f"{where}: step: expected {source.manifest.step}, got {saved['step']}")
     expected = trees.shapes(fresh["parameters"])
     if trees.shapes(saved["parameters"]) != expected:
         raise InputError(f"{where}: parameters: expected shapes {expected}, got {trees.shapes(saved['parameters'])}")
@@ -302,22 +302,22 @@ def _unpack(
     return saved
 
 
-def _ahead(found: Checkpoint) -> int:
+def _ahead(source: Checkpoint) -> int:
     """Return how many steps resolutions are ahead of their schedule, before the state is restored, whose shapes depend on it."""
-    match found.packed.skeleton:
+    match source.packed.skeleton:
         case {"dict": list(pairs)}:
             number = next((pair[1] for pair in pairs if isinstance(pair, list) and pair[:1] == [_AHEAD]), 0)
             return number if type(number) is int and 0 <= number < NEVER else 0
     return 0
 
 
-def _check_candidate(found: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
+def _check_candidate(candidate: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
     """Raise `InputError` unless it is a `Candidate` of parameters with these shapes."""
-    if not isinstance(found, dict) or found.keys() != {"step", "loss", "parameters"}:
-        raise InputError(f"{where}: expected step, loss and parameters, got {repr(found)[:60]}")
-    if not all(isinstance(found[name], (int, float)) for name in ("step", "loss")):
-        raise InputError(f"{where}: expected numbers, got {found['step']!r:.20} and {found['loss']!r:.20}")
-    values = found["parameters"]
+    if not isinstance(candidate, dict) or candidate.keys() != {"step", "loss", "parameters"}:
+        raise InputError(f"{where}: expected step, loss and parameters, got {repr(candidate)[:60]}")
+    if not all(isinstance(candidate[name], (int, float)) for name in ("step", "loss")):
+        raise InputError(f"{where}: expected numbers, got {candidate['step']!r:.20} and {candidate['loss']!r:.20}")
+    values = candidate["parameters"]
     if not isinstance(values, dict) or not all(isinstance(x, np.ndarray) for x in values.values()):
         raise InputError(f"{where}: expected arrays, got {repr(values)[:60]}")
     if {key: x.shape for key, x in values.items()} != shapes:

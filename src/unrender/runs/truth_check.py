@@ -103,8 +103,8 @@ def _noise(problem: Problem, key: str, sensitivity: np.ndarray, where: np.ndarra
 
     Few probes make single sensitivities uncertain, so all elements get the standard error of their mean square.
     """
-    seen = sensitivity if where is None else sensitivity[where]
-    square = float(np.mean(np.square(seen, dtype=np.float64))) if seen.size else 0.0
+    visible = sensitivity if where is None else sensitivity[where]
+    square = float(np.mean(np.square(visible, dtype=np.float64))) if visible.size else 0.0
     if not (square > 0.0 and math.isfinite(residual)):
         return 0.0
     known = np.asarray(problem.truth[key])

@@ -200,8 +200,8 @@ class FreshPictures:
         if not self.sampled:
             return pseudo
         # The parts are the sampling units: pairs of pixels, or views.
-        drawn = 1 if frame.view is not None else pseudo.shape[1] // 2
-        return pseudo.reshape(len(pseudo), drawn, -1).sum(axis=2)
+        divisor = 1 if frame.view is not None else pseudo.shape[1] // 2
+        return pseudo.reshape(len(pseudo), divisor, -1).sum(axis=2)
 
     def _values(self, frame: _Frame, image: np.ndarray) -> np.ndarray:
         problem, array = self._problem, self._problem.renderer.array
@@ -240,10 +240,10 @@ def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], boo
 
 def _full_view(problem: Problem, view: int) -> _Frame:
     height, width = problem.sizes[view]
-    seen = problem.views[view]
-    reference = np.asarray(seen.reference, np.float32).reshape(-1, 3)
-    mask = np.ones((height, width)) if seen.mask is None else np.asarray(seen.mask)
-    factors = mask.reshape(-1, 1) * (seen.weight / reference.size)
+    own = problem.views[view]
+    reference = np.asarray(own.reference, np.float32).reshape(-1, 3)
+    mask = np.ones((height, width)) if own.mask is None else np.asarray(own.mask)
+    factors = mask.reshape(-1, 1) * (own.weight / reference.size)
     return _Frame(view, np.full(height * width, view), np.arange(height * width), reference, factors)
 
 

@@ -26,17 +26,17 @@ _CLEARANCE = 0.01
 """Distance to a singular value that bounds keep, relative to that value; at most half of the initial distance."""
 
 
-def check_bounds(given: Any, info: ParameterInfo, start: np.ndarray) -> tuple[Bounds, str]:
+def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[Bounds, str]:
     """Return the bounds of a parameter, and a notice of how they were narrowed; "" if they were not.
 
     Args:
-        given: (low, high), where either may be None or infinite; None for the physical range.
+        bounds: (low, high), where either may be None or infinite; None for the physical range.
         info: the renderer's description of the parameter.
         start: initial values, which determine the side of a singular value.
     Raises:
         InputError: the bounds are malformed, or the initial values are at a singular value or on both sides of it.
     """
-    low, high = (info.lowest, info.highest) if given is None else _read(given)
+    low, high = (info.lowest, info.highest) if bounds is None else _read(bounds)
     if info.singular is None or not (_below(low, info.singular) and _below(info.singular, high)):
         return (low, high), ""
     singular = info.singular
@@ -46,7 +46,7 @@ def check_bounds(given: Any, info: ParameterInfo, start: np.ndarray) -> tuple[Bo
         )
     gap = min(_CLEARANCE * abs(singular), float(np.min(np.abs(start - singular), initial=np.inf)) / 2)
     side = (singular + gap, high) if start.flat[0] > singular else (low, singular - gap)
-    if given is None:
+    if bounds is None:
         return side, ""
     shown = ", ".join("open" if end is None else f"{end:g}" for end in side)
     return side, f"bounds narrowed to [{shown}]: images are singular at {singular:g}"
@@ -116,9 +116,9 @@ def off_ends(values: Tree, known: Mapping[str, ParameterInfo]) -> Tree:
 
     Gradients are wrong at an end: no light comes back from a black surface, and no path takes a lobe of probability 0.
     """
-    found = {key: _off_ends(x, known[key].lowest, known[key].highest) for key, x in values.items()}
-    arrays.evaluate(found)
-    return found
+    moved = {key: _off_ends(x, known[key].lowest, known[key].highest) for key, x in values.items()}
+    arrays.evaluate(moved)
+    return moved
 
 
 def _off_ends(x: Array, low: float | None, high: float | None) -> Array:
@@ -130,13 +130,13 @@ def _off_ends(x: Array, low: float | None, high: float | None) -> Array:
     return x
 
 
-def _read(given: Any) -> Bounds:
-    if isinstance(given, (str, bytes)) or not isinstance(given, Sequence) or len(given) != 2:
-        raise InputError(f"expected (low, high), either may be None, got {given!r}")
-    for side in given:
+def _read(bounds: Any) -> Bounds:
+    if isinstance(bounds, (str, bytes)) or not isinstance(bounds, Sequence) or len(bounds) != 2:
+        raise InputError(f"expected (low, high), either may be None, got {bounds!r}")
+    for side in bounds:
         if side is not None and (isinstance(side, bool) or not isinstance(side, (int, float)) or math.isnan(side)):
             raise InputError(f"expected two numbers or None, got {side!r}")
-    low, high = (None if side is None else float(side) for side in given)
+    low, high = (None if side is None else float(side) for side in bounds)
     if low == math.inf or high == -math.inf:
         raise InputError(f"low must be less than high, got {low} and {high}")
     low, high = None if low == -math.inf else low, None if high == math.inf else high

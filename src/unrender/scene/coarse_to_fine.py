@@ -80,18 +80,18 @@ class CoarseToFine:
         return resampling.upsample(values, shape[:-1], wrap)
 
 
-def checked_steps(owner: str, given: Any) -> tuple[int, ...]:
+def checked_steps(owner: str, values: Any) -> tuple[int, ...]:
     """Return the steps at which something changes, after checking them. Raises `InputError`."""
-    steps = tuple(given) if isinstance(given, (list, tuple)) else ()
+    steps = tuple(values) if isinstance(values, (list, tuple)) else ()
     if not steps or not all(type(step) is int and step >= 1 for step in steps) or list(steps) != sorted(set(steps)):
         what = "whole numbers of at least 1 that ascend, such as [200, 400]"
-        raise InputError(f"{owner}: steps must be {what}, got {given!r:.80}")
+        raise InputError(f"{owner}: steps must be {what}, got {values!r:.80}")
     return steps
 
 
-def of(given: Any) -> CoarseToFine:
+def of(value: Any) -> CoarseToFine:
     """Return the resolutions of a parameter from an instance, a list of steps or a table of options. Raises `InputError`."""
-    if isinstance(given, CoarseToFine):
-        return given
-    table = dict(given) if isinstance(given, Mapping) else {"steps": given}
+    if isinstance(value, CoarseToFine):
+        return value
+    table = dict(value) if isinstance(value, Mapping) else {"steps": value}
     return tables.build(CoarseToFine, table)

@@ -22,38 +22,38 @@ _Mesh = tuple[np.ndarray, np.ndarray]
 _SELF_INTERSECTIONS = ("warn", "prevent", "ignore")
 
 
-def check_regularizer(given: Any, mesh: _Mesh | None) -> MeshRegularizer | None:
+def check_regularizer(value: Any, mesh: _Mesh | None) -> MeshRegularizer | None:
     """Return a regularizer bound to the mesh, (positions, faces); None for none. Raises `InputError`."""
-    if given is None:
+    if value is None:
         return None
-    regularizer = tables.options(MeshRegularizer, given, "{ bilaplacian = 0.001 }")
+    regularizer = tables.options(MeshRegularizer, value, "{ bilaplacian = 0.001 }")
     if mesh is None:
         raise InputError(_NO_MESH)
     return regularizer.on_mesh(*mesh)
 
 
-def check_remeshing(given: Any, mesh: _Mesh | None, uv: Callable[[], np.ndarray | None]) -> Remeshing | None:
+def check_remeshing(value: Any, mesh: _Mesh | None, uv: Callable[[], np.ndarray | None]) -> Remeshing | None:
     """Return the remeshing of a mesh; None for none. Raises `InputError` if it does not suit the mesh.
 
     Args:
-        given: the user's setting.
+        value: the user's setting.
         mesh: (positions, faces); None if the parameter is not the vertex positions of a mesh.
         uv: function that returns the texture coordinates, or None if there are none.
     """
-    if given is None:
+    if value is None:
         return None
     if mesh is None:
         raise InputError(_NO_MESH)
-    setting = remeshing.of(given)
+    setting = remeshing.of(value)
     setting.check(*mesh, uv())
     return setting
 
 
-def check_self_intersection(given: Any, mesh: _Mesh | None) -> None:
+def check_self_intersection(choice: Any, mesh: _Mesh | None) -> None:
     """Raise `InputError` for an invalid treatment of self-intersections; see `Parameter`."""
-    if given not in _SELF_INTERSECTIONS:
-        raise InputError(f'expected "warn", "prevent" or "ignore", got {given!r}')
-    if given != "warn" and mesh is None:
+    if choice not in _SELF_INTERSECTIONS:
+        raise InputError(f'expected "warn", "prevent" or "ignore", got {choice!r}')
+    if choice != "warn" and mesh is None:
         raise InputError(_NO_MESH)
 
 

@@ -242,9 +242,9 @@ def _palette(palette: Any, channels: int) -> np.ndarray:
     return colours
 
 
-def _numbers(name: str, given: Any) -> np.ndarray:
+def _numbers(name: str, value: Any) -> np.ndarray:
     try:
-        values = np.asarray(given, np.float64)
+        values = np.asarray(value, np.float64)
     except (TypeError, ValueError):
         values = np.full(1, np.nan)
     if not np.isfinite(values).all():

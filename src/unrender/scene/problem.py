@@ -130,14 +130,14 @@ class Problem(ViewLosses):
     ):
         check_max_depth(max_depth)
         checked_loss = check_loss(L2() if loss is None else loss)
-        given: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
+        checked_parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
         given_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
-        renderer, located = _opened(scene, max_depth, given, given_views, expressions or {})
-        unknowns = _unknowns(given, renderer, truth or {}, surfaces or {})
+        renderer, located = _opened(scene, max_depth, checked_parameters, given_views, expressions or {})
+        unknowns = _unknowns(checked_parameters, renderer, truth or {}, surfaces or {})
         checked_views, view_notices = check_views(located, renderer, checked_loss)
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))
-        told = [line for unknown in unknowns.values() for line in unknown.notices]
+        unknown_notices = [line for unknown in unknowns.values() for line in unknown.notices]
         vars(self).update(
             renderer=renderer,
             unknowns=unknowns,
@@ -147,7 +147,7 @@ class Problem(ViewLosses):
             max_depth=max_depth or longest_path(renderer),
             name=name or (path.stem if path else "problem"),
             origin={"scene": str(path.resolve())} if path and are_storable(renderer) else {},
-            notices=[*renderer_notices(renderer), *told, *view_notices],
+            notices=[*renderer_notices(renderer), *unknown_notices, *view_notices],
             references=References(checked_views, renderer.array),
             executor=LOCAL,
             remeshed_from=None,
@@ -176,11 +176,13 @@ class Problem(ViewLosses):
         Truths and true surfaces stay for parameters that are still unknown. `origin` keeps only the scene's file. Raises `InputError` as
         `Problem` does.
         """
-        given = self.parameters if parameters is None else check_sequence(parameters, Parameter, "parameters")
-        keys = {parameter.key for parameter in given if isinstance(parameter.key, str)}
+        checked_parameters = (
+            self.parameters if parameters is None else check_sequence(parameters, Parameter, "parameters")
+        )
+        keys = {parameter.key for parameter in checked_parameters if isinstance(parameter.key, str)}
         made = Problem(
             self.renderer,
-            given,
+            checked_parameters,
             self.given_views if views is None else views,
             self.loss if loss is None else loss,
             self.max_depth,

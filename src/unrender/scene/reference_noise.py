@@ -34,8 +34,8 @@ def standard_deviation(reference: np.ndarray, mask: np.ndarray | None = None) ->
     size = math.sqrt(float(np.mean(picture[seen] ** 2))) if seen.any() else 0.0
     both = seen[1:, 1:] & seen[:-1, 1:] & seen[1:, :-1] & seen[:-1, :-1]
     twice = 0.5 * (picture[1:, 1:] - picture[:-1, 1:] - picture[1:, :-1] + picture[:-1, :-1])[both]
-    found = float(np.median(np.abs(twice))) / _MEDIAN if twice.size else 0.0
-    return max(found, _LEAST * size, 1e-12)
+    deviation = float(np.median(np.abs(twice))) / _MEDIAN if twice.size else 0.0
+    return max(deviation, _LEAST * size, 1e-12)
 
 
 def likelihood_scale(problem: Problem) -> float:

@@ -86,15 +86,15 @@ class Remeshing:
         return ReplacedMesh(np.asarray(vertices, np.float64), np.asarray(made, np.int64))
 
 
-def of(given: Any) -> Remeshing:
+def of(value: Any) -> Remeshing:
     """Return the remeshing of a parameter from an instance, a list of steps or a table of options. Raises `InputError`."""
-    if isinstance(given, Remeshing):
-        return given
-    if not isinstance(given, (Mapping, Sequence)) or isinstance(given, str):
+    if isinstance(value, Remeshing):
+        return value
+    if not isinstance(value, (Mapping, Sequence)) or isinstance(value, str):
         raise InputError(
-            f"expected steps such as [100, 200], or a table such as {{ steps = [100] }}, got {given!r:.60}"
+            f"expected steps such as [100, 200], or a table such as {{ steps = [100] }}, got {value!r:.60}"
         )
-    return tables.build(Remeshing, dict(given) if isinstance(given, Mapping) else {"steps": given})
+    return tables.build(Remeshing, dict(value) if isinstance(value, Mapping) else {"steps": value})
 
 
 def _check_size(faces: int) -> None:

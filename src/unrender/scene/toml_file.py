@@ -203,9 +203,13 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         except InputError as error:
             raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
-    given = {"parameterisation": model.parameterisation, "regularizer": model.regularizer, "remeshing": model.remeshing}
-    given |= {"prior": model.prior, "self_intersection": model.self_intersection, "keys": model.keys}
-    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, resolutions, **given)
+    fields = {
+        "parameterisation": model.parameterisation,
+        "regularizer": model.regularizer,
+        "remeshing": model.remeshing,
+    }
+    fields |= {"prior": model.prior, "self_intersection": model.self_intersection, "keys": model.keys}
+    return Parameter(model.key, start, model.bounds, model.learning_rate, preconditioner, resolutions, **fields)
 
 
 def _value(value: Any, folder: Path) -> Any:

@@ -66,8 +66,8 @@ def check_max_depth(max_depth: Any) -> None:
         return
     if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
         hint = "; for Mitsuba's -1 (no limit) use a large number such as 64" if max_depth == -1 else ""
-        given = shorten(repr(max_depth), 60)
-        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {given}{hint}")
+        shown = shorten(repr(max_depth), 60)
+        raise FieldError(("max_depth",), f"expected a whole number of at least 1, got {shown}{hint}")
     if max_depth > _DEEPEST:
         raise FieldError(("max_depth",), f"expected at most {_DEEPEST}, got {shorten(hex(max_depth), 60)}")
 
@@ -158,8 +158,8 @@ def check_parameter(
     )
 
 
-def _bound_prior(given: Any, info: ParameterInfo, initial: np.ndarray) -> Prior:
-    return tables.options(Prior, given, "{ smoothness = 0.05 }").on(
+def _bound_prior(prior: Any, info: ParameterInfo, initial: np.ndarray) -> Prior:
+    return tables.options(Prior, prior, "{ smoothness = 0.05 }").on(
         initial, info.conversion.repeated, mesh_topology(info), info.welded
     )
 
@@ -203,23 +203,31 @@ def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> Paramete
     return info
 
 
-def _at_bounds(key: str, given: Any, transform: Transform | None, initial: np.ndarray, bounds: Bounds) -> list[str]:
+def _at_bounds(
+    key: str, parameterisation: Any, transform: Transform | None, initial: np.ndarray, bounds: Bounds
+) -> list[str]:
     """Return a notice if values start on a bound that a parameterisation leaves slowly; else an empty list."""
     count = 0 if transform is None else int(np.sum(project(initial, *bounds, open_scale(initial)) != initial))
-    slowly = f"at a bound, which {type(given).__name__.lower()} leaves slowly"
+    slowly = f"at a bound, which {type(parameterisation).__name__.lower()} leaves slowly"
     return [f"parameter {key}: {count} of {initial.size} initial values are {slowly}"] if count else []
 
 
 def _check_parameterisation(
-    given: Any, bounds: Bounds, initial: np.ndarray
+    parameterisation: Any, bounds: Bounds, initial: np.ndarray
 ) -> tuple[Parameterisation, Transform | None]:
     """Return a parameterisation, made from its name or table, and its φ. Raises `InputError`."""
     try:
-        made = tables.component(given, "parameterisation") if isinstance(given, (str, Mapping)) else given
+        made = (
+            tables.component(parameterisation, "parameterisation")
+            if isinstance(parameterisation, (str, Mapping))
+            else parameterisation
+        )
     except InputError as error:
         raise InputError(str(error).removeprefix("parameterisation: ")) from error
     if isinstance(made, type) or not isinstance(made, _Parameterisation):
-        raise InputError(f"expected one of unrender.parameterisations, or its name, got {shorten(repr(given), 60)}")
+        raise InputError(
+            f"expected one of unrender.parameterisations, or its name, got {shorten(repr(parameterisation), 60)}"
+        )
     return made, made.transform(bounds, initial)
 
 
@@ -351,11 +359,11 @@ def renderer_notices(renderer: Renderer) -> Sequence[str]:
     return renderer.notices if isinstance(renderer, _Noticing) else ()
 
 
-def check_sequence(given: Any, kind: type, name: str) -> tuple[Any, ...]:
+def check_sequence(values: Any, kind: type, name: str) -> tuple[Any, ...]:
     """Return a tuple of at least one `kind`. Raises `FieldError`."""
-    items = (given,) if isinstance(given, kind) else given
+    items = (values,) if isinstance(values, kind) else values
     if isinstance(items, (str, bytes, Mapping)) or not isinstance(items, Sequence):
-        raise FieldError((name,), f"expected a list of {kind.__name__}, got {type(given).__name__}")
+        raise FieldError((name,), f"expected a list of {kind.__name__}, got {type(values).__name__}")
     if not items:
         raise FieldError((name,), f"expected at least one {kind.__name__}, got none")
     for index, item in enumerate(items):

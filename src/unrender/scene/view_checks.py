@@ -145,18 +145,18 @@ _WHITE = 0.001
 """Fraction of saturated pixels from which a notice is given."""
 
 
-def check_views(given: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[tuple[View, ...], list[str]]:
+def check_views(views: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[tuple[View, ...], list[str]]:
     """Return the views with their images, in memory or in a file if they are large, and notices. Raises `FieldError`.
 
     Args:
-        given: views as passed to the problem.
+        views: views as passed to the problem.
         renderer: renderer whose films give sizes and formats.
         loss: loss; one that handles saturated pixels needs no notice of them.
     """
     checked, notices, resolutions = [], [], renderer.resolutions()
-    known = [v.sensor for v in given if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
+    known = [v.sensor for v in views if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
     store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
-    for number, one in enumerate(given):
+    for number, one in enumerate(views):
         view, notes = _check_view(number, one, resolutions, renderer, not isinstance(loss, Censored))
         checked.append(view if store is None else _stored(view, store))
         notices += notes

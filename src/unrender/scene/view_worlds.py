@@ -98,12 +98,12 @@ def _with_aov(index: int, name: Any, own: Renderer) -> Renderer:
     raise FieldError(place, "this renderer has radiance only; leave it out", owner)
 
 
-def _values(index: int, given: Any, known: Mapping[str, ParameterInfo]) -> dict[str, np.ndarray]:
+def _values(index: int, known_values: Any, known: Mapping[str, ParameterInfo]) -> dict[str, np.ndarray]:
     place, owner = ("views", index, "with"), f"view {index}: known"
-    if not isinstance(given, Mapping):
-        raise FieldError(place, f"expected a table of values by key, got {given!r:.60}", owner)
-    found = {}
-    for key, value in given.items():
+    if not isinstance(known_values, Mapping):
+        raise FieldError(place, f"expected a table of values by key, got {known_values!r:.60}", owner)
+    values = {}
+    for key, value in known_values.items():
         if key not in known:
             raise FieldError(place, f"the scene has no parameter {key}{did_you_mean(str(key), known)}", owner)
         info = known[key]
@@ -119,5 +119,5 @@ def _values(index: int, given: Any, known: Mapping[str, ParameterInfo]) -> dict[
                 f"{key}: expected {' and '.join(checks.limits(info.lowest, info.highest))}, got {value!r:.60}",
                 owner,
             )
-        found[key] = np.asarray(filled, np.float32)
-    return found
+        values[key] = np.asarray(filled, np.float32)
+    return values

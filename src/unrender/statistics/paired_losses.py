@@ -58,17 +58,17 @@ def leave_one_out(images: np.ndarray) -> np.ndarray:
     return (images.mean(axis=0) * count - images) / (count - 1)
 
 
-def pseudo_values(whole: np.ndarray, left_out: np.ndarray) -> np.ndarray:
+def pseudo_values(losses: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """Return the jackknife pseudo-values (K, N) of N losses.
 
     Their mean over K is the loss without the bias from image noise: exactly for a quadratic loss, to second order otherwise.
 
     Args:
-        whole: losses at the mean of K images, (N,).
+        losses: losses at the mean of K images, (N,).
         left_out: losses at the mean of all images but one, (K, N).
     """
     count = len(left_out)
-    return count * whole - (count - 1) * left_out
+    return count * losses - (count - 1) * left_out
 
 
 def mean_and_error(pseudo: np.ndarray) -> tuple[float, float]:

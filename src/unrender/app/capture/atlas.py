@@ -49,13 +49,13 @@ def unwrap(mesh: Mesh, resolution: int, seconds: float = SECONDS, command: tuple
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     with tempfile.TemporaryDirectory(prefix="unrender-atlas-") as folder:
-        given, made = Path(folder, "mesh.npz"), Path(folder, "atlas.npz")
+        mesh_file, made = Path(folder, "mesh.npz"), Path(folder, "atlas.npz")
         local = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
-        np.savez(given, vertices=local, faces=mesh.faces.astype(np.uint32), resolution=resolution)
+        np.savez(mesh_file, vertices=local, faces=mesh.faces.astype(np.uint32), resolution=resolution)
         try:
             # Python searches the current directory for modules first, which may be untrusted.
             done = subprocess.run(
-                [*command, str(given), str(made)],
+                [*command, str(mesh_file), str(made)],
                 timeout=seconds,
                 capture_output=True,
                 check=False,
@@ -82,10 +82,10 @@ def _environment() -> dict[str, str]:
     return environment
 
 
-def _main(given: str, made: str) -> None:
+def _main(mesh_file: str, made: str) -> None:
     import xatlas  # pyright: ignore[reportMissingImports]
 
-    with np.load(given, allow_pickle=False) as mesh:
+    with np.load(mesh_file, allow_pickle=False) as mesh:
         vertices, faces, resolution = mesh["vertices"], mesh["faces"], int(mesh["resolution"])
     packing = xatlas.PackOptions()
     packing.resolution, packing.padding, packing.bilinear = resolution, _PADDING, True
@@ -94,10 +94,10 @@ def _main(given: str, made: str) -> None:
     atlas.generate(pack_options=packing)
     if atlas.atlas_count != 1:
         raise SystemExit(f"its charts fill {atlas.atlas_count} atlases")
-    of, kept, uv = atlas.get_mesh(0)
+    of, faces_of_atlas, uv = atlas.get_mesh(0)
     # xatlas treats the resolution as a hint: the atlas is slightly larger, and not square.
     uv = uv * np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)
-    np.savez(made, of=of, faces=kept, uv=uv.astype(np.float32))
+    np.savez(made, of=of, faces=faces_of_atlas, uv=uv.astype(np.float32))
 
 
 if __name__ == "__main__":

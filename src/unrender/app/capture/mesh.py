@@ -129,10 +129,10 @@ def read(path: Path) -> Mesh:
     vertices = np.array(mesh_layout.vertex_positions(loaded), float).reshape(-1, 3)
     faces = np.array(parameters[mesh_layout.FACES], np.int64).reshape(-1, 3)
     uv = np.array(parameters[mesh_layout.TEXCOORDS], float).reshape(-1, 2)
-    given = np.array(parameters[mesh_layout.NORMALS], float).reshape(-1, 3)
+    vertex_normals = np.array(parameters[mesh_layout.NORMALS], float).reshape(-1, 3)
     if not len(faces) or not np.isfinite(vertices).all() or not np.ptp(vertices, axis=0).max() > 0:
         raise InputError(f"--mesh {path}: expected triangles with some extent and finite vertices")
-    return Mesh(vertices, faces, uv if len(uv) else None, given if len(given) else None)
+    return Mesh(vertices, faces, uv if len(uv) else None, vertex_normals if len(vertex_normals) else None)
 
 
 def ply(mesh: Mesh) -> bytes:

@@ -106,10 +106,12 @@ def prepare(capture: LitCapture, resolution: int, scale: float | None, hold_out:
         resampled.append(resample.apply(read)[0])
     mask = np.ones(resampled[0].shape[:2], np.float32)
     if capture.mask is not None:
-        given = pictures.read_mask(capture.mask)
-        if given.shape != (height, width):
-            raise InputError(f"{capture.mask}: {given.shape[1]} x {given.shape[0]} pixels, expected {width} x {height}")
-        mask = np.clip(resample.apply(given[..., None])[0][..., 0], 0, 1)
+        picture = pictures.read_mask(capture.mask)
+        if picture.shape != (height, width):
+            raise InputError(
+                f"{capture.mask}: {picture.shape[1]} x {picture.shape[0]} pixels, expected {width} x {height}"
+            )
+        mask = np.clip(resample.apply(picture[..., None])[0][..., 0], 0, 1)
         if not (mask > 0.999).any():
             raise InputError(f"{capture.mask}: empty (black); expected white on the object")
     count = len(resampled)

@@ -52,8 +52,8 @@ def light_turns(poses: np.ndarray) -> np.ndarray:
 def stands_still(views: CapturedViews) -> bool:
     """Return whether the background is equal in photographs whose poses differ by more than 20 degrees, all from one elevation."""
     poses = np.array([view.camera_to_world for view in views])
-    seen = poses[:, :3, :3].transpose(0, 2, 1) @ axis(poses)
-    return float(np.linalg.norm(seen.mean(0))) > _LEVEL and likeness(views) > _LIKENESS
+    axes = poses[:, :3, :3].transpose(0, 2, 1) @ axis(poses)
+    return float(np.linalg.norm(axes.mean(0))) > _LEVEL and likeness(views) > _LIKENESS
 
 
 def likeness(views: CapturedViews) -> float:

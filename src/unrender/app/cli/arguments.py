@@ -254,11 +254,11 @@ def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float 
     return (DEFAULT_STEPS if steps is None and seconds is None else steps), seconds
 
 
-def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Path:
+def folder(out: Path | None, default: str, overwrite: bool, *marks: str) -> Path:
     """Return the output folder, created now so that an invalid location is reported before hours of work.
 
     Args:
-        given: folder that the user chose, or None for a new folder in out/.
+        out: folder that the user chose, or None for a new folder in out/.
         default: its name there; a number is appended if it exists.
         overwrite: whether a folder with earlier results may be written to.
         marks: patterns of files that identify earlier results.
@@ -266,29 +266,29 @@ def folder(given: Path | None, default: str, overwrite: bool, *marks: str) -> Pa
     Raises:
         InputError: a file, a folder with other contents, earlier results without `overwrite`, or not writable.
     """
-    if given is None:
+    if out is None:
         name = re.sub(r"[^\w.-]+", "-", default).strip(".-") or "run"
         number = 1
-        given = Path("out", name)
-        while given.exists():
+        out = Path("out", name)
+        while out.exists():
             number += 1
-            given = Path("out", f"{name}-{number}")
+            out = Path("out", f"{name}-{number}")
     try:
-        if given.exists() and not given.is_dir():
-            raise InputError(f"--out {given}: a file, expected a folder")
-        if given.is_dir() and any(not path.is_dir() for path in given.rglob("*")):
-            if not any(True for mark in marks for _ in given.glob(mark)):
-                raise InputError(f"--out {given}: the folder is not empty and holds no earlier results ({marks[0]})")
+        if out.exists() and not out.is_dir():
+            raise InputError(f"--out {out}: a file, expected a folder")
+        if out.is_dir() and any(not path.is_dir() for path in out.rglob("*")):
+            if not any(True for mark in marks for _ in out.glob(mark)):
+                raise InputError(f"--out {out}: the folder is not empty and holds no earlier results ({marks[0]})")
             if not overwrite:
-                raise InputError(f"--out {given}: contains earlier results; give --overwrite to replace them")
+                raise InputError(f"--out {out}: contains earlier results; give --overwrite to replace them")
         from unrender.io import files  # NumPy with it
 
-        files.make_folder(given)
+        files.make_folder(out)
     except OSError as error:
-        raise InputError(f"--out {given}: {error.strerror or error}") from error
-    if not os.access(given, os.W_OK | os.X_OK):
-        raise InputError(f"--out {given}: not writable")
-    return given
+        raise InputError(f"--out {out}: {error.strerror or error}") from error
+    if not os.access(out, os.W_OK | os.X_OK):
+        raise InputError(f"--out {out}: not writable")
+    return out
 
 
 def command_line(context: typer.Context) -> str:

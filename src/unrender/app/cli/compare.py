@@ -98,7 +98,7 @@ def compare(
     _check_single(what)
     typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
-        chosen, given = _methods_and_settings(methods, typed)
+        chosen, settings_ = _methods_and_settings(methods, typed)
         arguments.check_problem(what[0], options)
         _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
         folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
@@ -106,7 +106,7 @@ def compare(
             command = arguments.command_line(context)
             job = _job(what[0], options, not no_cache, command, folder)
             turns = itertools.product(range(seed, seed + seeds), chosen)  # a slow machine affects all methods
-            runs = [_run_task(method.name, given[method.name], seconds, n, final_spp) for n, method in turns]
+            runs = [_run_task(method.name, settings_[method.name], seconds, n, final_spp) for n, method in turns]
             with _prepared(console, job, runs, variant, where) as comparison:
                 directories, status = _run_all(console, comparison, progress)
         finally:

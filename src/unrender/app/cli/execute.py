@@ -124,8 +124,8 @@ def _error_line(problem: Problem, result: Result, key: str, before: float, after
     where = None if sensitivity is None else seen_cells(sensitivity)
     if where is None or key not in problem.truth or where.all():
         return line
-    seen = measure.error(result.parameters[key], problem.truth[key], where)
-    return line if seen is None else f"{line}, {measure.text(seen)} where seen ({where.mean():.0%} of it)"
+    error = measure.error(result.parameters[key], problem.truth[key], where)
+    return line if error is None else f"{line}, {measure.text(error)} where seen ({where.mean():.0%} of it)"
 
 
 def verified(result: Result) -> str:

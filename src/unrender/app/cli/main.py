@@ -25,8 +25,8 @@ from unrender.core.text import one_line
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if given == ["--version"]:  # without further imports
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words == ["--version"]:  # without further imports
         print(metadata.version("unrender"))
         return 0
     try:
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         try:
             with signals:
-                command = _command(given)
+                command = _command(words)
                 value = command()
                 sys.stdout.flush()
             status = value if isinstance(value, int) else 0
@@ -66,18 +66,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return status
 
 
-def _command(given: list[str]) -> Callable[[], Any]:
+def _command(words: list[str]) -> Callable[[], Any]:
     """Return the function that executes a command line."""
-    if given == ["doctor"]:  # works even if other modules cannot be imported
+    if words == ["doctor"]:  # works even if other modules cannot be imported
         from unrender.app.cli.doctor import doctor
 
         return doctor
-    for argument in given:
+    for argument in words:
         encode_text(argument, "command line")
     variant.prepare()  # must run before Dr.Jit is imported
     from unrender.app.cli.app import app
 
-    return partial(app, given, prog_name="unrender", standalone_mode=False, obj=["unrender", *given])
+    return partial(app, words, prog_name="unrender", standalone_mode=False, obj=["unrender", *words])
 
 
 def _status_of(error: BaseException, signals: Signals) -> int | None:

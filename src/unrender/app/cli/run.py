@@ -78,8 +78,11 @@ def run(
     SIGTERM stop after the current step and save the state; `unrender resume` continues from there.
     """
     arguments.check_file(problem)
-    given, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
-    steps, seconds = _budget_settings(given, steps, seconds)
+    method_settings, options = (
+        arguments.settings(settings, "--set"),
+        arguments.settings(problem_settings, "--problem-set"),
+    )
+    steps, seconds = _budget_settings(method_settings, steps, seconds)
     arguments.budget(steps, seconds)
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
@@ -92,11 +95,11 @@ def run(
 
             chosen, processes = _method(method_name), dealing.check(workers, compress, insecure)
             if stages.is_stages(problem):
-                stages.refuse_settings(method_name, given, options, workers)
+                stages.refuse_settings(method_name, method_settings, options, workers)
                 plan = (steps, seconds), seed, out, overwrite, variant, threads, command, checkpoint_every, final_spp
                 return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
             steps, seconds = arguments.budget(steps, seconds)
-            chosen.start(given)
+            chosen.start(method_settings)
             arguments.check_problem(problem, options)
         folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
         try:
@@ -104,7 +107,9 @@ def run(
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
-                task = RunOrder(chosen, given, steps, seconds, seed, final_spp, command, options, checkpoint_every)
+                task = RunOrder(
+                    chosen, method_settings, steps, seconds, seed, final_spp, command, options, checkpoint_every
+                )
                 with execution(dealt, task, folder, console, progress) as order:
                     result = optimize(**order)
         finally:

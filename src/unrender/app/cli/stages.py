@@ -77,10 +77,10 @@ def refuse_workers(workers: str | None) -> None:
 def refuse_settings(method: str, settings: Mapping[str, str], options: Mapping[str, str], workers: str | None) -> None:
     """Raise `InputError` for command-line options that belong in a file of stages, or that stages do not support."""
     refuse_workers(workers)
-    given = [f"--set {name}" for name in settings] + [f"--problem-set {name}" for name in options]
-    given += ["--method"] * (method != "auto")
-    if given:
-        raise InputError(f"{given[0]}: not supported with stages; set it in the file of stages")
+    refused = [f"--set {name}" for name in settings] + [f"--problem-set {name}" for name in options]
+    refused += ["--method"] * (method != "auto")
+    if refused:
+        raise InputError(f"{refused[0]}: not supported with stages; set it in the file of stages")
 
 
 def begin(
@@ -126,7 +126,7 @@ def begin(
     folder = arguments.folder(out, f"{file.resolve().parent.name}-stages", overwrite, stages_file.FILE)
     try:
         running = arguments.use_variant(variant, threads)
-        whole = _read(stages)
+        problem = _read(stages)
         with _held(folder) as lock:
             _clear(folder)
             options = stages_file.RunOptions(running, threads, checkpoint_every, final_spp)
@@ -134,7 +134,7 @@ def begin(
             stages_file.write(stages, folder)
     finally:
         arguments.remove_if_empty(folder)
-    return StagesRun(stages, whole, folder, running, command, lock)
+    return StagesRun(stages, problem, folder, running, command, lock)
 
 
 def reopen(
@@ -155,10 +155,10 @@ def reopen(
     running = arguments.use_variant(variant or options.variant, threads or options.threads)
     stages = replace(stages, run=options)
     with _held(folder) as lock:
-        whole = _read(stages)
+        problem = _read(stages)
         if budget != (None, None):
             stages_file.write(stages, folder)
-    return StagesRun(stages, whole, folder, running, command, lock)
+    return StagesRun(stages, problem, folder, running, command, lock)
 
 
 def run_remaining(run: StagesRun, console: Console, progress: Progress) -> None:

@@ -116,14 +116,14 @@ def sweep_command(
         record = _extended(read_sweep(Path(what)), trials)
         run_trials(console, Session(Path(what), where, threads), record, _search_of(record.plan)[1])
         return
-    given = {
+    values = {
         "problem": what, "method": method_name, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
         "seconds": seconds, "seeds": seeds, "seed": seed, "final_spp": final_spp, "variant": variant, "cached": not no_cache,
         "settings": arguments.settings(settings, "--set"),
         "problem_settings": arguments.settings(problem_settings, "--problem-set"),
     }  # fmt: skip
     with phases.phase("loading"):
-        planned = _planned(given, over or [])
+        planned = _planned(values, over or [])
     folder = _folder(planned, out, overwrite)
     _begin(console, planned, arguments.command_line(context), Session(folder, where, threads, fresh=True))
 
@@ -173,12 +173,14 @@ def sweep(
         InputError: an invalid argument (the message names the command's option), or Ray or Optuna is required and missing.
         KeyboardInterrupt: completed trials are in `out`; `unrender sweep DIR` continues.
     """
-    given: dict[str, Any] = {
+    values: dict[str, Any] = {
         "problem": str(problem), "method": method, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
         "seconds": seconds, "seeds": seeds, "seed": seed, "final_spp": final_spp, "variant": variant, "cached": True,
     }  # fmt: skip
     where = arguments.workers(None if workers is None else str(workers), insecure)
-    planned = _planned(given | {"settings": _texts(settings), "problem_settings": _texts(problem_settings)}, over or {})
+    planned = _planned(
+        values | {"settings": _texts(settings), "problem_settings": _texts(problem_settings)}, over or {}
+    )
     return _run_silently(planned, where, threads, _folder(planned, None if out is None else Path(out), overwrite))
 
 
@@ -201,10 +203,10 @@ def _run_silently(
     return read_sweep(folder)
 
 
-def _texts(given: Mapping[str, Any] | None) -> dict[str, str]:
+def _texts(values: Mapping[str, Any] | None) -> dict[str, str]:
     from unrender.app.sweeps.axes import as_text
 
-    return {name: as_text(value) for name, value in (given or {}).items()}
+    return {name: as_text(value) for name, value in (values or {}).items()}
 
 
 def _is_sweep(what: str) -> bool:
@@ -215,7 +217,7 @@ def _is_sweep(what: str) -> bool:
 
 
 def _planned(
-    given: dict[str, Any], over: Sequence[str] | Mapping[str, str | Sequence[Any]]
+    values: dict[str, Any], over: Sequence[str] | Mapping[str, str | Sequence[Any]]
 ) -> tuple[SweepPlan, Search]:
     """Return the plan of a sweep and its search. Raises `InputError`."""
     from unrender.app.sweeps.axes import parse_axes
@@ -223,16 +225,16 @@ def _planned(
     from unrender.methods import method
     from unrender.runs.folder import schema
 
-    steps, seconds = arguments.budget(given["steps"], given["seconds"])
-    arguments.check_problem(given["problem"], given["problem_settings"])
-    arguments.check_variant(given["variant"])
-    chosen = method(given["method"])
-    axes = parse_axes(over, chosen, given["settings"])
-    chosen.configure(given["settings"])
-    check_seed("--seed", given["seed"], given["seeds"])
-    changes = {"steps": steps, "seconds": seconds, "method": chosen.name, "search": _kind(given["search"], axes)}
-    changes |= {"problem": arguments.absolute(given["problem"]), "over": [f"{a.name}={a.text}" for a in axes]}
-    return _search_of(schema.validate(SweepPlan, {**given, **changes}, "unrender sweep"))
+    steps, seconds = arguments.budget(values["steps"], values["seconds"])
+    arguments.check_problem(values["problem"], values["problem_settings"])
+    arguments.check_variant(values["variant"])
+    chosen = method(values["method"])
+    axes = parse_axes(over, chosen, values["settings"])
+    chosen.configure(values["settings"])
+    check_seed("--seed", values["seed"], values["seeds"])
+    changes = {"steps": steps, "seconds": seconds, "method": chosen.name, "search": _kind(values["search"], axes)}
+    changes |= {"problem": arguments.absolute(values["problem"]), "over": [f"{a.name}={a.text}" for a in axes]}
+    return _search_of(schema.validate(SweepPlan, {**values, **changes}, "unrender sweep"))
 
 
 def _folder(planned: tuple[SweepPlan, Search], out: Path | None, overwrite: bool) -> Path:

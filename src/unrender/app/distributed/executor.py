@@ -134,18 +134,18 @@ class DistributedExecutor:
         memory = self._memory(request.state)
         sample = None if request.batch is None else request.batch.sample
         call, sent = self._call(request, memory)
-        kept: Any = (None,) * len(self._problem.views)
+        updated: Any = (None,) * len(self._problem.views)
         if sample is None and isinstance(request.state, RecursiveControlVariateState):
-            kept, call = self._memories.after(memory, call, sent)
+            updated, call = self._memories.after(memory, call, sent)
         parts = [None] * len(self._shares) if sample is None else split(self._problem, sample, self._shares)
         calls = {index: replace(call, batch=part) for index, part in enumerate(parts) if sample is None or part}
-        if isinstance(kept, Memory) and kept.recipe.call is not None:
-            kept.recipe.call = replace(call, replay=True, pictures=False)
+        if isinstance(updated, Memory) and updated.recipe.call is not None:
+            updated.recipe.call = replace(call, replay=True, pictures=False)
         replies = self._replies(calls, sent, memory)
         self._in_step = False
-        if isinstance(kept, Memory):
-            self._collect_if_long(kept)
-        gathered = self._sample(request, [replies[index] for index in sorted(replies)], kept)
+        if isinstance(updated, Memory):
+            self._collect_if_long(updated)
+        gathered = self._sample(request, [replies[index] for index in sorted(replies)], updated)
         draws_of_parts = [(part, replies[index].draws) for index, part in enumerate(parts) if part is not None]
         return replace(gathered, draws=joined([(part, draws) for part, draws in draws_of_parts if draws is not None]))
 
@@ -167,8 +167,8 @@ class DistributedExecutor:
         replies = self._replies(calls, sent, None)
         paths = [np.empty((sum(map(len, used.values())), *x.shape[1:]), x.dtype) for x in replies[min(replies)].paths]
         for share, positions in used.items():
-            for whole, part in zip(paths, replies[share].paths, strict=True):
-                whole[positions] = part[: len(positions)]
+            for path, part in zip(paths, replies[share].paths, strict=True):
+                path[positions] = part[: len(positions)]
         return paths
 
     def _reset_traffic(self) -> None:
@@ -185,8 +185,12 @@ class DistributedExecutor:
 
     def collect(self, state: Any) -> Any:
         if isinstance(state, RecursiveControlVariateState) and isinstance(state.views, Memory):
-            whole = replace(state, views=self._views(state.views.recipe), snapshot=None)
-            return whole if state.snapshot is None else replace(whole, snapshot=_snapshot(whole))
+            collected_state = replace(state, views=self._views(state.views.recipe), snapshot=None)
+            return (
+                collected_state
+                if state.snapshot is None
+                else replace(collected_state, snapshot=_snapshot(collected_state))
+            )
         if dataclasses.is_dataclass(state) and not isinstance(state, type):
             parts = {each.name: getattr(state, each.name) for each in dataclasses.fields(state) if each.init}
             collected = {name: self.collect(part) for name, part in parts.items()}
@@ -232,7 +236,9 @@ class DistributedExecutor:
             known = None if past is None else numbered(past)
             number = None if memory is None else memory.number
             state = ImageState(known, number, request.state.snapshot is not None, request.state.step)
-        asked = None if pair is None else Pair(numbered(pair.previous), pair.space, pair.step, pair.difference_spp)
+        numbered_pair = (
+            None if pair is None else Pair(numbered(pair.previous), pair.space, pair.step, pair.difference_spp)
+        )
         self._calls += 1
         call = Call(
             numbered(request.parameters),
@@ -241,7 +247,7 @@ class DistributedExecutor:
             request.spp,
             request.key,
             request.adjoint_spp,
-            asked,
+            numbered_pair,
             tangents=named(self._outbox.once(request.tangents)),
             tolerance=request.tolerance,
             fresh=request.fresh,
@@ -359,7 +365,7 @@ class DistributedExecutor:
 
     # ------------------------------------------------------------------ replies to a sum
 
-    def _sample(self, request: GradientRequest, replies: Sequence[Reply], kept: Any) -> GradientSample:
+    def _sample(self, request: GradientRequest, replies: Sequence[Reply], updated: Any) -> GradientSample:
         def summed(of: Callable[[Reply], Mapping[str, np.ndarray]]) -> Tree:
             return {key: self._problem.renderer.array(x) for key, x in total(map(of, replies)).items()}
 
@@ -375,7 +381,7 @@ class DistributedExecutor:
                 info.setdefault(name, {}).update(maps)
         state = request.state
         if batch is None or batch.sample is None:
-            state = request.image.advance(request.parameters, request.state, kept)
+            state = request.image.advance(request.parameters, request.state, updated)
         return GradientSample(
             gradient=summed(lambda reply: reply.gradient),
             paired=summed(lambda reply: reply.paired),

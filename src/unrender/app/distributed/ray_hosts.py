@@ -244,9 +244,9 @@ class RayHosts:
 
     def _silent(self, shares: Mapping[int, Any]) -> list[int]:
         """Return the shares whose worker does not answer a ping."""
-        asked = {share: self._of[share].handle.alive.options(concurrency_group="answers").remote() for share in shares}
-        done, _ = self._ray.wait(list(asked.values()), num_returns=len(asked), timeout=_ANSWER)
-        return [share for share, reference in asked.items() if reference not in done]
+        calls = {share: self._of[share].handle.alive.options(concurrency_group="answers").remote() for share in shares}
+        done, _ = self._ray.wait(list(calls.values()), num_returns=len(calls), timeout=_ANSWER)
+        return [share for share, reference in calls.items() if reference not in done]
 
     def _classify_error(self, share: int, error: Exception, lost: list[_Worker]) -> None:
         """Add the worker to `lost` if the error means that it is lost; raise `InputError` otherwise."""

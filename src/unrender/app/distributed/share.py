@@ -56,11 +56,11 @@ class ViewShare:
             frames = [(-1, PixelBatch(self.problem, sample))]
             request = replace(request, batch=MiniBatch(sample, tangents=self._tree(call.tangents)))
         parts = [request.estimate_frame(self.problem, frame, call.key.fold(max(index, 0))) for index, frame in frames]
-        kept = tuple(part.kept for part in parts)
+        states = tuple(part.kept for part in parts)
         parts_by_name = {name: [getattr(part, name) for part in parts] for name in TREES}
-        arrays.evaluate(kept, parts_by_name, [part.loss for part in parts])
+        arrays.evaluate(states, parts_by_name, [part.loss for part in parts])
         if call.batch is None:
-            self._remember(call, kept)
+            self._remember(call, states)
         sums = {name: total(map(trees.numpy, parts)) for name, parts in parts_by_name.items()}
         if call.single:
             sums = {name: {key: value.astype(np.float32) for key, value in tree.items()} for name, tree in sums.items()}
@@ -144,9 +144,9 @@ class ViewShare:
 
         return PixelSample(integers(batch.views), integers(batch.pixels), like, integers(batch.positions))
 
-    def _pilot(self, call: Call, asked: Pilot) -> tuple[np.ndarray, ...]:
+    def _pilot(self, call: Call, pilot: Pilot) -> tuple[np.ndarray, ...]:
         assert call.batch is not None
-        references = tuple(self.problem.renderer.array(reference) for reference in asked.references)
+        references = tuple(self.problem.renderer.array(reference) for reference in pilot.references)
         sample, tangents = self._sample(call.batch), self._tree(call.tangents)
         request = PilotRequest(self._tree(call.parameters), sample, call.key, references, tangents)
         return tuple(request.carry_out(self.problem))
@@ -170,9 +170,9 @@ class ViewShare:
         arrays.evaluate(memory)
         return memory
 
-    def _remember(self, call: Call, kept: tuple[Any, ...]) -> None:
+    def _remember(self, call: Call, states: tuple[Any, ...]) -> None:
         if call.result is not None:
-            self._memories[call.result] = kept
+            self._memories[call.result] = states
 
 
 class Hosts(Protocol):

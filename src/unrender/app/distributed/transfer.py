@@ -46,7 +46,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     Raises:
         InputError: the problem cannot be sent: it has a loaded scene, or a function or object of this process.
     """
-    given = [_located(problem.given_views[view], "reference", "mask", "scene") for view in views]
+    located_views = [_located(problem.given_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
     sensors = sensors_with_rows(problem.renderer)
     if sensors is not None and any(view.own_world for view in problem.given_views):
@@ -56,7 +56,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     parts = _Parts(
         _scene(problem),
         parameters,
-        given,
+        located_views,
         problem.loss,
         problem.max_depth,
         problem.name,
@@ -116,14 +116,14 @@ def _scene(problem: Problem) -> Any:
     return str(Path(description).resolve()) if isinstance(description, (str, Path)) else description
 
 
-def _located(given: _Given, *names: str) -> _Given:
+def _located(owner: _Given, *names: str) -> _Given:
     """Return the object with absolute file names, since workers have other working directories."""
-    paths = {name: value for name in names if isinstance(value := getattr(given, name), (str, Path))}
+    paths = {name: value for name in names if isinstance(value := getattr(owner, name), (str, Path))}
     located: dict[str, Any] = {name: Path(value).absolute() for name, value in paths.items()}
-    if isinstance(given, View) and given.known is not None:
-        known = given.known.items()
+    if isinstance(owner, View) and owner.known is not None:
+        known = owner.known.items()
         located["known"] = {k: Path(x).absolute() if isinstance(x, (str, Path)) else x for k, x in known}
-    return replace(given, **located)
+    return replace(owner, **located)
 
 
 def _pickler(ray: Any) -> Any:

@@ -119,12 +119,12 @@ def write(
     rows = []
     for index, (name, view, mask) in enumerate(zip(names_of(problem), problem.views, masks, strict=True)):
         photograph = np.asarray(view.reference)
-        rendered, wanted, _ = shown(images[index], photograph, mask)
+        rendered, target, _ = shown(images[index], photograph, mask)
         if relit:
             third, _, _ = shown(relit[index] * level, np.zeros_like(photograph), mask)
         else:
-            third = np.clip(_DIFFERENCE * np.abs(rendered - wanted), 0, 1)
-        cells = (wanted, rendered, third)
+            third = np.clip(_DIFFERENCE * np.abs(rendered - target), 0, 1)
+        cells = (target, rendered, third)
         if index < MOST_ROWS:
             box = _box(mask)
             label = _label(name, measures[index]) if measures else name

@@ -45,20 +45,20 @@ class FilesOnly:
         self._recorded = recorded
         self._placed: list[tuple[Any, str]] = []
 
-    def dictionary(self, given: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[str, Any]:
+    def dictionary(self, description: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[str, Any]:
         """Return `given` with files in place of objects.
 
         Raises:
             InputError: an object has no description.
         """
         converted: dict[str, Any] = {}
-        for key, value in given.items():
+        for key, value in description.items():
             here = (*place, key)
             if isinstance(value, Mapping):
                 converted[key] = self.dictionary(value, here)
-            elif isinstance(value, mi.VolumeGrid) or (key == "data" and given.get("type") == "gridvolume"):
+            elif isinstance(value, mi.VolumeGrid) or (key == "data" and description.get("type") == "gridvolume"):
                 converted["filename"] = self._volume(value, here)
-            elif isinstance(value, mi.Bitmap) or (key == "data" and given.get("type") in ("bitmap", "envmap")):
+            elif isinstance(value, mi.Bitmap) or (key == "data" and description.get("type") in ("bitmap", "envmap")):
                 converted["filename"] = self._bitmap(value, here)
             elif isinstance(value, mi.Object):
                 converted[key] = self._object(value, here)

@@ -104,7 +104,7 @@ def export(
     exchange two names, the replacement takes two steps, and the next export repairs an interrupted one.
     """
     variant.ensure()
-    out, asked = Path(out), check_formats(formats)
+    out, formats_ = Path(out), check_formats(formats)
     files.check_replaceable(out, _OWN, textures.RECORD, overwrite, f"export to {out}", "an earlier export")
     problem, parameters = _opened(what)
     renderer = scene_renderer(problem.renderer)
@@ -113,10 +113,12 @@ def export(
     as_tree(problem, parameters)
     values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
     try:
-        notices, renamed = files.write_folder(out, lambda folder: _write(folder, problem, renderer, values, asked, spp))
+        notices, renamed = files.write_folder(
+            out, lambda folder: _write(folder, problem, renderer, values, formats_, spp)
+        )
     except OSError as error:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
-    has_scene = MITSUBA in asked and not renderer.pair.emissive
+    has_scene = MITSUBA in formats_ and not renderer.pair.emissive
     return Exported(out, out / SCENE if has_scene else None, tuple(notices), renamed)
 
 
@@ -137,13 +139,13 @@ def _write(
     problem: Problem,
     renderer: MitsubaRenderer,
     values: dict[str, np.ndarray],
-    asked: Sequence[str],
+    formats: Sequence[str],
     spp: int,
 ) -> tuple[list[str], dict[str, str]]:
     """Write the recovered values and the requested formats; return the notices and `Exported.renamed`."""
     repeated = problem.coordinates.repeated
     notices = textures.write({k: periodic.interior(x, repeated.get(k, 0)) for k, x in values.items()}, folder)
-    others = [name for name in asked if name != MITSUBA]
+    others = [name for name in formats if name != MITSUBA]
     if renderer.pair.emissive:
         if others:
             raise InputError(f"{problem.name}: an emissive medium has no mesh; expected --format {MITSUBA} alone")
@@ -151,14 +153,14 @@ def _write(
         return [*notices, why], {}
     of_scene = scene_values(problem.renderer, values)
     renamed = _fill(folder, renderer, of_scene, problem.max_depth, spp)
-    if MITSUBA in asked:
+    if MITSUBA in formats:
         renamings = [
             f"{key} is called {name} in the exported scene" for key, name in renamed.items() if key in of_scene
         ]
         notices = renamings + notices
     if others:
         notices += write_formats(asset.read(folder / SCENE), folder, others)
-    if MITSUBA not in asked:
+    if MITSUBA not in formats:
         for name in _OF_SCENE:
             files.remove(folder / name)
     return notices, renamed

@@ -34,8 +34,8 @@ def write(parameters: Mapping[str, np.ndarray], folder: Path) -> list[str]:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["parameter", "element", "value"])
-    for key, given in parameters.items():
-        value = np.asarray(given, np.float32)
+    for key, values in parameters.items():
+        value = np.asarray(values, np.float32)
         entry: dict[str, Any] = {"shape": list(value.shape)}
         if value.size <= _LARGEST and value.ndim < 3:
             entry["value"] = value.tolist()

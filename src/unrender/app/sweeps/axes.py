@@ -77,12 +77,12 @@ class Axis:
 
 
 def parse_axes(
-    given: Iterable[str] | Mapping[str, str | Sequence[Any]], method: Method, fixed: Iterable[str] = ()
+    texts: Iterable[str] | Mapping[str, str | Sequence[Any]], method: Method, fixed: Iterable[str] = ()
 ) -> tuple[Axis, ...]:
     """Return the axes of a sweep.
 
     Args:
-        given: `NAME=VALUE,VALUE` and `NAME=LOW:HIGH[:log][:POINTS]`; or, by name, the text after `NAME=` or a list of values.
+        texts: `NAME=VALUE,VALUE` and `NAME=LOW:HIGH[:log][:POINTS]`; or, by name, the text after `NAME=` or a list of values.
         method: the method of the options; it must accept every value.
         fixed: options that are set already.
 
@@ -91,7 +91,7 @@ def parse_axes(
     """
     axes = []
     taken = set(fixed)
-    for name, values in (given if isinstance(given, Mapping) else _by_name(given)).items():
+    for name, values in (texts if isinstance(texts, Mapping) else _by_name(texts)).items():
         if name in taken:
             raise InputError(f"--over {name}: it is fixed by --set")
         if isinstance(values, str):

@@ -87,8 +87,8 @@ def loss(
             PyTorch's `grad`.
     """
     if not isinstance(phi, torch.Tensor) or not phi.is_floating_point() or phi.ndim not in (1, 2) or phi.numel() == 0:
-        given = f"{phi.dtype} {tuple(phi.shape)}" if isinstance(phi, torch.Tensor) else type(phi).__name__
-        raise InputError(f"grey_box.loss: phi must be a floating-point tensor (n,) or (K, n), got {given}")
+        actual = f"{phi.dtype} {tuple(phi.shape)}" if isinstance(phi, torch.Tensor) else type(phi).__name__
+        raise InputError(f"grey_box.loss: phi must be a floating-point tensor (n,) or (K, n), got {actual}")
     if not torch.isfinite(phi).all():
         raise InputError("grey_box.loss: phi has elements that are not finite: the network before it has diverged")
     options = SamplingOptions(samples, seed, aggregate, antithetic, baseline, low_discrepancy, epsilon=epsilon)

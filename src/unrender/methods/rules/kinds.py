@@ -76,9 +76,9 @@ def volumes(traits: Traits) -> Part:
 def positive_values(traits: Traits) -> Part:
     """Optimise positive numbers, colours and textures without an upper bound as their logarithms."""
     positive, known = logarithms(traits.problem, traits.constants), traits.problem.unknowns
-    given = {key: u.parameterisation for key, u in known.items() if u.parameterisation is not None}
+    parameterisations = {key: u.parameterisation for key, u in known.items() if u.parameterisation is not None}
     moved = {key: "log" for key in positive if traits.options.parameterise and key not in traits.rates}
-    named = {key: type(own).__name__.lower() for key, own in given.items()} | moved
+    named = {key: type(own).__name__.lower() for key, own in parameterisations.items()} | moved
     settings = {key: ParameterSettings(parameterisation=name) for key, name in moved.items()}
     return Part(tuple(named), f"moved as {grouped(named)}", settings) if named else Part()
 

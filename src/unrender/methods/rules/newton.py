@@ -43,14 +43,17 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
     """Return path gradients of sensors if an image or pixels are requested, or Gauss-Newton steps are unsuitable; else None."""
     if not traits.only_cameras or not all(info.differentiable for info in traits.infos.values()):
         return None
-    sampler, drawn = sampling.sampler(traits)
+    sampler, sampler_reason = sampling.sampler(traits)
     spp = sampling.samples_per_pixel(traits, sampler)
     rate = traits.constants.camera_share * traits.options.learning_rate
     image = RecursiveControlVariate("primary") if traits.options.image == "rcv" else Plain()
     reason = f"path gradients of cameras, {spp} samples per pixel, Adam, first rate {rate:.3g}, halved every 30 steps"
     descent = Adam(rate, beta_2=0.99, schedule=Exponential(30, 0.01))
     return Plan(
-        traits.problem, PathGradient(image, sampler, spp), descent, reasons=tuple(filter(None, (reason, drawn)))
+        traits.problem,
+        PathGradient(image, sampler, spp),
+        descent,
+        reasons=tuple(filter(None, (reason, sampler_reason))),
     )
 
 

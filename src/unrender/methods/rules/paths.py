@@ -67,7 +67,7 @@ def paths(traits: Traits) -> Plan:
     configured = problem.configured(settings)
     rates = {**first_rates(configured, options.learning_rate, traits.constants), **traits.rates}
     rates = {key: rate for key, rate in rates.items() if key not in traits.block}
-    sampler, drawn = sampling.sampler(traits)
+    sampler, reason = sampling.sampler(traits)
     image, image_reason = sampling.image(traits, sampler)
     spp = sampling.samples_per_pixel(traits, sampler)
     smoothed = tuple(key for part in parts if part.smoothed for key in part.keys)
@@ -90,7 +90,7 @@ def paths(traits: Traits) -> Plan:
     first = grouped({key: f"{rate:.3g}" for key, rate in (rates | own_rates).items()})
     reasons = (
         f"{'a fresh rendering each step' if plain else 'recursive control variates'}, {spp} samples per pixel: {image_reason}",
-        drawn,
+        reason,
         f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
         *(part.reason for part in parts),
         f"{'schedule-free Adam' if len(apart) < len(rates) else 'Adam'}, first rate {first}",

@@ -359,9 +359,9 @@ class FittedSobolev(StepTransform):
 
     def _smooth(self, key: str) -> Preconditioner:
         """Return the preconditioner of a parameter in `preconditioned`, at full strength."""
-        found = self._bound[key][1] if key in self._bound else self.preconditioner
-        assert found is not None
-        return found
+        preconditioner = self._bound[key][1] if key in self._bound else self.preconditioner
+        assert preconditioner is not None
+        return preconditioner
 
     def _sobolev(self, key: str) -> Sobolev:
         return cast("Sobolev", self._smooth(key))

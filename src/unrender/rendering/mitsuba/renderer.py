@@ -129,24 +129,24 @@ class MitsubaRenderer:
 
         Poses and other parameters that move geometry cannot be prepared together, since the scenes of posed shapes are not rebuilt.
         """
-        names, wanted = tuple(keys), differentiated(keys, derivatives)
-        if (names, wanted, space) not in self._checked:
+        names, differentiable = tuple(keys), differentiated(keys, derivatives)
+        if (names, differentiable, space) not in self._checked:
             for key in keys:
-                self._check(key, space, key in wanted)
+                self._check(key, space, key in differentiable)
             self._check_targets(keys)
             if space is not None:
                 self.pair.check_separate([key for key in keys if key not in self._poses])
-            self._checked.add((names, wanted, space))
-        if (names, wanted) not in self._sessions:
+            self._checked.add((names, differentiable, space))
+        if (names, differentiable) not in self._sessions:
             chosen = {key: self._poses[key] for key in keys if key in self._poses and not self._is_written(key, keys)}
             rest = [key for key in keys if key not in chosen]
             session = MitsubaSession(
-                self.pair, rest, chosen, wanted, self.light_paths, self._sampler, self._differential_bsdf
+                self.pair, rest, chosen, differentiable, self.light_paths, self._sampler, self._differential_bsdf
             )
-            session = self._caching(session, keys, wanted)
+            session = self._caching(session, keys, differentiable)
             is_luminance = self._formats[0].colour == "luminance"
-            self._sessions[names, wanted] = LuminanceSession(session) if is_luminance else session
-        return self._sessions[names, wanted]
+            self._sessions[names, differentiable] = LuminanceSession(session) if is_luminance else session
+        return self._sessions[names, differentiable]
 
     def _caching(
         self, session: MitsubaSession, keys: list[str], derivatives: AbstractSet[str]

@@ -148,8 +148,8 @@ def read(path: Path) -> Checkpoint:
     if path.is_symlink() or any((path / name).is_symlink() for name in (STATE, MANIFEST)):
         raise InputError(f"{path}: a link, or with links inside; expected a folder with files")
     where = str(path / MANIFEST)
-    given = bounded_files.parse_json(bounded_files.read_bytes(path / MANIFEST, _LARGEST_MANIFEST, path), where)
-    manifest = schema.validate(Manifest, given, where)
+    content = bounded_files.parse_json(bounded_files.read_bytes(path / MANIFEST, _LARGEST_MANIFEST, path), where)
+    manifest = schema.validate(Manifest, content, where)
     if int(path.name) != manifest.step:
         raise InputError(f"{where}: step: expected {int(path.name)}, as its folder is named, got {manifest.step}")
     return Checkpoint(manifest, Packed(manifest.state, _tensors(path / STATE, manifest)))

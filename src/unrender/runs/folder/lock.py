@@ -169,8 +169,8 @@ def _locks_for_all(file: int) -> bool:
 
 def _read(path: Path) -> Holder | None:
     try:
-        given = bounded_files.parse_json(bounded_files.read_bytes(path, _LARGEST), str(path))
-        match given:
+        content = bounded_files.parse_json(bounded_files.read_bytes(path, _LARGEST), str(path))
+        match content:
             case {"pid": int(pid), "host": str(host), "started": str(started)} if 0 < pid < 1 << 31:
                 return Holder(pid, host[:200], started)
     except InputError:

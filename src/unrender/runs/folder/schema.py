@@ -236,17 +236,17 @@ class Manifest(BaseModel):
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def validate(model: type[Model], given: Any, where: str) -> Model:
+def validate(model: type[Model], content: Any, where: str) -> Model:
     """Validate a value against a model. Raises `InputError`: one line that begins with `where` and names the first invalid field."""
     try:
-        return model.model_validate(given)
+        return model.model_validate(content)
     except RecursionError as error:
         raise InputError(f"{where}: nested too deeply") from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         name = printable(".".join(str(part) for part in first["loc"]))
         if first["type"] == "missing":
-            hint = did_you_mean(name, map(printable, given)) if isinstance(given, dict) else ""
+            hint = did_you_mean(name, map(printable, content)) if isinstance(content, dict) else ""
             raise InputError(f"{where}: {name} is missing{hint}") from error
         if first["type"] == "extra_forbidden":
             raise InputError(f"{where}: unknown field {name}") from error
@@ -255,14 +255,14 @@ def validate(model: type[Model], given: Any, where: str) -> Model:
         raise InputError(f"{where}: {field}expected {message}, got {printable(repr(first['input']))}") from error
 
 
-def encode(model: type[BaseModel], given: Any, where: str) -> bytes:
+def encode(model: type[BaseModel], content: Any, where: str) -> bytes:
     """Return the bytes of a JSON file that the reader accepts as the model.
 
     Raises:
         InputError: the reader would reject them; one line that begins with `where` and names the field.
     """
     try:
-        data = encode_text(json.dumps(given, indent=2, ensure_ascii=False) + "\n", where)
+        data = encode_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", where)
     except (TypeError, ValueError, RecursionError) as error:
         raise InputError(f"{where}: cannot be written as JSON: {reason_of(error, 200)}") from error
     if len(data) > bounded_files.LARGEST_JSON:

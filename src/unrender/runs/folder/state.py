@@ -135,7 +135,7 @@ def not_finite(state: Any, where: str = "state") -> str:
         return where if host.dtype.kind == "f" and not np.isfinite(host).all() else ""
     else:
         return ""
-    return next((found for part, name in parts if (found := not_finite(part, name))), "")
+    return next((place for part, name in parts if (place := not_finite(part, name))), "")
 
 
 @dataclass

@@ -77,10 +77,10 @@ def read(folder: Path, kind: str | None = None, masks: Path | None = None) -> Ca
     Raises:
         InputError: the folder does not exist, has none of the formats, or contains unreadable files.
     """
-    for given, name in ((folder, "FOLDER"), (masks, "--masks")):
-        if given is not None and bounded_files.kind(given) != "folder":
-            problem = "not a folder" if bounded_files.exists(given) else "no such folder"
-            raise InputError(f"{given}: {problem}" if name == "FOLDER" else f"{name} {given}: {problem}")
+    for place, name in ((folder, "FOLDER"), (masks, "--masks")):
+        if place is not None and bounded_files.kind(place) != "folder":
+            problem = "not a folder" if bounded_files.exists(place) else "no such folder"
+            raise InputError(f"{place}: {problem}" if name == "FOLDER" else f"{name} {place}: {problem}")
     if kind == LIGHTS:
         raise InputError(f"{folder}: not in the format {LIGHTS}: expected {lights.FILE}")
     if kind is not None and kind not in FORMATS:

@@ -47,7 +47,7 @@ def find_picture(folder: Path, name: str) -> Path | None:
     return None
 
 
-def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | None = None) -> Path | None:
+def find_mask(folder: Path, photograph: Path, mask_folder: Path | None, named: str | None = None) -> Path | None:
     """Return the mask of a photograph, or None.
 
     Search order: only the folder `given`, if there is one; the file that the format names; NAME_mask.png next to the photograph; a
@@ -56,8 +56,8 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
     take precedence over its bare name.
     """
     relative = _relative(folder, photograph)
-    if given is not None:
-        mask = _of_name(given, relative)
+    if mask_folder is not None:
+        mask = _of_name(mask_folder, relative)
         return None if mask == photograph else mask
     if named is not None:
         path = folder / named
@@ -68,8 +68,8 @@ def find_mask(folder: Path, photograph: Path, given: Path | None, named: str | N
         return path
     stem = photograph.stem.removesuffix("_rgb").removesuffix("_rgba")
     for ending in PICTURES:
-        if is_file(beside := photograph.with_name(f"{stem}_mask{ending}")):
-            return beside
+        if is_file(candidate := photograph.with_name(f"{stem}_mask{ending}")):
+            return candidate
     own = photograph.parent.with_name(f"{photograph.parent.name}_mask") if photograph.parent.name else folder / "mask"
     places = [own, *(place / name for place in (folder, photograph.parent.parent) for name in _MASK_FOLDERS)]
     return next((mask for place in places if (mask := _of_name(place, relative)) is not None), None)

@@ -164,20 +164,20 @@ def connect(
     with contextlib.ExitStack() as stack:
         if address is None:
             gpu = name == variant.CUDA or (name == "auto" and variant.gpu_problem() is None)
-            given = stack.enter_context(private_cluster(ray))
-            given |= {"num_cpus": limits.cores(), "include_dashboard": False, "object_store_memory": store_bytes}
-            given |= {} if gpu else {"num_gpus": 0}
+            init_options = stack.enter_context(private_cluster(ray))
+            init_options |= {"num_cpus": limits.cores(), "include_dashboard": False, "object_store_memory": store_bytes}
+            init_options |= {} if gpu else {"num_gpus": 0}
             most = most_by_memory(most)
         else:
             gpu = name == variant.CUDA
-            given = {"address": address}
+            init_options = {"address": address}
             _check_answers(address)
             if not workers.insecure:
                 check_token(address)
                 if _is_located(address):
                     check_cluster(ray, address)
         stack.callback(_leave, ray)
-        _init(ray, address, given)
+        _init(ray, address, init_options)
         gcs_address = ray.get_runtime_context().gcs_address
         if address is None:
             check_private(ray)
@@ -195,13 +195,13 @@ def connect(
         )
 
 
-def _init(ray: Any, address: str | None, given: dict[str, Any]) -> None:
+def _init(ray: Any, address: str | None, init_options: dict[str, Any]) -> None:
     """Start or join the cluster. Raises `InputError`."""
     where = "cannot start on this machine" if address is None else f"cannot be reached at {address}"
     quiet = {"logging_level": logging.ERROR, "log_to_driver": False, "configure_logging": True}
     with _own_signals():
         try:
-            ray.init(namespace=_NAMESPACE, **quiet, **given)
+            ray.init(namespace=_NAMESPACE, **quiet, **init_options)
         except Exception as error:  # of many kinds
             reason = one_line(reason_of(error, 200))
             raise InputError(f"workers: Ray {where}: {reason}") from error

@@ -297,5 +297,5 @@ class MovedPair:
         """Return which lanes survive Russian roulette, and their throughput."""
         most = dr.max(β)
         q = dr.minimum(most * dr.square(η), 0.95)
-        asked = depth >= self.rr_depth
-        return (most != 0) & (~asked | (number < q)), β * dr.select(asked, dr.rcp(q), 1)
+        roulette = depth >= self.rr_depth
+        return (most != 0) & (~roulette | (number < q)), β * dr.select(roulette, dr.rcp(q), 1)

@@ -118,7 +118,7 @@ def sampling_weights(
         delta: lanes that sampled a perfectly specular lobe.
         own_pdf: the density that the BSDF gave its sample: of all lobes, or of the sampled one.
     """
-    whole = dr.abs(own_pdf - pdf) <= _SAME_DENSITY * pdf
-    rejected = whole & (dr.max(weight) <= 0) & (dr.max(dr.detach(values[0])) > 0)
+    full_density = dr.abs(own_pdf - pdf) <= _SAME_DENSITY * pdf
+    rejected = full_density & (dr.max(weight) <= 0) & (dr.max(dr.detach(values[0])) > 0)
     inv_pdf = dr.select(smooth & ~rejected & (pdf > 0), dr.rcp(pdf), 0)
     return [dr.select(delta, weight, dr.detach(value) * inv_pdf) for value in values]
