@@ -13,7 +13,7 @@ import numpy as np
 
 import unrender as ur
 from unrender.app.stages import stages_file
-from unrender.app.stages.stage_problem import Whole
+from unrender.app.stages.stage_problem import StagedProblem
 from unrender.core import arrays, trees, vectors
 from unrender.core.random import Key
 from unrender.core.trees import Tree
@@ -69,8 +69,8 @@ __all__ = [
     "SampleRequest",
     "SlotReaders",
     "Smoke",
+    "StagedProblem",
     "Tree",
-    "Whole",
     "WholeView",
     "advance",
     "arrays",

@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Whole, dr, from_tensor, project, stages_file, stock_scene
+from benchmarks.internals import StagedProblem, dr, from_tensor, project, stages_file, stock_scene
 from benchmarks.photographs.projection import Projection
 from benchmarks.runner.records import scratch
 from unrender import methods
@@ -60,7 +60,7 @@ class Judge:
     def __init__(self, folder: Path, keys: list[str], spp: int):
         given = ur.Problem.from_file(folder / "held-out.toml")
         parameters = [ur.Parameter(key) for key in keys]
-        self.problem = ur.Problem(given.origin["scene"], parameters, given.given_views, max_depth=given.max_depth)
+        self.problem = ur.Problem(given.origin["scene"], parameters, given.declared_views, max_depth=given.max_depth)
         self.folder, self.spp = folder, spp
         self.picture = np.zeros(0)
 
@@ -153,7 +153,7 @@ class Clock(ur.protocols.Callback):
 def in_stages(folder: Path, seconds: float, seed: int) -> tuple[dict[str, np.ndarray], int]:
     """What the stages of an import find, and in how many steps."""
     stages = stages_file.read(folder / stages_file.FILE)
-    whole = Whole.read(stages)
+    whole = StagedProblem.read(stages)
     shares = [share or 0.0 for _, share in stages_file.split(replace(stages, steps=None, seconds=seconds))]
     values: dict[str, np.ndarray] = {}
     steps = 0

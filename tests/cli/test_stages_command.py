@@ -14,7 +14,7 @@ import pytest
 from conftest import KEY, Unrender
 from unrender.app.cli import stages
 from unrender.app.stages import run_folders, stages_file
-from unrender.app.stages.stage_problem import Whole
+from unrender.app.stages.stage_problem import StagedProblem
 from unrender.core.errors import InputError
 from unrender.runs.folder import checkpoint, method_file
 from unrender.runs.folder.lock import Lock
@@ -280,7 +280,7 @@ def test_a_key_that_the_scene_between_stages_has_under_another_name_is_refused(s
         )
     first = stages_file.Stage("light", ("sky.radiance.value",))
     stage = stages_file.Stage("colour", (f"_{KEY}",))
-    whole = Whole.read(stages_file.Stages(staged / "problem.toml", (first, stage), steps=1))
+    whole = StagedProblem.read(stages_file.Stages(staged / "problem.toml", (first, stage), steps=1))
     for _ in range(2):  # what was written is not taken the second time
         with pytest.raises(InputError, match=rf"stage colour: _{KEY} is called \S+ in the scene with"):
             whole.of_stage(stage, {"sky.radiance.value": np.full(3, 0.5, np.float32)}, staged / "scene")

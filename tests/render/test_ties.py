@@ -181,7 +181,7 @@ def test_a_problem_file_has_keys_and_factors_and_a_run_folder_keeps_them(tmp_pat
     assert first.unknowns["paint"].bounds == (0.0, 0.5)  # both reflectances stay below 1
     serialization.save(first, tmp_path / "run")
     again = ur.Problem.from_file(tmp_path / "run" / "problem.toml")
-    assert again.unknowns["paint"].given.keys == {"a.bsdf.reflectance.value": 1.0, "b.bsdf.reflectance.value": 2.0}
+    assert again.unknowns["paint"].parameter.keys == {"a.bsdf.reflectance.value": 1.0, "b.bsdf.reflectance.value": 2.0}
     assert fingerprint.fingerprint(first) == fingerprint.fingerprint(again)
     other = fields.replace("2.0", "3.0")
     assert fingerprint.fingerprint(ur.Problem.from_file(written(tmp_path, other))) != fingerprint.fingerprint(first)

@@ -124,7 +124,7 @@ def test_positive_numbers_move_as_logarithms() -> None:
     ):
         base = problem()
         parameters = [dataclasses.replace(p, **change) if p.key == "gain" else p for p in base.parameters]
-        other = Problem(base.renderer, parameters, base.given_views)
+        other = Problem(base.renderer, parameters, base.declared_views)
         assert chosen(other)[1].reparameterised == (), change
 
 
@@ -155,7 +155,7 @@ def test_a_step_has_so_many_paths(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_large_views_are_drawn_from(monkeypatch: pytest.MonkeyPatch) -> None:
-    constants(monkeypatch, most_pixels=10, drawn=5, drawn_paths=20)
+    constants(monkeypatch, most_pixels=10, batch_pixels=5, batch_paths=20)
     estimator, optimizer = chosen(problem(losses.L1()))
     assert estimator.pixels == pixels.Uniform(5)
     assert estimator.spp == 4

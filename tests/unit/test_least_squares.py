@@ -66,7 +66,7 @@ def test_a_run_that_ended_early_is_told_its_step():
 
 def test_steps_are_not_told_of_losses_with_another_minimum():
     made = problem(MATRIX)
-    made = ur.Problem(made.renderer, [u.given for u in made.unknowns.values()], made.views, loss=ur.losses.L1())
+    made = ur.Problem(made.renderer, [u.parameter for u in made.unknowns.values()], made.views, loss=ur.losses.L1())
     away = at(best(made, MATRIX) + np.array([0.1, 0, 0, 0]))
     assert not check_numbers(made, away, made.initial_values(), FAR).unfinished
 

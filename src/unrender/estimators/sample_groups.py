@@ -262,8 +262,8 @@ def _image_state(
     """Return the next state of the image estimator."""
     image, state = request.image, request.state
     if sample is not None:
-        return image.learn(problem, state, sample, parts[0].kept)
-    return image.advance(request.parameters, state, tuple(part.kept for part in parts))
+        return image.learn(problem, state, sample, parts[0].image_state)
+    return image.advance(request.parameters, state, tuple(part.image_state for part in parts))
 
 
 def _concatenated(draws: list[DrawStatistics]) -> DrawStatistics | None:
@@ -276,7 +276,7 @@ def _concatenated(draws: list[DrawStatistics]) -> DrawStatistics | None:
 
 @dataclass(frozen=True)
 class FrameGradient:
-    """Contribution of one frame to a `GradientSample`. `kept` is its contribution to the image estimator's next state."""
+    """Contribution of one frame to a `GradientSample`. `image_state` is its contribution to the image estimator's next state."""
 
     gradient: Tree
     paired: Tree
@@ -286,7 +286,7 @@ class FrameGradient:
     image: Array
     samples: int
     info: Mapping[str, Any]
-    kept: Any
+    image_state: Any
     draws: DrawStatistics | None = None
     connections: EmitterMoments | None = None
 

@@ -174,8 +174,8 @@ def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int =
         place = level * np.sin(angle), height, level * np.cos(angle)
         camera = parts.camera(place, (0, _MIDDLE, 0), _FIELD_OF_VIEW, size)
         camera["film"]["pixel_format"] = "rgba"
-        seen = mi.load_dict(camera)
-        picture = mi.render(scene, sensor=seen, integrator=path, spp=spp, seed=seed + index)  # pyright: ignore[reportArgumentType]
+        camera_ = mi.load_dict(camera)
+        picture = mi.render(scene, sensor=camera_, integrator=path, spp=spp, seed=seed + index)  # pyright: ignore[reportArgumentType]
         pictures.append(np.array(picture))
         matrix = np.array(camera["to_world"].matrix) @ MITSUBA_TO_OPENGL
         frames.append({"file_path": f"images/{index:02}.png", "transform_matrix": matrix.tolist()})

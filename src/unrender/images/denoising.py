@@ -119,8 +119,8 @@ def _optix(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np
     del fast
     noisy = _continued(picture)
     denoiser = _optix_denoiser(noisy.shape[1], noisy.shape[0], "albedo" in guides, "normals" in guides)
-    given = {name: mi.TensorXf(_continued(guide)) for name, guide in guides.items()}
-    return _as(np.array(denoiser(mi.TensorXf(noisy), **given).numpy()), picture)
+    tensors = {name: mi.TensorXf(_continued(guide)) for name, guide in guides.items()}
+    return _as(np.array(denoiser(mi.TensorXf(noisy), **tensors).numpy()), picture)
 
 
 @functools.lru_cache(maxsize=8)

@@ -137,7 +137,7 @@ class _Network:
     def __init__(self, tensors: Mapping[str, Any], layers: tuple[str, ...], dtype: str):
         torch = _torch()
         self.dtype, kind = np.dtype(dtype), getattr(torch, dtype)
-        self._wanted = layers
+        self._layers = layers
         self._stages: list[tuple[str, Any]] = []
         inputs, number = 3, 0
         for block, widths in enumerate(_BLOCKS, 1):
@@ -163,7 +163,7 @@ class _Network:
         features = {}
         for name, stage in self._stages:
             x = features[name] = stage(x)
-        return [features[name] for name in self._wanted]
+        return [features[name] for name in self._layers]
 
 
 def _torch() -> Any:

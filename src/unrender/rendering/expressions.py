@@ -271,7 +271,7 @@ class _ExpressionSession(SessionWrapper):
 
     def __init__(self, renderer: ExpressionRenderer, inner: RenderSession, differentiable: frozenset[str]):
         super().__init__(inner)
-        self._renderer, self._wanted = renderer, differentiable
+        self._renderer, self._differentiable = renderer, differentiable
         self._known: list[tuple[Tree, Tree]] = []
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
@@ -296,8 +296,8 @@ class _ExpressionSession(SessionWrapper):
         own, rest = self._split(parameters)
         if not own:
             return rest
-        for given, values in self._known:
-            if given.keys() == own.keys() and all(given[key] is x for key, x in own.items()):
+        for inputs, values in self._known:
+            if inputs.keys() == own.keys() and all(inputs[key] is x for key, x in own.items()):
                 return {**rest, **values}
         with dr.suspend_grad():
             values = self._renderer.evaluated(own)
@@ -322,7 +322,7 @@ class _ExpressionSession(SessionWrapper):
         """Return the gradient by the unknowns: the functions' derivatives, transposed, times that by the scene's parameters."""
         own, rest = self._split(parameters)
         gradient = {key: inner_gradient[key] for key in rest if key in inner_gradient}
-        leaves = _leaves({key: x for key, x in own.items() if key in self._wanted})
+        leaves = _leaves({key: x for key, x in own.items() if key in self._differentiable})
         if not leaves:
             return gradient | trees.zeros_like(own)
         fixed = {key: x for key, x in own.items() if key not in leaves}

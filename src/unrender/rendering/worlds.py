@@ -243,7 +243,7 @@ class WorldsSession:
     """Images and derivatives of views of different worlds. See `RenderSession`."""
 
     def __init__(self, renderer: WorldsRenderer, sessions: Mapping[int, RenderSession], differentiable: frozenset[str]):
-        self._renderer, self._sessions, self._wanted = renderer, sessions, differentiable
+        self._renderer, self._sessions, self._differentiable = renderer, sessions, differentiable
         self._known = [{key: renderer.array(x) for key, x in state.values.items()} for state in renderer.states]
         self._keys = [frozenset(state.renderer.parameters()) for state in renderer.states]
         self._own = [state.renderer.values(renderer.known_keys(state.renderer)) for state in renderer.states]
@@ -352,7 +352,7 @@ class WorldsSession:
 
     def _sum(self, parameters: Tree, paths: Sequence[_Part], gradients: Sequence[Tree]) -> Tree:
         """Return the sum of the states' gradients; a value that a state knows has none there."""
-        total = trees.zeros_like({key: x for key, x in parameters.items() if key in self._wanted})
+        total = trees.zeros_like({key: x for key, x in parameters.items() if key in self._differentiable})
         for part, gradient in zip(paths, gradients, strict=True):
             known = self._known[part.state]
             total = {key: x + gradient[key] if key in gradient and key not in known else x for key, x in total.items()}

@@ -167,7 +167,7 @@ class _Numbers:
     def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> _Numbers | None:
         known, count = problem.renderer.parameters(), len(problem.views)
         views = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
-        seen = {problem.views[view].sensor for view in views}
+        sensors = {problem.views[view].sensor for view in views}
         keys = [
             key
             for key, x in values.items()
@@ -175,7 +175,7 @@ class _Numbers:
             and x.size <= _MOST_OF_ONE
             and known[key].perturbable
             and problem.unknowns[key].prior is None
-            and (known[key].sensor is None or known[key].sensor in seen)
+            and (known[key].sensor is None or known[key].sensor in sensors)
         ]
         elements = sum(values[key].size for key in keys)
         pixels = sum(math.prod(problem.sizes[view]) for view in views)

@@ -229,7 +229,7 @@ def _warn_of_skipping(run: Run, culprit: str) -> None:
 def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
     """Warn of shortened steps of meshes, once per mesh."""
     for key in keys:
-        also = " or passed through others" if run.problem.unknowns[key].given.self_intersection == "prevent" else ""
+        also = " or passed through others" if run.problem.unknowns[key].parameter.self_intersection == "prevent" else ""
         line = f"{key}: triangles would have turned over{also}; such steps are shortened"
         if not any(known.endswith(line) for known in run.warnings):
             run.warnings.append(f"step {run.step}: {line}")
@@ -269,7 +269,7 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     shortened = []
     for key, faces in problem.faces.items():
         values = arrays.numpy(bounded[key])
-        crossing = problem.unknowns[key].given.self_intersection != "prevent"
+        crossing = problem.unknowns[key].parameter.self_intersection != "prevent"
         allowed = guarded(arrays.numpy(parameters[key]), values, faces, crossing)
         if allowed is not values:
             bounded[key] = arrays.like(allowed, bounded[key])

@@ -47,7 +47,7 @@ class Progress(Callback):
         self._started = self._shown = self._before = 0.0
         self._loss: float | None = None
         self._error: dict[str, float] = {}
-        self._told = 0
+        self._warnings_shown = 0
 
     def __enter__(self) -> Progress:
         self._listening = phases.listening(self)
@@ -102,7 +102,7 @@ class Progress(Callback):
 
     def on_start(self, run: Run) -> None:
         self._started, self._before, self._shown = time.perf_counter(), run.progress(), 0.0
-        self._loss, self._error, self._told = None, {}, len(run.warnings)
+        self._loss, self._error, self._warnings_shown = None, {}, len(run.warnings)
         if self._console.is_terminal:
             self._open("", 1.0)
 
@@ -111,9 +111,9 @@ class Progress(Callback):
         if math.isfinite(loss):
             self._loss = loss if self._loss is None else self._loss + _SMOOTHING * (loss - self._loss)
         self._error = record.get("parameter_error") or self._error
-        for line in run.warnings[self._told :]:
+        for line in run.warnings[self._warnings_shown :]:
             self._console.print(f"note: {line}", markup=False, highlight=False, soft_wrap=True)
-        self._told = len(run.warnings)
+        self._warnings_shown = len(run.warnings)
         now = time.perf_counter()
         last = bool(run.stopped)
         if self._bar is not None:

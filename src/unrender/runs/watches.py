@@ -108,7 +108,7 @@ class MeshWatch(Hook):
 
     def _crosses(self, run: Run, key: str) -> str:
         """Return the warning about new self-intersections of a mesh; "" if there are none, or it was issued."""
-        if key in self._crossing or run.problem.unknowns[key].given.self_intersection == "ignore":
+        if key in self._crossing or run.problem.unknowns[key].parameter.self_intersection == "ignore":
             return ""
         before, after, joined = _joined(run, key)
         count = len(crossing_triangles(after, joined))

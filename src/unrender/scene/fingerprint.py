@@ -69,9 +69,9 @@ def _take(problem: Problem) -> dict[str, str]:
         for name in ("parameterisation", "regularizer", "prior", "remeshing", "coarse_to_fine"):
             if (setting := getattr(unknown, name)) is not None:
                 parts[f"parameter {key}: {name}"] = repr(setting)
-        if unknown.given.keys is not None:
-            parts[f"parameter {key}: keys"] = repr(ties_of([unknown.given])[0].factors)
-        if unknown.given.self_intersection == "prevent":
+        if unknown.parameter.keys is not None:
+            parts[f"parameter {key}: keys"] = repr(ties_of([unknown.parameter])[0].factors)
+        if unknown.parameter.self_intersection == "prevent":
             parts[f"parameter {key}: self_intersection"] = "prevent"
     for index, view in enumerate(problem.views):
         parts[f"view {index}: sensor"] = str(view.sensor)
@@ -80,7 +80,7 @@ def _take(problem: Problem) -> dict[str, str]:
         parts[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
     if (layer := expression_layer(problem.renderer)) is not None:
         parts |= {f"expression of {one.key}": one.text or "a function" for one in layer.expressions}
-    for index, view in enumerate(problem.given_views):
+    for index, view in enumerate(problem.declared_views):
         known = {} if view.known is None else dict(sorted(view.known.items()))
         fields = {
             f"known {key}": str(x) if isinstance(x, (str, Path)) else _of_array(np.asarray(x, np.float32))

@@ -30,9 +30,9 @@ def standard_deviation(reference: np.ndarray, mask: np.ndarray | None = None) ->
         mask: (H, W); only differences of pixels above 0 count. None for all pixels.
     """
     picture = np.asarray(reference, np.float64)
-    seen = np.isfinite(picture).all(axis=-1) & (True if mask is None else np.asarray(mask) > 0)
-    size = math.sqrt(float(np.mean(picture[seen] ** 2))) if seen.any() else 0.0
-    both = seen[1:, 1:] & seen[:-1, 1:] & seen[1:, :-1] & seen[:-1, :-1]
+    valid = np.isfinite(picture).all(axis=-1) & (True if mask is None else np.asarray(mask) > 0)
+    size = math.sqrt(float(np.mean(picture[valid] ** 2))) if valid.any() else 0.0
+    both = valid[1:, 1:] & valid[:-1, 1:] & valid[1:, :-1] & valid[:-1, :-1]
     twice = 0.5 * (picture[1:, 1:] - picture[:-1, 1:] - picture[1:, :-1] + picture[:-1, :-1])[both]
     deviation = float(np.median(np.abs(twice))) / _MEDIAN if twice.size else 0.0
     return max(deviation, _LEAST * size, 1e-12)

@@ -65,9 +65,9 @@ class References:
         factors = np.empty((len(pixels), 1), np.float32)
         for view in np.unique(views):
             here = views == view
-            seen = self._views[view]
-            values[here] = _rows(seen.reference, pixels[here], 3)
-            factors[here] = self._factors[view] * (1.0 if seen.mask is None else _rows(seen.mask, pixels[here], 1))
+            own = self._views[view]
+            values[here] = _rows(own.reference, pixels[here], 3)
+            factors[here] = self._factors[view] * (1.0 if own.mask is None else _rows(own.mask, pixels[here], 1))
         return self._array(values), self._array(factors)
 
     @cached_property

@@ -26,7 +26,7 @@ class Unknown:
     """An unknown of a problem.
 
     Attributes:
-        given: The parameter as passed, with the settings of a method.
+        parameter: The parameter as passed, with the settings of a method.
         initial: Initial value: float32, inside the bounds, of the scene's shape. Read-only, because it may be the scene's own memory.
         bounds: (low, high), the parameter's or the physical range from the renderer; None is unbounded.
         measure: Measure of errors against the true value.
@@ -44,7 +44,7 @@ class Unknown:
         notices: One line for each change of the input.
     """
 
-    given: Parameter
+    parameter: Parameter
     initial: np.ndarray
     bounds: Bounds
     measure: ErrorMeasure

@@ -141,7 +141,7 @@ def check_parameter(
     notices += _at_bounds(key, parameterisation, transform, initial, bounds)
     notices += [] if mesh is None else mesh_notices(key, *mesh)
     return Unknown(
-        given=parameter,
+        parameter=parameter,
         initial=initial,
         bounds=bounds,
         measure=ErrorMeasure(info.role, info.conversion.repeated),
@@ -172,19 +172,19 @@ def _check_rate(rate: Any) -> float | None:
 
 def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo) -> Unknown:
     """Return the unknown with those settings for which its own are None. Raises `InputError` for an unsuitable one."""
-    own = {n: x for n, x in vars(settings).items() if x is not None and getattr(unknown.given, n) is None}
+    own = {n: x for n, x in vars(settings).items() if x is not None and getattr(unknown.parameter, n) is None}
     changes: dict[str, Any] = dict(own)
     if "parameterisation" in own:
         pair = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
         changes |= {"parameterisation": pair[0], "transform": pair[1]}
     if "preconditioner" in own:
-        changes["preconditioner"] = _check_preconditioner(unknown.given.key, own["preconditioner"], info)
+        changes["preconditioner"] = _check_preconditioner(unknown.parameter.key, own["preconditioner"], info)
     if "coarse_to_fine" in own:
         try:
             _check_resolutions(own["coarse_to_fine"], info)
         except InputError as error:
-            raise InputError(f"parameter {unknown.given.key}: coarse_to_fine: {error}") from error
-    return replace(unknown, given=replace(unknown.given, **own), **changes)
+            raise InputError(f"parameter {unknown.parameter.key}: coarse_to_fine: {error}") from error
+    return replace(unknown, parameter=replace(unknown.parameter, **own), **changes)
 
 
 def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:

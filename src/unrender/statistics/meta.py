@@ -135,9 +135,9 @@ def update(
     Returns:
         (M_i, Var M_i, α_i, the next state).
     """
-    seen = observed or (proportional, difference)
+    statistics = observed or (proportional, difference)
     state, var_f, var_d, var_m, started = _observe(
-        state, *seen, step_norm, beta_proportional, beta_difference, centred, decouple
+        state, *statistics, step_norm, beta_proportional, beta_difference, centred, decouple
     )
     alpha = _bounded_alpha(state, optimal_alpha(var_f, var_m, var_d), var_f, started, clip, max_weight)
     gradient = advance(state.gradient, proportional, proportional - difference, alpha)

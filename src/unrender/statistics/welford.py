@@ -74,9 +74,9 @@ def update(
         beta: decay of the covariance, in [0, 1).
         count: number of samples of which x and y are means, if the covariance of single samples is wanted. Exact for a constant count.
     """
-    seen = state.mean_weight > 0
-    inflation = 1.0 + state.mean_weight_squares / arrays.where(seen, state.mean_weight * state.mean_weight, 1.0)
-    gain = arrays.where(seen, (1.0 - beta) / inflation, 0.0)
+    positive = state.mean_weight > 0
+    inflation = 1.0 + state.mean_weight_squares / arrays.where(positive, state.mean_weight * state.mean_weight, 1.0)
+    gain = arrays.where(positive, (1.0 - beta) / inflation, 0.0)
     dx, dy = x - state.mean_x, y - state.mean_y
     mean_weight = alpha * state.mean_weight + (1.0 - alpha)
     step = (1.0 - alpha) / mean_weight
@@ -86,7 +86,7 @@ def update(
         moment=beta * state.moment + gain * (dx * dy) * count,
         mean_weight=mean_weight,
         mean_weight_squares=alpha * alpha * state.mean_weight_squares + (1.0 - alpha) * (1.0 - alpha),
-        moment_weight=beta * state.moment_weight + arrays.where(seen, 1.0 - beta, 0.0),
+        moment_weight=beta * state.moment_weight + arrays.where(positive, 1.0 - beta, 0.0),
     )
 
 

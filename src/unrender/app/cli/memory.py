@@ -159,10 +159,10 @@ def _passing_on(child: int) -> Iterator[None]:
 
 def _described() -> str:
     parts = []
-    if given := limits.address_space():
-        parts.append(f"ulimit -v allows {given >> 10} kB of address space")
-    if given := limits.group_memory():
-        parts.append(f"the container allows {given >> 20} MB")
+    if limit := limits.address_space():
+        parts.append(f"ulimit -v allows {limit >> 10} kB of address space")
+    if limit := limits.group_memory():
+        parts.append(f"the container allows {limit >> 20} MB")
     return ", ".join(parts)
 
 

@@ -21,7 +21,7 @@ from unrender.core.random import check_seed
 if TYPE_CHECKING:
     import numpy as np
 
-    from unrender.app.stages.stage_problem import Whole
+    from unrender.app.stages.stage_problem import StagedProblem
     from unrender.app.stages.stages_file import RunOptions, Stages
     from unrender.display.terminal import Console
     from unrender.runs.folder.lock import Lock
@@ -38,7 +38,7 @@ class StagesRun:
 
     Attributes:
         stages: stages with their budget and run options.
-        whole: their problem.
+        problem: their problem.
         out: folder of the run folders.
         variant: Mitsuba variant.
         command: typed command, which is saved with the results.
@@ -46,7 +46,7 @@ class StagesRun:
     """
 
     stages: Stages
-    whole: Whole
+    problem: StagedProblem
     out: Path
     variant: str
     command: str
@@ -242,7 +242,7 @@ def _run_stage(
         live.clear()
         return problem, result
     with phases.phase("loading"):
-        problem = run.whole.of_stage(stage, values, run.out / _SCENES / folder.name)
+        problem = run.problem.of_stage(stage, values, run.out / _SCENES / folder.name)
     introduce(console, problem, run.variant)
     steps, seconds = stages_file.split(stages)[index]
     settings = stages.settings_of(stage)
@@ -255,11 +255,11 @@ def _run_stage(
         return problem, optimize(**arguments_of_run)
 
 
-def _read(stages: Stages) -> Whole:
-    from unrender.app.stages.stage_problem import Whole
+def _read(stages: Stages) -> StagedProblem:
+    from unrender.app.stages.stage_problem import StagedProblem
 
     with phases.phase("loading"):
-        return Whole.read(stages)
+        return StagedProblem.read(stages)
 
 
 def _is_finished(folder: Path) -> bool:

@@ -50,13 +50,13 @@ class ViewShare:
         if call.replay:
             self._remember(call, self._replayed(call, request))
             return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started)
-        frames: list[tuple[int, Frame]] = self._whole()
+        frames: list[tuple[int, Frame]] = self._whole_views()
         if call.batch is not None:
             sample = self._sample(call.batch)
             frames = [(-1, PixelBatch(self.problem, sample))]
             request = replace(request, batch=MiniBatch(sample, tangents=self._tree(call.tangents)))
         parts = [request.estimate_frame(self.problem, frame, call.key.fold(max(index, 0))) for index, frame in frames]
-        states = tuple(part.kept for part in parts)
+        states = tuple(part.image_state for part in parts)
         parts_by_name = {name: [getattr(part, name) for part in parts] for name in TREES}
         arrays.evaluate(states, parts_by_name, [part.loss for part in parts])
         if call.batch is None:
@@ -133,7 +133,7 @@ class ViewShare:
     def _pair_request(self, pair: Pair) -> PairRequest:
         return PairRequest(self._tree(pair.previous), pair.space, pair.step, difference_spp=pair.difference_spp)
 
-    def _whole(self) -> list[tuple[int, Frame]]:
+    def _whole_views(self) -> list[tuple[int, Frame]]:
         return [(index, WholeView(self.problem, local)) for local, index in enumerate(self.views)]
 
     def _sample(self, batch: Batch) -> PixelSample:
@@ -165,7 +165,7 @@ class ViewShare:
                 call.key.fold(index).fold(0),
                 request.pair_request,
             )[1]
-            for index, frame in self._whole()
+            for index, frame in self._whole_views()
         )
         arrays.evaluate(memory)
         return memory

@@ -21,11 +21,11 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["Whole"]
+__all__ = ["StagedProblem"]
 
 
 @dataclass(frozen=True)
-class Whole:
+class StagedProblem:
     """A problem with the unknowns of all stages, without its scene in memory: Mitsuba compiles kernels for all loaded scenes.
 
     Attributes:
@@ -44,7 +44,7 @@ class Whole:
     known: dict[str, ParameterInfo]
 
     @classmethod
-    def read(cls, stages: Stages) -> Whole:
+    def read(cls, stages: Stages) -> StagedProblem:
         """Read the problem file of the stages.
 
         Raises:
@@ -58,7 +58,7 @@ class Whole:
         return cls(
             Path(problem.origin["scene"]),
             parameters,
-            problem.given_views,
+            problem.declared_views,
             problem.loss,
             problem.max_depth,
             problem.truth,

@@ -25,10 +25,10 @@ class Constants:
     """Limits of the samples per pixel of a step. Source: fact 21 of the design, variance of the leave-one-out gradient by spp."""
     most_pixels: int = 1 << 19
     """Number of pixels of all views up to which a step renders all of them. Source: by hand."""
-    drawn: int = 1 << 15
+    batch_pixels: int = 1 << 15
     """Size of the pixel mini-batch for more pixels. Source: `photographs`, 25.2 dB on 57 views (af62c5a)."""
-    drawn_paths: int = 1 << 17
-    """Path budget of a step with a mini-batch. Source: as for `drawn`."""
+    batch_paths: int = 1 << 17
+    """Path budget of a step with a mini-batch. Source: as for `batch_pixels`."""
 
     memory: float = 0.97
     """Largest weight of control variates, for losses that noise biases. Source: `suite`."""

@@ -20,13 +20,13 @@ from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.partitioned import Partitioned
 from unrender.schedules import Exponential
 
-__all__ = ["beside", "cameras", "cameras_by_paths", "few_numbers"]
+__all__ = ["cameras", "cameras_by_paths", "few_numbers", "with_separate_block"]
 
 
 def cameras(traits: Traits) -> Plan | None:
     """Return Gauss-Newton steps if poses of sensors are unknown, with or without lenses; else None."""
     constants, problem = traits.constants, traits.problem
-    of_cameras = traits.only_cameras or traits.cameras_beside_lenses
+    of_cameras = traits.only_cameras or traits.cameras_and_lenses
     if not of_cameras or not traits.newton_suits or traits.elements > constants.most_elements:
         return None
     spp = traits.options.spp or sampling.within(constants.image_spp, constants.image_paths // problem.pixels)
@@ -80,7 +80,7 @@ def few_numbers(traits: Traits) -> Plan | None:
     return Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
 
 
-def beside(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
+def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
     """Return a path-gradient plan with a separate block of these unknowns; None if Gauss-Newton steps do not suit them.
 
     Args:

@@ -16,7 +16,7 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling
 from unrender.methods.rules.first_rates import first_rates
 from unrender.methods.rules.kinds import KINDS
-from unrender.methods.rules.newton import beside
+from unrender.methods.rules.newton import with_separate_block
 from unrender.methods.rules.traits import Traits, refusal
 from unrender.methods.smoothed import parse_widths, widths_of
 from unrender.optimizers.base import Optimizer
@@ -35,7 +35,7 @@ def paths_and_perturbed(traits: Traits) -> Plan | None:
     others = problem.with_parts(renderer=PartialDerivatives(problem.renderer, frozenset(keys)))
     if not 0 < len(keys) < len(traits.infos) or refusal(others):
         return None
-    if plan := beside(traits, tuple(keys), paths(replace(traits, problem=others, block=tuple(keys)))):
+    if plan := with_separate_block(traits, tuple(keys), paths(replace(traits, problem=others, block=tuple(keys)))):
         return plan
     rates = {key: constants.perturbed_share * width for key, width in widths_of(sigma, keys).items()}
     plan = paths(replace(traits, problem=others, rates=rates))

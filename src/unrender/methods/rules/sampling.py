@@ -26,14 +26,14 @@ def sampler(traits: Traits) -> tuple[PixelSampler, str]:
         return pixels.Views(batch), f"{batch} of {views} views a step: moving borders cost each view alike"
     if few or not problem.loss.pixelwise:
         return pixels.All(), ""
-    return pixels.Uniform(constants.drawn), f"{constants.drawn} of all {count} pixels a step"
+    return pixels.Uniform(constants.batch_pixels), f"{constants.batch_pixels} of all {count} pixels a step"
 
 
 def samples_per_pixel(traits: Traits, sampler: PixelSampler) -> int:
     """Return the largest power of two within the path budget, clamped to the limits, unless it is set."""
     constants = traits.constants
     draws = isinstance(sampler, pixels.Uniform)
-    count, paths = (sampler.count, constants.drawn_paths) if draws else (traits.problem.pixels, constants.paths)
+    count, paths = (sampler.count, constants.batch_paths) if draws else (traits.problem.pixels, constants.paths)
     power = 1 << ((paths // count).bit_length() - 1 if count <= paths else 0)
     return traits.options.spp or within(constants.spp, power)
 

@@ -64,7 +64,7 @@ class Traits:
         return all(info.viewpoint and info.rigid for info in self.infos.values())
 
     @property
-    def cameras_beside_lenses(self) -> bool:
+    def cameras_and_lenses(self) -> bool:
         """Return whether all unknowns are poses of sensors and other numbers that change the form of the picture, such as lenses."""
         infos = self.infos.values()
         suit = all(info.perturbable and (info.viewpoint or (info.nonlinear and not info.rigid)) for info in infos)

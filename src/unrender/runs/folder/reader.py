@@ -98,7 +98,11 @@ def read(directory: str | Path) -> RunFolder:
     truth = _optional(path / schema.TRUTH, path)
     known = {key: value for key, value in truth.items() if key in parameters}
     before, after = (
-        {k: e for k, wanted in known.items() if (e := record.problem.measure(k).error(of[k], wanted)) is not None}
+        {
+            k: e
+            for k, true_value in known.items()
+            if (e := record.problem.measure(k).error(of[k], true_value)) is not None
+        }
         for of in (initial, parameters)
     )
     meshes = meshes_in(_optional(path / schema.MESHES, path), parameters, initial, path / schema.MESHES)

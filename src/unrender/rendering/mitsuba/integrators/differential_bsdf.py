@@ -37,14 +37,14 @@ class BranchVertex:
         depth: number of segments before it.
         β: throughput up to it.
         η: relative index of refraction up to it.
-        found: lanes that have such a vertex.
+        valid: lanes that have such a vertex.
     """
 
     ray: mi.Ray3f
     depth: UInt32
     β: Spectrum
     η: Float
-    found: Bool
+    valid: Bool
 
     @staticmethod
     def nowhere(ray: mi.Ray3f) -> BranchVertex:
@@ -53,13 +53,13 @@ class BranchVertex:
 
     def or_else(self, other: BranchVertex) -> BranchVertex:
         """Return this vertex, or `other` in lanes that had none before."""
-        take = other.found & ~self.found
+        take = other.valid & ~self.valid
         return BranchVertex(
             ray=dr.select(take, other.ray, self.ray),
             depth=dr.select(take, other.depth, self.depth),
             β=dr.select(take, other.β, self.β),
             η=dr.select(take, other.η, self.η),
-            found=self.found | other.found,
+            valid=self.valid | other.valid,
         )
 
 
@@ -180,9 +180,9 @@ class DifferentialBsdf:
                 active). It applies the MIS weight to emitters that the ray hits.
         """
         geometry: Any = context.geometry
-        si = geometry.ray_intersect(branch.ray, ray_flags=mi.RayFlags.All, coherent=False, active=branch.found)
+        si = geometry.ray_intersect(branch.ray, ray_flags=mi.RayFlags.All, coherent=False, active=branch.valid)
         bsdf = si.bsdf(branch.ray)
-        lobe = self.lobe(context, si, bsdf, branch.found & si.is_valid())
+        lobe = self.lobe(context, si, bsdf, branch.valid & si.is_valid())
         slope = mi.Spectrum(0)
         for wo in lobe.pair(numbers.next_2d()):
             active = lobe.reflects(wo)

@@ -208,10 +208,10 @@ class MovedPair:
         """Add the contributions of visible emitter samples. Shadow rays are skipped for contributions of 0 and for results of the other
         state."""
         scene, sceneₚ = scenes
-        ray, asked, askedₚ = now.si.spawn_ray_to(now.to), dr.max(now.Ld) != 0, dr.max(before.Ld) != 0
-        hidden = scene.ray_test(ray, asked)
-        known = path.same & asked & dr.all(now.to == before.to) & ~tables["bounds"].meet(ray, ray.maxt)
-        hiddenₚ = sceneₚ.ray_test(before.si.spawn_ray_to(before.to), askedₚ & ~known)
+        ray, contributes, contributesₚ = now.si.spawn_ray_to(now.to), dr.max(now.Ld) != 0, dr.max(before.Ld) != 0
+        hidden = scene.ray_test(ray, contributes)
+        known = path.same & contributes & dr.all(now.to == before.to) & ~tables["bounds"].meet(ray, ray.maxt)
+        hiddenₚ = sceneₚ.ray_test(before.si.spawn_ray_to(before.to), contributesₚ & ~known)
         path.current.L += now.Le + dr.select(hidden, 0, now.Ld)
         path.previous.L += before.Le + dr.select(dr.select(known, hidden, hiddenₚ), 0, before.Ld)
 

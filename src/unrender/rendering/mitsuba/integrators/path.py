@@ -333,7 +333,7 @@ class PathPair:
         if not path.branches or self.differential is None:
             return None
         (branch,) = path.branches
-        lobe = self.differential.lobe(context, si, bsdf, active & ~branch.found)
+        lobe = self.differential.lobe(context, si, bsdf, active & ~branch.valid)
         path.branches = [branch.or_else(BranchVertex(path.ray, path.depth, path.β[0], path.η, lobe.served))]
         return lobe
 
