@@ -85,7 +85,7 @@ class Problem(ViewLosses):
         unknowns: {key: `Unknown`}: the parameters with their defaults filled in, in order.
         views: tuple of `View`, with the reference as a float32 array (H, W, 3), and the mask as (H, W) or None. If all references exceed
             512 MiB, they are stored in a temporary file, and `np.asarray` reads one.
-        declared_views: tuple of `View`, as passed.
+        given_views: tuple of `View`, as passed.
         loss, max_depth, name: as above.
         origin: how to recreate the problem: {"scene": path of the XML}, plus "file", the path of the problem file, if there is one;
             {"gallery": name, "options": {...}}; empty if only the program that made it can recreate it.
@@ -102,7 +102,7 @@ class Problem(ViewLosses):
     renderer: Renderer
     unknowns: Mapping[str, Unknown]
     views: tuple[View, ...]
-    declared_views: tuple[View, ...]
+    given_views: tuple[View, ...]
     loss: Loss
     max_depth: int
     name: str
@@ -131,9 +131,9 @@ class Problem(ViewLosses):
         check_max_depth(max_depth)
         checked_loss = check_loss(L2() if loss is None else loss)
         checked_parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
-        declared_views: tuple[View, ...] = check_sequence(views, View, "views")
+        given_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
-        renderer, located = _opened(scene, max_depth, checked_parameters, declared_views, expressions or {})
+        renderer, located = _opened(scene, max_depth, checked_parameters, given_views, expressions or {})
         unknowns = _unknowns(checked_parameters, renderer, truth or {}, surfaces or {})
         checked_views, view_notices = check_views(located, renderer, checked_loss)
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))
@@ -142,7 +142,7 @@ class Problem(ViewLosses):
             renderer=renderer,
             unknowns=unknowns,
             views=checked_views,
-            declared_views=declared_views,
+            given_views=given_views,
             loss=checked_loss,
             max_depth=max_depth or longest_path(renderer),
             name=name or (path.stem if path else "problem"),
@@ -183,7 +183,7 @@ class Problem(ViewLosses):
         made = Problem(
             self.renderer,
             checked_parameters,
-            self.declared_views if views is None else views,
+            self.given_views if views is None else views,
             self.loss if loss is None else loss,
             self.max_depth,
             truth={key: value for key, value in self.truth.items() if key in keys} if truth is None else truth,

@@ -46,7 +46,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     Raises:
         InputError: the problem cannot be sent: it has a loaded scene, or a function or object of this process.
     """
-    located_views = [_located(problem.declared_views[view], "reference", "mask", "scene") for view in views]
+    located_views = [_located(problem.given_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
     sensors = sensors_with_rows(problem.renderer)
     if sensors is not None and any(view.own_world for view in problem.given_views):

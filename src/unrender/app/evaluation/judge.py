@@ -175,7 +175,7 @@ def _problem(
     notices = [f"{', '.join(left_out)}: not in the scene of {held_out.name}, left out"] if left_out else []
     bounds = {parameter.key: parameter.bounds for parameter in problem.parameters if parameter.keys is None}
     plain = [Parameter(key, bounds=bounds.get(key)) for key in shared]
-    judged = Problem(other.origin["scene"], plain, other.declared_views, max_depth=problem.max_depth, name=other.name)
+    judged = Problem(other.origin["scene"], plain, other.given_views, max_depth=problem.max_depth, name=other.name)
     if not isinstance(judged.renderer, MitsubaRenderer):
         raise InputError(f"{held_out}: it is not rendered by Mitsuba")
     judged = reopen.with_meshes(judged, run)
