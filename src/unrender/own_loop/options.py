@@ -18,8 +18,8 @@ from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
 from unrender.pixels.uniform import Uniform
+from unrender.rendering.picture_format import format_of
 from unrender.rendering.renderer import Renderer as RendererPort
-from unrender.rendering.renderer import format_of
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.validation import open_renderer
