@@ -78,11 +78,8 @@ def run(
     SIGTERM stop after the current step and save the state; `unrender resume` continues from there.
     """
     arguments.check_file(problem)
-    method_settings, options = (
-        arguments.settings(settings, "--set"),
-        arguments.settings(problem_settings, "--problem-set"),
-    )
-    steps, seconds = _budget_settings(method_settings, steps, seconds)
+    values, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
+    steps, seconds = _budget_settings(values, steps, seconds)
     arguments.budget(steps, seconds)
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
@@ -95,11 +92,11 @@ def run(
 
             chosen, processes = _method(method_name), dealing.check(workers, compress, insecure)
             if stages.is_stages(problem):
-                stages.refuse_settings(method_name, method_settings, options, workers)
+                stages.refuse_settings(method_name, values, options, workers)
                 plan = (steps, seconds), seed, out, overwrite, variant, threads, command, checkpoint_every, final_spp
                 return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
             steps, seconds = arguments.budget(steps, seconds)
-            chosen.start(method_settings)
+            chosen.start(values)
             arguments.check_problem(problem, options)
         folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
         try:
@@ -107,9 +104,7 @@ def run(
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
             with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
-                task = RunOrder(
-                    chosen, method_settings, steps, seconds, seed, final_spp, command, options, checkpoint_every
-                )
+                task = RunOrder(chosen, values, steps, seconds, seed, final_spp, command, options, checkpoint_every)
                 with execution(dealt, task, folder, console, progress) as order:
                     result = optimize(**order)
         finally:
