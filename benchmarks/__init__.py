@@ -1,10 +1,10 @@
 """The benchmarks: `python -m benchmarks` lists them, `python -m benchmarks rcv.fig4_order` runs one.
 
-A benchmark is a folder with three files:
+A benchmark is a folder with two files:
 
-    run.py     `run(...)` measures; its parameters are the command's options. `QUICK`: toy sizes for `--quick`.
-    report.py  `table(record)` makes the Markdown of the benchmark's page, `plot(record)` its figure where it has one.
-    notes.md   the section's title, and the findings.
+    run.py    `run(...)` measures; its parameters are the command's options. `QUICK`: toy sizes for `--quick`.
+              `table(record)` makes the Markdown of its page, `plot(record)` its figure where it has one.
+    notes.md  the section's title, and the findings.
 
 `benchmarks.runner` does everything else; the other modules here are measurements that several benchmarks share.
 """

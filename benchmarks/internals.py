@@ -3,6 +3,8 @@
 Dr.Jit and Mitsuba stand here untyped (`dr`, `mi`): their stubs know less than their functions return.
 """
 
+# ruff: noqa: F401, F811 (names for other modules)
+
 from __future__ import annotations
 
 import importlib
@@ -10,11 +12,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from unrender.runs.sensitivity import hardly_seen
 
 import unrender as ur
 from unrender.app.stages import stages_file
 from unrender.app.stages.stage_problem import StagedProblem
-from unrender.core import arrays, trees, vectors
+from unrender.backend.versions import hardware, versions
+from unrender.core import arrays, trees
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
@@ -40,9 +44,6 @@ from unrender.rendering.numpy.one_pixel import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.runs import loop
 from unrender.runs.budget import Budget
-from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, first_values
-from unrender.runs.result import hardware, versions
-from unrender.runs.sensitivity import hardly_seen
 from unrender.scene.batches import WholeView
 from unrender.scene.bounds import project
 from unrender.scene.executor import LOCAL
@@ -51,64 +52,6 @@ from unrender.statistics.recursion import advance
 
 dr: Any = importlib.import_module("drjit")
 mi: Any = importlib.import_module("mitsuba")
-
-__all__ = [
-    "RATE",
-    "Estimate",
-    "Estimator",
-    "ImageEstimate",
-    "ImageEstimator",
-    "IndirectRoom",
-    "Key",
-    "ObjectGraph",
-    "Optimizer",
-    "PixelSampler",
-    "PlainState",
-    "Range",
-    "RenderSession",
-    "SampleRequest",
-    "SlotReaders",
-    "Smoke",
-    "StagedProblem",
-    "Tree",
-    "WholeView",
-    "advance",
-    "arrays",
-    "available_denoiser",
-    "black_box",
-    "build_problem",
-    "coupled_gradients",
-    "descend",
-    "dr",
-    "element_scales",
-    "from_tensor",
-    "gradient_of",
-    "hardly_seen",
-    "hardware",
-    "image_step",
-    "leave_one_out_groups",
-    "load_scene",
-    "media",
-    "method",
-    "mi",
-    "mitsuba_renderer",
-    "parts",
-    "pixel_probability",
-    "pixel_shares",
-    "prepare",
-    "project",
-    "scene_description",
-    "second_moments",
-    "stages_file",
-    "stock_scene",
-    "trees",
-    "vectors",
-    "versions",
-    "volumes",
-    "volumetric",
-    "with_differential_bsdf",
-    "with_preconditioner",
-]
 
 
 def prepare(problem: ur.Problem, keys: Any, space: Space | None = None, derivatives: bool = True) -> RenderSession:
@@ -283,6 +226,6 @@ def with_preconditioner(problem: ur.Problem, preconditioner: Any, *keys: str) ->
 
 def descend(problem: ur.Problem, estimator: Estimator, optimizer: Optimizer, steps: int) -> dict[str, np.ndarray]:
     """Return the parameters after some steps; without the pictures that verify a run, which cost more than a short one."""
-    run, state = loop.prepare(Plan(problem, estimator, optimizer), steps, None, 1)
-    log = RunMetadata(describe_run(run, RunAnnotations()), first_values(run))
-    return loop.descend(loop.Descent(run, state, log, [Budget()])).parameters
+    run = loop.prepare(Plan(problem, estimator, optimizer), steps, None, 1)
+    run.callbacks = [Budget()]
+    return loop.descend(run).parameters

@@ -16,7 +16,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,10 +24,11 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks import figures, markdown
 from benchmarks.internals import mi
 from benchmarks.peers import scenes
 from benchmarks.races import search, total_error
-from benchmarks.runner.records import scratch
+from benchmarks.runner.records import Record, scratch
 from benchmarks.suite.run import visible
 from benchmarks.timed_runs import Kept, blind
 
@@ -279,3 +280,55 @@ def run(
                 runs = [peer.run(judge, seconds, seed, rate) for seed in range(seeds)]
                 sides[f"{peer.name}, tuned"] = {"settings": {**peer.settings, peer.rate: rate}, "runs": runs}
                 yield found
+
+
+_RATES = ("base_learning_rate", "learning_rate")
+
+
+def _reached(runs: Sequence[Record], error: float) -> str:
+    """The median over runs of the seconds after which the error is first at most so much."""
+    firsts = [next((seconds for seconds, found in run["curve"] if found <= error), np.inf) for run in runs]
+    found = float(np.median(firsts))
+    return f"{found:.1f} s" if np.isfinite(found) else "never"
+
+
+def table(record: Record) -> str:
+    """Errors at the end, and steps; how far each peer's rendering of the true scene is from the references."""
+    text = "{seconds:g} s of the processor, pictures of {resolution}², textures of {texture}², errors relative to the start, median and "
+    text += "range: of the textures where seen, and of held-out pictures."
+    parts = [text.format(**record["settings"])]
+    for name, sides in record["problems"].items():
+        ours = sides["auto"]["runs"]
+        several = len(ours[0]["each"]) > 1
+        head = "side | rate | steps | textures | held-out pictures | `auto` as good after"
+        rows = [_row(side, entry, ours, several) for side, entry in sides.items()]
+        runs = ((side, run) for side, entry in sides.items() for run in entry["runs"])
+        checks = ", ".join(f"{side} {run['check']:.3f}" for side, run in runs if "check" in run)
+        parts += [
+            f"**{name}**, {len(ours)} seed{'s' if len(ours) > 1 else ''}",
+            markdown.table(f"{head} | each texture" if several else head, rows),
+            f"The true scene as a peer renders it, from the references, relative: {checks}.",
+        ]
+    return markdown.blocks(*parts)
+
+
+def _row(side: str, entry: Record, ours: Sequence[Record], several: bool) -> list[str]:
+    runs = entry["runs"]
+    rate = next((f"{entry['settings'][key]:.2g}" for key in _RATES if key in entry.get("settings", {})), "")
+    steps = f"{np.median([run['steps'] for run in runs]):g}"
+    errors = [markdown.spread([run[kind] for run in runs]) for kind in ("textures", "pictures")]
+    reached = "" if side == "auto" else _reached(ours, float(np.median([run["textures"] for run in runs])))
+    each = [f"{channel} {np.median([run['each'][channel] for run in runs]):.3f}" for channel in runs[0]["each"]]
+    return [side, rate, steps, *errors, reached, *(["; ".join(each)] if several else [])]
+
+
+def plot(record: Record) -> figures.Figure:
+    """Error of the textures over processor seconds."""
+    panels = {
+        name: {
+            side: [tuple(zip((0.0, 1.0), *run["curve"][1:], strict=True)) for run in entry["runs"]]
+            for side, entry in sides.items()
+        }
+        for name, sides in record["problems"].items()
+    }
+    return figures.curves(panels, "processor seconds", "error where seen / at the start", log="")

@@ -24,9 +24,11 @@ import mitsuba as mi
 import numpy as np
 
 import unrender as ur
+from benchmarks import figures, markdown
 from benchmarks.internals import StagedProblem, dr, from_tensor, project, stages_file, stock_scene
 from benchmarks.photographs.projection import Projection
-from benchmarks.runner.records import scratch
+from benchmarks.runner.records import Record, scratch
+from benchmarks.timed_runs import Kept
 from unrender import methods
 from unrender.app.capture import importing
 from unrender.app.evaluation.measures import measure
@@ -133,23 +135,6 @@ def stock(
     return {key: np.array(dr.ravel(optimizer[key])).reshape(shape) for key, shape in shapes.items()}, step
 
 
-class Clock(ur.protocols.Callback):
-    """Ends a run after so many seconds of the processor. Its first step, which compiles, does not count."""
-
-    def __init__(self, seconds: float):
-        self.seconds, self.spent, self.steps = seconds, 0.0, 0
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `ur.protocols.Callback`."""
-        del record
-        now = time.process_time()
-        self.spent += now - self._since if self.steps else 0.0
-        self.steps += 1
-        if self.spent >= self.seconds:
-            run.stop()
-        self._since = now
-
-
 def in_stages(folder: Path, seconds: float, seed: int) -> tuple[dict[str, np.ndarray], int]:
     """What the stages of an import find, and in how many steps."""
     stages = stages_file.read(folder / stages_file.FILE)
@@ -160,7 +145,7 @@ def in_stages(folder: Path, seconds: float, seed: int) -> tuple[dict[str, np.nda
     for index, (stage, share) in enumerate(zip(stages.stages, shares, strict=True)):
         problem = whole.of_stage(stage, values, folder / "scenes" / stage.name)
         plan = plan_of(stage.method or stages.method, problem, stages.settings_of(stage))
-        clock = Clock(share)
+        clock = Kept(share, points=1)
         result = ur.optimize(problem, plan, steps=1_000_000, seed=seed + index, callbacks=[clock])
         values |= {key: np.asarray(value) for key, value in result.parameters.items()}
         steps += clock.steps
@@ -240,7 +225,7 @@ def run(
                 if who in ("stages", "stages-flat"):
                     values, steps = in_stages(judge.folder, seconds, 100 * seed)
                 else:
-                    clock = Clock(seconds)
+                    clock = Kept(seconds, points=1)
                     plan = plan_of(who, problem, METHODS[who])
                     result = ur.optimize(problem, plan, steps=1_000_000, seed=seed, callbacks=[clock])
                     values, steps = result.parameters, clock.steps
@@ -292,3 +277,40 @@ def tuned(
 def plan_of(name: str, problem: ur.Problem, settings: dict[str, Any]) -> Any:
     """Return the plan of a method for the problem."""
     return methods.method(name).plan(problem, settings)
+
+
+def table(record: Record) -> str:
+    """Held-out PSNR of each, of each capture, resolution and time."""
+    races = sorted(record["races"].items(), key=lambda item: (item[1]["pixels"], item[1]["seconds"]))
+    return markdown.blocks(*(_race(name, race) for name, race in races))
+
+
+def _race(name: str, race: Record) -> str:
+    rows, tried = [], []
+    for who, entry in race["found"].items():
+        means = [float(np.mean(one)) for one in entry["psnr"]]
+        spread = f" ± {np.std(means):.2f}" if len(means) > 1 else ""
+        given = {key: value for key, value in entry.get("settings", {}).items() if value is not False}
+        settings = ", ".join(key if value is True else f"{key} {value:g}" for key, value in given.items())
+        steps = f"{np.mean(entry['steps']):.0f}" if "steps" in entry else ""
+        worst = f"{min(entry['psnr'][0]):.2f}"
+        rows.append([who, f"{np.mean(means):.2f}{spread}", worst, len(means), steps, settings])
+        for row in entry.get("tried", []):
+            rate = f"{row['rate']:g}{' falling' if row.get('falling') else ''}"
+            tried.append([who, row["spp"], rate, row["steps"], f"{np.mean(row['psnr']):.2f}"])
+    capture, size, _ = name.rsplit(", ", 2)
+    counts = f"{race['views']} photographs of {size} pixels along the longer side, {race['held_out']} more held out"
+    parts = [
+        f"{capture}: {counts}, {race['seconds']:g} s of the processor each.",
+        markdown.table(" | held-out PSNR (dB) | the worst of them | seeds | steps | settings", rows),
+    ]
+    if tried:
+        parts.append(markdown.table("tried | spp | rate | steps | held-out PSNR (dB)", tried))
+    return markdown.blocks(*parts)
+
+
+def plot(record: Record) -> figures.Figure:
+    """A held-out photograph of the vase that the project renders, and what each makes of it."""
+    maps = record["maps"]
+    shown = ("photograph", "projection", "stock", "stock-normals", "stages")
+    return figures.pictures([{name: maps[name] for name in shown if name in maps}])

@@ -26,24 +26,25 @@ class Benchmark:
 
     Attributes:
         name: of the folder, with dots: "rcv.fig4_order".
-        folder: with run.py, report.py, notes.md, and, once measured, results.json, and maps.npz where it keeps images.
+        folder: with run.py, notes.md, and, once measured, results.json, and maps.npz where it keeps images.
     """
 
     name: str
     folder: Path
 
-    def module(self, kind: str) -> ModuleType:
-        """Its run or report module."""
-        return importlib.import_module(f"benchmarks.{self.name}.{kind}")
+    @property
+    def module(self) -> ModuleType:
+        """Its module run.py: `run` measures, `table` and `plot` show a record."""
+        return importlib.import_module(f"benchmarks.{self.name}.run")
 
     def table(self, record: dict[str, Any]) -> str:
         """Return the tables of a record as Markdown."""
-        return self.module("report").table(record)
+        return self.module.table(record)
 
     @property
     def plot(self) -> Callable[[dict[str, Any]], Any] | None:
         """The function that draws a record; None where the table says it all."""
-        return getattr(self.module("report"), "plot", None)
+        return getattr(self.module, "plot", None)
 
     @property
     def docstring(self) -> str:

@@ -63,7 +63,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def execute(benchmark: Benchmark, arguments: Sequence[str]) -> int:
     """Measure and plot one benchmark, or plot its record."""
-    module = benchmark.module("run")
+    module = benchmark.module
     parser = argparse.ArgumentParser(
         f"python -m benchmarks {benchmark.name}",
         description=benchmark.docstring,
@@ -107,7 +107,7 @@ def measure(benchmark: Benchmark, settings: dict[str, Any], folder: Path, keep: 
     """
     import unrender as ur
 
-    module = benchmark.module("run")
+    module = benchmark.module
     if getattr(module, "RENDERS", True):
         print(f"variant {ur.use()}", flush=True)
     load = Load()

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks import markdown
 from benchmarks.internals import Key, SampleRequest, dr, mi, prepare, project, stock_scene
 from benchmarks.paths import truth
+from benchmarks.runner.records import Record
 from benchmarks.runner.timing import percentiles, turns
 from benchmarks.stock_loop import stock_loop
 
@@ -119,3 +121,31 @@ def run(problem: tuple[str, ...] = PROBLEMS, resolution: int = 128, spp: int = 1
         "step_ratios": {f"{name}/stock": steps[name][0] / stock for name in ("leave-one-out", "rcv")},
         "gradient_variance": {name: gradient_variance(made, spp) for name, made in half.items()},
     }
+
+
+def table(record: Record) -> str:
+    """Costs as ratios."""
+    primal, steps, ratios = record["primal_ms"], record["step_ms"], record["step_ratios"]
+    images = [
+        ["plain, this kernel", f"{primal['plain'][0]:.1f}", "1"],
+        [
+            "Mitsuba's prb, primal",
+            f"{primal['mitsuba_prb'][0]:.1f}",
+            f"{primal['pair/plain'] / primal['pair/prb']:.2f}",
+        ],
+        ["**pair**", f"{primal['pair'][0]:.1f}", f"**{primal['pair/plain']:.2f}** ({primal['pair/prb']:.2f} of prb)"],
+    ]
+    whole = [["stock loop", f"{steps['stock']:.1f}", "1"]]
+    for key, name in {"leave-one-out": "plain, leave-one-out groups", "rcv": "control variate"}.items():
+        whole.append([name, f"{steps[key][0]:.1f}", f"**{ratios[f'{key}/stock']:.2f}**"])
+    variance = [
+        [name, *(f"{entry[place]['ratio']:.2f}" if place in entry else "" for place in ("start", "near the truth"))]
+        for name, entry in record["gradient_variance"].items()
+    ]
+    return markdown.blocks(
+        "`indirect-room`, {resolution}², {spp} spp, milliseconds (median of 15).".format(**record["settings"]),
+        markdown.table("primal | ms | ratio", images),
+        markdown.table("whole step | ms | of the stock loop", whole),
+        "Variance of the gradient, leave-one-out groups over an adjoint on paths of its own, equal spp, L2 (equal is 1):",
+        markdown.table("problem | at the start | near the truth", variance),
+    )

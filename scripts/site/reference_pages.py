@@ -159,7 +159,7 @@ result = ur.optimize(problem, ur.PathGradient(spp=16), ur.optimizers.Adam(0.05),
 print(result.status, result.parameters, result.verification["best"])
 """,
         (
-            *("function optimize", "function estimate", "function sensitivity", "function resume"),
+            *("function optimize", "function estimate", "function unrender.runs.sensitivity", "function resume"),
             *("function unrender.app.distribute", "function unrender.app.sweep"),
             *("class unrender.app.sweeps.record.SweepRecord", "class Result"),
             *("class unrender.runs.Live", "class unrender.runs.TensorBoard", "class unrender.core.random.Key"),
@@ -232,14 +232,14 @@ print(welford.covariance(state))
         tuple(f"unrender.statistics{part}" for part in ("", ".welford", ".meta", ".gaussian", ".recursion")),
     ),
     "metrics": Page(
-        "`ur.metrics`",
+        "`ur.losses.metrics`",
         "Differences of pictures in numbers.",
         """
 import numpy as np
 
 reference = np.random.default_rng(0).uniform(0, 1, (16, 16, 3))
 picture = 0.9 * reference
-print(ur.metrics.rmse(picture, reference), ur.metrics.ssim(picture, reference))
+print(ur.losses.metrics.rmse(picture, reference), ur.losses.metrics.ssim(picture, reference))
 """,
         ("unrender.losses.metrics", "unrender.scene.surfaces"),
     ),

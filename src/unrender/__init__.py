@@ -25,23 +25,15 @@ from unrender.backend.variant import use
 from unrender.core.errors import InputError, UnrenderError, VariantError
 
 if TYPE_CHECKING:
-    from unrender import (
-        app,
-        estimators,
-        gallery,
-        images,
-        losses,
-        optimizers,
-        parameterisations,
-        pixels,
-        preconditioners,
-        protocols,
-        runs,
-        scene,
-        schedules,
-        statistics,
-    )
+    from unrender import app as app
+    from unrender import estimators as estimators
+    from unrender import gallery, images, losses, optimizers, pixels, preconditioners, statistics
     from unrender import io as io
+    from unrender import parameterisations as parameterisations
+    from unrender import protocols as protocols
+    from unrender import runs as runs
+    from unrender import scene as scene
+    from unrender import schedules as schedules
     from unrender.core.registry import register
     from unrender.estimators import smoothing as smoothed
     from unrender.estimators.base import Estimate
@@ -50,27 +42,35 @@ if TYPE_CHECKING:
     from unrender.estimators.path import PathGradient
     from unrender.estimators.smoothed import SmoothedDerivatives
     from unrender.estimators.smoothing import grey_box as grey_box
-    from unrender.losses import metrics
     from unrender.own_loop.renderer import Renderer
     from unrender.runs.optimize import estimate, optimize
     from unrender.runs.reopen import resume
     from unrender.runs.result import Result
-    from unrender.runs.sensitivity import sensitivity
     from unrender.scene.parameter import Parameter
     from unrender.scene.problem import Problem
     from unrender.scene.render import render, render_pair
     from unrender.scene.view import View
 
 _MODULES = {
-    **{
-        name: name
-        for name in ("app", "estimators", "gallery", "images", "io", "losses", "optimizers", "parameterisations")
-    },
-    **{name: name for name in ("pixels", "preconditioners", "protocols", "runs", "scene", "schedules", "statistics")},
+    "app": "app",
+    "estimators": "estimators",
+    "gallery": "gallery",
     "grey_box": "estimators.smoothing.grey_box",
-    "metrics": "losses.metrics",
+    "images": "images",
+    "io": "io",
+    "losses": "losses",
+    "optimizers": "optimizers",
+    "parameterisations": "parameterisations",
+    "pixels": "pixels",
+    "preconditioners": "preconditioners",
+    "protocols": "protocols",
+    "runs": "runs",
+    "scene": "scene",
+    "schedules": "schedules",
     "smoothed": "estimators.smoothing",
+    "statistics": "statistics",
 }
+"""Modules that are attributes without an import."""
 _HOMES = {
     "Estimate": "estimators.base",
     "GaussNewton": "estimators.gauss_newton",
@@ -88,7 +88,6 @@ _HOMES = {
     "render": "scene.render",
     "render_pair": "scene.render",
     "resume": "runs.reopen",
-    "sensitivity": "runs.sensitivity",
 }
 _MOVED = {
     "Callback": "protocols.Callback",
@@ -106,8 +105,10 @@ _MOVED = {
     "export": "app.export",
     "import_capture": "app.import_capture",
     "judge": "app.judge",
+    "metrics": "losses.metrics",
     "read_grid": "io.read_grid",
     "report": "app.report",
+    "sensitivity": "runs.sensitivity",
     "sweep": "app.sweep",
     "turntable": "app.turntable",
     "write_grid": "io.write_grid",
@@ -117,7 +118,7 @@ _MOVED = {
 with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
     _variant.prepare()  # before anything imports Dr.Jit, which reads the choice of LLVM once
 
-# Without grey_box, which needs PyTorch, and without io, whose name the standard library has: `from unrender import *` must do no harm.
+# The names of a first script. The other modules of `_MODULES` are for those who go further; `from unrender import *` leaves them out.
 __all__ = [
     "Estimate",
     "GaussNewton",
@@ -132,27 +133,18 @@ __all__ = [
     "UnrenderError",
     "VariantError",
     "View",
-    "app",
     "estimate",
-    "estimators",
     "gallery",
     "images",
     "losses",
-    "metrics",
     "optimize",
     "optimizers",
-    "parameterisations",
     "pixels",
     "preconditioners",
-    "protocols",
     "register",
     "render",
     "render_pair",
     "resume",
-    "runs",
-    "scene",
-    "schedules",
-    "sensitivity",
     "smoothed",
     "statistics",
     "use",
@@ -178,4 +170,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return sorted({*__all__, *_MODULES})

@@ -165,14 +165,14 @@ def test_what_has_one_resolution_is_refused() -> None:
 def at_the_change(name: str, states: str, steps: int = 5) -> tuple[Any, Any, Any, Any]:
     """A run before its change of resolution, and after: (run, memory) each."""
     found = problem(ur.scene.CoarseToFine((steps,), states=states))  # type: ignore
-    run, memory = loop.prepare(Plan(found, *PAIRS[name]), 9, None, 0)
+    run = loop.prepare(Plan(found, *PAIRS[name]), 9, None, 0)
     for _ in range(steps):
-        loop._step(run, memory)
-    before = dict(run.parameters), loop.replace(memory)
+        loop._step(run)
+    before = dict(run.parameters), loop.replace(run.state)
     assert refinement.is_due(run)
-    refinement.refine(run, memory)
+    refinement.refine(run)
     assert not refinement.is_due(run)
-    return *before, run, memory
+    return *before, run, run.state
 
 
 def innermost(state: Any) -> Any:
@@ -360,12 +360,12 @@ def test_adam_that_starts_anew_makes_a_first_step_again() -> None:
     schedule = ur.optimizers.schedules.Steps(every=3, factor=0.5)
     found = problem(ur.scene.CoarseToFine((3,), states="reset"))
     plan = Plan(found, ur.PathGradient(spp=2), ur.optimizers.Adam(0.02, schedule=schedule))
-    run, memory = loop.prepare(plan, 9, None, 0)
+    run = loop.prepare(plan, 9, None, 0)
     for _ in range(3):
-        loop._step(run, memory)
-    refinement.refine(run, memory)
+        loop._step(run)
+    refinement.refine(run)
     start = run.parameters[KEY]
-    loop._step(run, memory)
+    loop._step(run)
     moved = run.parameters[KEY] - start
     gradient = run.estimate.gradient[KEY]  # type: ignore
     clear = np.abs(gradient) > 1e-6

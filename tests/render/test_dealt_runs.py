@@ -18,8 +18,8 @@ from tests.unit.test_dealing import ESTIMATORS, VIEWS, apart, dealt, descend
 from unrender.app.distributed.cluster import Workers, connect
 from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.messages import Call
-from unrender.app.distributed.outbox import Outbox
 from unrender.app.distributed.ray_hosts import RayHosts
+from unrender.app.distributed.worker_state import Outbox
 from unrender.backend import variant
 
 

@@ -13,7 +13,7 @@ from scipy import stats
 import unrender as ur
 from tiers import quick, slow
 from unrender.backend import cache
-from unrender.gallery import boxes, mesh_files, meshes, specification, textures
+from unrender.gallery import boxes, meshes, specification, textures
 from unrender.gallery.sunlit_vase import SunlitVase
 from unrender.methods import method
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -552,7 +552,7 @@ def test_a_mesh_from_a_file_is_brought_to_size_and_place(name, scale, tmp_path):
     path.write_text(TETRAHEDRON)
     problem = ur.gallery.problem(name, mesh=path, resolution=8, reference_spp=1)
     assert [parameter.key for parameter in problem.parameters] == POSES.get(name, ["sphere.vertex_positions"])
-    made = mesh_files.standing if name == "bunny" else mesh_files.centred
+    made = meshes.standing if name == "bunny" else meshes.centred
     box = mi.load_dict(made(str(path), {"type": "diffuse"})).bbox()
     low, high = np.array(box.min).reshape(3), np.array(box.max).reshape(3)
     np.testing.assert_allclose(high - low, scale, rtol=1e-6)

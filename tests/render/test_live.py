@@ -16,7 +16,7 @@ import pytest
 import unrender as ur
 from unrender.app.watch.monitor import LOST, PAUSED, RUNNING, SAVING, VANISHED, WAITING, RunMonitor
 from unrender.io.bounded_files import read_float_arrays
-from unrender.io.thumbnails import reduced
+from unrender.io.resampling import reduced
 from unrender.runs import live as module
 from unrender.runs.folder.reader import read_record
 from unrender.runs.live import Live

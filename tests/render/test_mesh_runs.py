@@ -14,7 +14,7 @@ import trimesh
 import unrender as ur
 from unrender.runs.folder import reader
 from unrender.runs.metadata import RunAnnotations
-from unrender.runs.remeshing import remeshed
+from unrender.runs.refinement import remeshed
 from unrender.scene.problem import Problem
 
 SMALL = {"resolution": 16, "subdivisions": 2, "reference_spp": 32}

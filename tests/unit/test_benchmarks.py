@@ -31,7 +31,7 @@ def benchmark(request: pytest.FixtureRequest) -> Benchmark:
 
 
 def test_every_benchmark_is_whole_and_its_toy_sizes_are_options(benchmark: Benchmark) -> None:
-    run = benchmark.module("run")
+    run = benchmark.module
     assert benchmark.summary
     assert benchmark.summary
     assert set(run.QUICK) <= set(inspect.signature(run.run).parameters)

@@ -16,6 +16,7 @@ from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import budget, loop
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.resume import load_run, resume_run
+from unrender.runs.run import Run
 
 TRUTH = {"gain": np.full(2, 0.5)}
 
@@ -57,12 +58,12 @@ def test_a_budget_may_cover_more_than_the_steps(
 ) -> None:
     """Steps alone have all 20 seconds. Otherwise 3 are for the final pictures, and the steps have half of the budget, as long as all ends
     within 5 seconds of it, or 15 if kernels were compiled. Each step takes a second, which the next one sees."""
-    now, warm_up, kernels = [100.0], loop.Descent.warm_up, [0]
+    now, warm_up, kernels = [100.0], loop.warm_up, [0]
 
-    def compiled(descent: loop.Descent) -> Any:
+    def compiled(run: Run) -> Any:
         now[0] += warming
         kernels[0] += compiles
-        return warm_up(descent)
+        return warm_up(run)
 
     monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(budget, "slowdown", lambda: 1.0)
@@ -73,7 +74,7 @@ def test_a_budget_may_cover_more_than_the_steps(
             now[0] += 1.0
             run.clock = float(run.step)
 
-    monkeypatch.setattr(loop.Descent, "warm_up", compiled)
+    monkeypatch.setattr(loop, "warm_up", compiled)
     annotations = RunAnnotations(began=now[0] if within else None)
     result = ur.optimize(problem(), "plain", seconds=20, callbacks=[Seconds()], annotations=annotations)
     assert result.stopped == "seconds"
@@ -94,7 +95,7 @@ def test_the_end_of_the_steps_leaves_time_for_the_final_pictures(
 ) -> None:
     """A tenth and a second, times the slowdown of a busy machine, up to 3; but half of the budget at most."""
     monkeypatch.setattr(budget, "slowdown", lambda: slowdown)
-    run, _ = loop.prepare(Plan(problem(), ur.PathGradient(), ur.optimizers.Adam(0.01)), None, seconds, 0)
+    run = loop.prepare(Plan(problem(), ur.PathGradient(), ur.optimizers.Adam(0.01)), None, seconds, 0)
     run.deadline = time.perf_counter() + seconds
     budget.Budget()._set_last_step(run)
     assert (run.last_step or 0.0) - time.perf_counter() == pytest.approx(left, abs=0.1)
@@ -103,9 +104,7 @@ def test_the_end_of_the_steps_leaves_time_for_the_final_pictures(
 def test_a_resumed_run_has_what_is_left_of_its_budget(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[float] = []
     check = budget.Budget._check
-    monkeypatch.setattr(
-        budget.Budget, "_check", lambda self, descent: (seen.append(descent.run.time_left()), check(self, descent))[1]
-    )
+    monkeypatch.setattr(budget.Budget, "_check", lambda self, run: (seen.append(run.time_left()), check(self, run))[1])
     parts = ur.PathGradient(), ur.optimizers.Adam(0.01)
     clock = ur.optimize(problem(), *parts, steps=5, run_directory=tmp_path / "run").seconds
     seen.clear()

@@ -21,9 +21,9 @@ from unrender.app.distributed.assignment import assign, total
 from unrender.app.distributed.cluster import Workers, share
 from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.messages import Call, Reply
-from unrender.app.distributed.outbox import Outbox
 from unrender.app.distributed.share import ViewShare
 from unrender.app.distributed.transfer import packed, unpacked
+from unrender.app.distributed.worker_state import Outbox
 from unrender.core import arrays
 from unrender.runs.resume import load_run
 
@@ -187,7 +187,7 @@ def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "unrender.app.distributed.memories._MOST_STEPS", 4
+        "unrender.app.distributed.worker_state._MOST_STEPS", 4
     )  # so that memories are collected and stored, too
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
     shares = assign([16] * VIEWS, 3)
@@ -203,7 +203,7 @@ def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
 def test_memories_are_collected_no_more_often_than_their_size_warrants(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = analytic.problem(views=VIEWS)
     step = sum(np.asarray(value).nbytes for value in problem.initial().values())
-    monkeypatch.setattr("unrender.app.distributed.memories._MOST_BYTES", 3 * step)
+    monkeypatch.setattr("unrender.app.distributed.worker_state._MOST_BYTES", 3 * step)
     together, collected = dealt(problem, 2), list[int]()
     hosts: Any = together.executor._hosts  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
     fetch = hosts.fetch

@@ -52,7 +52,7 @@ def test_every_benchmark_of_the_plan_has_its_options(name: str) -> None:
         pytest.importorskip("torch")
     parser = argparse.ArgumentParser()
     parser.add_argument("--quick", action="store_true")
-    add_options(parser, ALL[name].module("run").run)
+    add_options(parser, ALL[name].module.run)
     for command in (c for c in COMMANDS if c.name == name):
         for small in (False, True):
             parser.parse_args(command.arguments(small))  # exits where there is no such option or choice
@@ -76,7 +76,7 @@ def test_two_commands_of_a_benchmark_in_a_slice_merge_into_one_record() -> None:
     for part in SLICES:
         names = [c.name for c in part.commands if c.name not in ("doctor", "tests")]
         for name in {n for n in names if names.count(n) > 1}:
-            assert getattr(ALL[name].module("run"), "MERGE", ()), f"{part.name}: {name} would lose the first's figures"
+            assert getattr(ALL[name].module, "MERGE", ()), f"{part.name}: {name} would lose the first's figures"
 
 
 def test_what_ended_is_not_run_again(folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

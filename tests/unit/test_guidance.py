@@ -10,7 +10,7 @@ import pytest
 
 from unrender import optimizers, pixels
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.estimators.path import PathGradient
 from unrender.images import RecursiveControlVariate
 from unrender.losses import Huber
@@ -18,9 +18,9 @@ from unrender.methods import method
 from unrender.methods.smoothed import SmoothedMethod
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import ParameterInfo
-from unrender.runs.advice import remarks
 from unrender.runs.components import resolve
 from unrender.runs.optimize import estimate, optimize
+from unrender.runs.watches import remarks
 from unrender.scene.key_hints import instead_of, near_key
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem

@@ -14,7 +14,7 @@ from unrender.app.stages.stage_problem import _check
 from unrender.core import tables
 from unrender.core.random import Key
 from unrender.estimators.base import Estimate
-from unrender.gallery import blobs, meshes
+from unrender.gallery import meshes
 from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import Sobolev
@@ -25,8 +25,7 @@ from unrender.scene import remeshing
 from unrender.scene.mesh_checks import check_regularizer, check_self_intersection, check_surfaces, mesh_notices
 from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.remeshing import Remeshing
-from unrender.scene.self_intersections import crossing_triangles
-from unrender.scene.surfaces import Surface, folds, surface_error
+from unrender.scene.surfaces import Surface, crossing_triangles, folds, surface_error
 from unrender.scene.unknown import Unknown
 
 POINTS, FACES = meshes.icosphere(2)
@@ -197,8 +196,8 @@ def test_two_optimizers_side_by_side_do_what_each_does_alone() -> None:
 
 
 def test_blobs_are_closed_and_face_outward() -> None:
-    parts = [blobs.Ellipsoid((0, 0, 0), (0.5, 0.3, 0.4), 20.0), blobs.Ellipsoid((0.4, 0.1, 0), (0.2, 0.2, 0.2))]
-    points, faces = blobs.around(blobs.united(parts, 0.02), (-1, -1, -1), (1, 1, 1), 0.08)
+    parts = [meshes.Ellipsoid((0, 0, 0), (0.5, 0.3, 0.4), 20.0), meshes.Ellipsoid((0.4, 0.1, 0), (0.2, 0.2, 0.2))]
+    points, faces = meshes.around(meshes.united(parts, 0.02), (-1, -1, -1), (1, 1, 1), 0.08)
     sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     assert {tuple(side) for side in sides} == {tuple(side) for side in sides[:, ::-1]}
     a, b, c = points[faces.T]
@@ -289,7 +288,7 @@ def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
     problem = of_mesh(key, POINTS, FACES, "ignore")
     crumpled = POINTS + 0.3 * np.random.default_rng(0).normal(size=POINTS.shape)
     run = SimpleNamespace(problem=problem, step=3, warnings=[], stopped="steps", parameters={key: crumpled.reshape(-1)})
-    descent, watch = SimpleNamespace(run=run), MeshWatch()
+    descent, watch = run, MeshWatch()
     for size in (0.0, 1.0, 0.0, 0.0):
         watch.on_update(descent, Estimate(0.0, {key: np.full(POINTS.size, size)}), True)  # type: ignore
     assert run.warnings == [
@@ -316,18 +315,18 @@ def test_a_mesh_that_passes_through_itself_is_told_once() -> None:
     problem = of_mesh(key, vertices + away, faces, "ignore")
     run = SimpleNamespace(problem=problem, parameters={key: vertices + away / 2}, warnings=[], step=25, stopped="")
     watch, estimate = MeshWatch(), Estimate(0.0, {key: np.ones(vertices.size)})
-    watch.on_update(SimpleNamespace(run=run), estimate, True)  # type: ignore
+    watch.on_update(run, estimate, True)  # type: ignore
     assert run.warnings == []
     run.problem = of_mesh(key, vertices + away, faces, "warn")
     for run.step in (24, 25, 50):
-        watch.on_update(SimpleNamespace(run=run), estimate, True)  # type: ignore
+        watch.on_update(run, estimate, True)  # type: ignore
     (line,) = run.warnings
     assert line.startswith(f"step 25: {key}: the mesh passes through itself at ")
     run.warnings = []  # of an estimator without gradients, as of CMA-ES
-    MeshWatch().on_update(SimpleNamespace(run=run), Estimate(0.0, {}), True)  # type: ignore
+    MeshWatch().on_update(run, Estimate(0.0, {}), True)  # type: ignore
     assert run.warnings == [line.replace("step 25", "step 50")]
     run.warnings, run.stopped = [line], "steps"
-    assert watch.warnings(SimpleNamespace(run=run)) == []  # type: ignore
+    assert watch.warnings(run) == []  # type: ignore
 
 
 def test_whole_views_are_drawn_evenly() -> None:

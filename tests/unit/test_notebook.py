@@ -16,8 +16,8 @@ import pytest
 from unrender import optimizers
 from unrender.core import phases
 from unrender.core.errors import InputError
-from unrender.display import formatting, notebook_bar
-from unrender.display.notebook_bar import NotebookBar
+from unrender.display import formatting, notebook
+from unrender.display.notebook import NotebookBar
 from unrender.estimators.path import PathGradient
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.optimize import optimize
@@ -162,7 +162,7 @@ def test_no_bar_where_none_is_wanted_or_nobody_sees_it(monkeypatch: pytest.Monke
 
 def test_phases_are_shown_escaped_and_the_bar_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     shell = Shell(monkeypatch)
-    with notebook_bar.shown(), phases.phase("<reference>") as advance:
+    with notebook.shown(), phases.phase("<reference>") as advance:
         advance(0.5)
     assert "&lt;reference&gt;" in shell.shown[0]
     assert shell.shown[-1] == ""

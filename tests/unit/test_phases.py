@@ -7,7 +7,7 @@ import pytest
 from unrender.core import phases
 
 
-class Listener:
+class Listener(phases.Listener):
     def __init__(self) -> None:
         self.heard: list[tuple[str, object]] = []
 
@@ -29,6 +29,13 @@ def test_a_listener_hears_of_phases_within_phases_and_of_their_progress() -> Non
     assert listener.heard == [
         ("begin", "outer"), ("begin", "inner"), ("at", 0.5), ("at", 1.0), ("end", "inner"), ("end", "outer"),
     ]  # fmt: skip
+
+
+def test_one_that_listens_twice_hears_once() -> None:
+    listener = Listener()
+    with phases.listening(listener, listener), phases.listening(listener), phases.phase("once"):
+        pass
+    assert listener.heard == [("begin", "once"), ("end", "once")]
 
 
 def test_a_phase_ends_by_an_exception_and_nobody_hears_afterwards() -> None:

@@ -27,7 +27,7 @@ from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.scene.fingerprint import fingerprint
 from unrender.scene.prior import Prior
-from unrender.scene.reference_noise import likelihood_scale, standard_deviation
+from unrender.scene.references import likelihood_scale, standard_deviation
 
 SIDE, SIZE = 16, 3
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]), np.array([[0, 1, 2], [0, 1, 3], [1, 2, 3]])

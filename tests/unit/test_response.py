@@ -10,7 +10,7 @@ from PIL import Image
 from test_photographs_parameters import check_adjoint, requests
 
 import unrender as ur
-from unrender.app.capture import decoding, pictures, unknowns
+from unrender.app.capture import pictures, unknowns
 from unrender.core.errors import InputError
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.photographs import OF_PHOTOGRAPHS, scene_values, with_photographs
@@ -174,7 +174,7 @@ def test_files_are_decoded_by_the_response_that_is_named(tmp_path: Path) -> None
     }
     expected["fit"] = expected["srgb"]
     for response, values_ in expected.items():
-        assert decoding.check(response) == response
+        assert pictures.check_response(response) == response
         found = pictures.read(tmp_path / "a.png", response=response).values[..., 1]
         np.testing.assert_allclose(found, values_, atol=1e-6)
     np.testing.assert_array_equal(

@@ -10,7 +10,7 @@ import pytest
 
 import kernels
 import unrender as ur
-from unrender.core import vectors
+from unrender.core import trees
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capability, Hessian, HessianProduct, LossFunction, Smoothing
@@ -24,7 +24,7 @@ FIRST_STEPS = [Newton(), NewtonCG(), LBFGS()]
 
 
 def split(x, like=LIKE):
-    return vectors.unravel(x, like)
+    return trees.unravel(x, like)
 
 
 def paraboloid(n: int = 6, seed: int = 0, condition: float = 1000.0) -> tuple[np.ndarray, np.ndarray]:
@@ -38,7 +38,7 @@ def known(gradient, hessian=None, like=LIKE, losses=None) -> Estimate:
     """The gradient of a quadratic, and its Hessian, products and losses where they are given."""
     capabilities: list[Capability] = []
     if hessian is not None:
-        capabilities = [Hessian(hessian), HessianProduct(lambda v: split(hessian @ vectors.ravel(v), like))]
+        capabilities = [Hessian(hessian), HessianProduct(lambda v: split(hessian @ trees.ravel(v), like))]
     if losses is not None:
         capabilities.append(LossFunction(losses))
     return Estimate(0.0, split(gradient, like), tuple(capabilities))
@@ -46,7 +46,7 @@ def known(gradient, hessian=None, like=LIKE, losses=None) -> Estimate:
 
 def first_step(optimizer, gradient, hessian=None, learning_rates=None, like=LIKE) -> np.ndarray:
     step, _ = optimizer.update(known(gradient, hessian, like), optimizer.init(like, learning_rates), like)
-    return vectors.ravel(step)
+    return trees.ravel(step)
 
 
 def descend(optimizer, function, x, steps, learning_rates=None):
@@ -148,7 +148,7 @@ def test_on_a_line_the_length_is_the_losss_own_and_not_the_products(radius):
         estimate = known(sign * gradient, 50 * hessian, like, losses)
         optimizer = NewtonCG(trust_radius=radius, iterations=1, line=True)
         assert optimizer.requires == {"gradient", "hvp", "losses"}
-        return vectors.ravel(optimizer.update(estimate, optimizer.init(like), like)[0])
+        return trees.ravel(optimizer.update(estimate, optimizer.init(like), like)[0])
 
     found = step(1.0)
     assert np.linalg.norm(found) <= radius * (1 + 1e-9)
@@ -208,13 +208,13 @@ def test_a_later_product_that_is_not_finite_ends_the_iterations():
 
     def product(v):
         calls.append(1)
-        return split(hessian @ vectors.ravel(v) * (np.nan if len(calls) == 3 else 1.0))
+        return split(hessian @ trees.ravel(v) * (np.nan if len(calls) == 3 else 1.0))
 
     gradient = -hessian @ minimum
     estimate = Estimate(0.0, split(gradient), (HessianProduct(product),))
     step, _ = optimizer.update(estimate, optimizer.init(LIKE), LIKE)
     expected = first_step(dataclasses.replace(optimizer, iterations=2), gradient, hessian)
-    np.testing.assert_array_equal(vectors.ravel(step), expected)
+    np.testing.assert_array_equal(trees.ravel(step), expected)
     assert len(calls) == 3
 
 
@@ -227,15 +227,15 @@ def test_noisy_products_lead_neither_upwards_nor_astray(noise):
         gradient = -hessian @ minimum
 
         def product(v, rng=rng, hessian=hessian):
-            exact = hessian @ vectors.ravel(v)
+            exact = hessian @ trees.ravel(v)
             return split(exact + noise * np.linalg.norm(exact) / math.sqrt(6) * rng.normal(size=6))
 
         optimizer = NewtonCG(trust_radius=0.5, iterations=12, tolerance=0.0)
         step, _ = optimizer.update(
             Estimate(0.0, split(gradient), (HessianProduct(product),)), optimizer.init(LIKE), LIKE
         )
-        assert vectors.ravel(step) @ gradient < 0
-        assert 0 < np.linalg.norm(vectors.ravel(step)) <= 0.5 * (1 + 1e-9)
+        assert trees.ravel(step) @ gradient < 0
+        assert 0 < np.linalg.norm(trees.ravel(step)) <= 0.5 * (1 + 1e-9)
 
 
 def test_damping_helps_against_a_noisy_hessian():
@@ -307,9 +307,9 @@ def test_through_adam_the_steps_opposite_is_adams_gradient(kind):
     for step in range(5):
         estimate = known(rng.normal(size=6), hessian)
         direction, states = plain.update(estimate, states, LIKE)
-        expected, state = adam.update(Estimate(0.0, split(-vectors.ravel(direction))), state, LIKE)
+        expected, state = adam.update(Estimate(0.0, split(-trees.ravel(direction))), state, LIKE)
         found, own = passed.update(estimate, own, LIKE)
-        np.testing.assert_allclose(vectors.ravel(found), 0.5 ** (step / 3) * vectors.ravel(expected), rtol=1e-12)
+        np.testing.assert_allclose(trees.ravel(found), 0.5 ** (step / 3) * trees.ravel(expected), rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -409,7 +409,7 @@ def search(optimizer, losses, state, parameters, steps, project=lambda x: x):
     for _ in range(steps):
         step, state = optimizer.update(Estimate(0.0, {}, (LossFunction(losses),)), state, parameters)
         parameters = {key: project(x + step[key]) for key, x in parameters.items()}
-        path.append(vectors.ravel(parameters))
+        path.append(trees.ravel(parameters))
         states.append(state)
     return np.array(path), states, parameters
 
@@ -564,7 +564,7 @@ def test_states_and_steps_on_the_device_are_those_of_numpy():
         like, other = LIKE, device
         states, compiled = [optimizer.init(like), optimizer.init(other)], []
         for _ in range(6):
-            place = minimum - vectors.ravel(like)
+            place = minimum - trees.ravel(like)
             expected, states[0] = optimizer.update(known(-hessian @ place, hessian, like, sphere), states[0], like)
             with kernels.recorded() as new:
                 found, states[1] = optimizer.update(known(-hessian @ place, hessian, other, sphere), states[1], other)
@@ -572,7 +572,7 @@ def test_states_and_steps_on_the_device_are_those_of_numpy():
             compiled.append(sum(new))
             assert all(isinstance(x, mi.TensorXf) for x in found.values())
             assert all(found[key].shape == x.shape for key, x in LIKE.items())
-            np.testing.assert_allclose(vectors.ravel(found), vectors.ravel(expected), rtol=2e-4, atol=1e-6)
+            np.testing.assert_allclose(trees.ravel(found), trees.ravel(expected), rtol=2e-4, atol=1e-6)
             like = {key: x + expected[key] for key, x in like.items()}
             other = {key: kernels.on_device(x) for key, x in like.items()}
         # One more may be an input in another order; a number that became a literal makes four.
@@ -585,12 +585,12 @@ def test_steps_have_the_parameters_type_and_memory_of_their_own():
 
     single = {"x": np.ones((2, 3), np.float32)}
     vector = np.arange(6.0)
-    found = vectors.unravel(vector, single)
+    found = trees.unravel(vector, single)
     vector[:] = 0
     assert found["x"].dtype == np.float32
     np.testing.assert_array_equal(found["x"], np.arange(6.0).reshape(2, 3))
     lone = {"a": mi.Float([1, 2]), "b": mi.TensorXf(np.array(3.0, np.float32))}
-    np.testing.assert_array_equal(vectors.ravel(vectors.unravel(np.array([4.0, 5.0, 6.0]), lone)), [4, 5, 6])
+    np.testing.assert_array_equal(trees.ravel(trees.unravel(np.array([4.0, 5.0, 6.0]), lone)), [4, 5, 6])
 
 
 @pytest.mark.parametrize(
@@ -664,10 +664,10 @@ def test_trust_regions_are_as_wide_as_the_smoothing(optimizer):
     def first(sigma: dict[str, float] | None) -> np.ndarray:
         scale = np.array([sigma["a"], sigma["a"], sigma["b"]]) if sigma else np.ones(3)
         hessian = np.diag(1 / scale**2)
-        products = HessianProduct(lambda v: vectors.unravel(hessian @ vectors.ravel(v), parameters))
+        products = HessianProduct(lambda v: trees.unravel(hessian @ trees.ravel(v), parameters))
         smoothing = () if sigma is None else (Smoothing(sigma),)
         found = Estimate(0.0, gradient, (Hessian(hessian), products, *smoothing))
-        return vectors.ravel(optimizer.update(found, optimizer.init(parameters), parameters)[0])
+        return trees.ravel(optimizer.update(found, optimizer.init(parameters), parameters)[0])
 
     for sigma in ({"a": 0.2, "b": 0.2}, {"a": 0.01, "b": 0.5}):
         step = first(sigma)

@@ -10,8 +10,8 @@ import pytest
 import unrender as ur
 from unrender.core.errors import InputError
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs import sensitivity as module
-from unrender.runs.sensitivity import hardly_seen, sensitivity
+from unrender.runs import image_sensitivity as module
+from unrender.runs.image_sensitivity import hardly_seen, sensitivity
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
@@ -85,4 +85,4 @@ def test_refuses_what_makes_no_sense():
         sensitivity(problem(), probes=0)
     with pytest.raises(InputError, match="expected shape"):
         sensitivity(problem(), {"wall": np.zeros((2, 2, 2))})
-    assert ur.sensitivity is sensitivity
+    assert ur.runs.sensitivity is sensitivity

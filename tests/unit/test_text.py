@@ -15,8 +15,7 @@ from rich.table import Table
 
 from unrender.app.report import html
 from unrender.core.errors import InputError, VariantError
-from unrender.core.suggestions import did_you_mean
-from unrender.core.text import LONGEST_LINE, grouped, listed, one_line, printable, shorten, visible
+from unrender.core.text import LONGEST_LINE, did_you_mean, grouped, listed, one_line, printable, shorten, visible
 from unrender.display.terminal import Console, echo
 
 EVIL = {

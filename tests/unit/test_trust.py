@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from unrender.app.distributed.cluster.trust import check_cluster, check_token
+from unrender.app.distributed.cluster.connection import check_cluster, check_token
 from unrender.backend.access import can_change, can_read
 from unrender.core.errors import InputError
 
@@ -126,7 +126,7 @@ def test_ray_folder_that_others_can_change_is_refused(home: Path) -> None:
 
 def test_a_cluster_without_nodes_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """It says nothing of its folders, so it is not joined."""
-    monkeypatch.setattr("unrender.app.distributed.cluster.trust._SECONDS", 0.0)
+    monkeypatch.setattr("unrender.app.distributed.cluster.connection._SECONDS", 0.0)
     with pytest.raises(InputError, match="the cluster at a:1 has no node"):
         check_cluster(fake_ray(), "a:1")
 

@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks import figures, markdown
 from benchmarks.gradient_variance import gradients, spread
 from benchmarks.pixel_schemes import SCHEMES, pixels
+from benchmarks.runner.records import Record
 
 FIVE_LEVELS = "adaptive, five levels"
 GROUPS = {1: "", 2: ", leave-one-out"}
@@ -115,3 +117,28 @@ def run(
             maps[f"{case}|{name}"] = probability
         print(case, name, values, flush=True)
     yield {"cases": {case: {**sizes, "schemes": schemes, "ratios": ratios(schemes)}}, "maps": maps}
+
+
+def table(record: Record) -> str:
+    """Per case and scheme, and the ratios."""
+    blocks = []
+    for entry in markdown.named(record["cases"], "case"):
+        text = "`mirror-trio`, {case}: {resolution}², {count} pixels with two paths each, {runs} runs."
+        rows = [
+            [
+                markdown.fill("{name} | {variance:.3g} ± {error:.1g}", scheme),
+                f"{scheme['z']:.1f}" if "z" in scheme else "",
+            ]
+            for scheme in markdown.named(entry["schemes"], "name")
+        ]
+        ratios = ", ".join("{} {:.2f} ± {:.2f}".format(name, *ratio) for name, ratio in entry["ratios"].items())
+        head = "scheme | variance at equal paths | mean against all pixels, z"
+        blocks += [markdown.fill(text, entry), markdown.table(head, rows), f"Ratios: {ratios}."]
+    return markdown.blocks(*blocks)
+
+
+def plot(record: Record) -> figures.Figure:
+    """The picture, and maps of pixel probabilities over uniform ones."""
+    maps, first = record["maps"], next(iter(record["cases"]))
+    shown = {f"{name}, over uniform": maps[f"{first}|{name}"] for name in SHOWN}
+    return figures.pictures([{"reference": maps[f"{first}|reference"], **shown}], cmap="magma", norm="log", vmin=0.1)

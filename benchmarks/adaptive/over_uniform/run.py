@@ -13,7 +13,7 @@ Problems of the gallery, a Cornell box with a rough conductor, and scenes of oth
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,9 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks import markdown
 from benchmarks.internals import Key, PixelSampler, Tree, element_scales, gradient_of, mi, pixel_shares, second_moments
+from benchmarks.runner.records import Record
 from benchmarks.suite.scenes import problem as foreign_problem
 
 GALLERY: dict[str, dict[str, Any]] = {
@@ -224,3 +226,42 @@ def run(
             ]
             print(f"{name}, {label}: {', '.join(shown)}", flush=True)
         yield {"problems": {name: found}}
+
+
+def table(record: Record) -> str:
+    """Per problem, then the summary."""
+    settings = record["settings"]
+    parts = [
+        f"{settings['count']} pixels a step; plain / relative, by paths; ± is of the relative one. Steps are those done before; λ, the "
+        "share of uniform draws, at each."
+    ]
+    for label in record["summary"]:
+        found = {name: entry[label] for name, entry in record["problems"].items() if label in entry}
+        parts += [f"**{label}**, variance over uniform's after so many steps", _by_steps(found, _cell)]
+    direct = {
+        name: [point for point in entry["adaptive"] if point["gradients"]]
+        for name, entry in record["problems"].items()
+        if "adaptive" in entry
+    }
+    parts += [
+        f"**adaptive**, by {settings['runs']} gradients of each sampler, plain / relative",
+        _by_steps(direct, _direct),
+    ]
+    head = "sampler | problems | geometric mean at the end, plain | relative | worst of all steps, plain | relative"
+    row = "{label} | {problems} | {mean[0]:.2f} | {mean[1]:.2f} | {worst[0][0]:.2f} ± {worst[0][1]:.1g}"
+    row += " | {worst[1][0]:.2f} ± {worst[1][1]:.1g}"
+    return markdown.blocks(*parts, markdown.records(head, row, markdown.named(record["summary"], "label")))
+
+
+def _by_steps(found: dict[str, Any], cell: Callable[[dict[str, Any]], str]) -> str:
+    head = " | ".join(["problem", *(str(point["step"]) for point in next(iter(found.values())))])
+    return markdown.table(head, [[name, *map(cell, points)] for name, points in found.items()])
+
+
+def _cell(point: dict[str, Any]) -> str:
+    plain, relative = point["ratio"]
+    return f"{plain:.2f} / {relative:.2f} ± {point['error'][1]:.1g}, λ {point['uniform']:.2g}"
+
+
+def _direct(point: dict[str, Any]) -> str:
+    return " / ".join(f"{ratio:.2f} ± {error:.1g}" for ratio, error in point["gradients"])

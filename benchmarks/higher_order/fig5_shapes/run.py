@@ -17,12 +17,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import unrender as ur
-from benchmarks.higher_order.fig5_mesh import run as fig5_mesh
-from benchmarks.higher_order.fig5_mesh.run import smoothed
+from benchmarks import figures, markdown
 from benchmarks.higher_order.fig5_shapes import shapes
-from benchmarks.internals import dr, vectors, with_preconditioner
+from benchmarks.internals import Key, black_box, dr, trees, with_preconditioner
 from benchmarks.races import TUNING_SEED, search
+from benchmarks.runner.records import Record
+from benchmarks.timed_runs import Kept
 
 TASKS = ("SUZANNE", "BANANA")
 MERGE = ("tasks.*.methods",)
@@ -36,8 +39,27 @@ RADII = (0.5, 1.5, 4.5)
 """Of Newton's steps: by how many σ each element moves at most, in the mean square."""
 
 
+SIGMA = 0.05
+SAMPLES = 64
+_SPP = 1
+_EXACT_SPP = 64
+_POINTS = 12
+
+
+def smoothed(samples: int = SAMPLES, **more: Any) -> ur.SmoothedDerivatives:
+    """With the σ and the schedule of all methods."""
+    schedule = ur.schedules.Exponential(60, 0.2)
+    return ur.SmoothedDerivatives(SIGMA, samples, spp=_SPP, schedule=schedule, **more)
+
+
+def cma_es(deviation: float) -> tuple[Any, Any]:
+    """A search that begins with that deviation over 2, in units of σ."""
+    optimizer = ur.optimizers.CMAES(0.5, SAMPLES, diagonal=True, learning_rate=deviation * SIGMA)
+    return ur.estimators.LossValues(spp=_SPP), optimizer
+
+
 def _adam(rate: float, smooth: bool) -> ur.optimizers.Adam:
-    return ur.optimizers.Adam(rate * fig5_mesh.SIGMA, uniform=smooth)
+    return ur.optimizers.Adam(rate * SIGMA, uniform=smooth)
 
 
 def _newton(radius: float, n: int) -> ur.optimizers.NewtonCG:
@@ -47,11 +69,11 @@ def _newton(radius: float, n: int) -> ur.optimizers.NewtonCG:
 Make = Callable[[float, int, bool], tuple[Any, Any]]
 METHODS: dict[str, tuple[Make, tuple[float, ...]]] = {
     "FR22": (lambda rate, _, smooth: (smoothed(product=True), _adam(rate, smooth)), RATES),
-    "CMA-ES": (lambda deviation, _, __: fig5_mesh.cma_es(deviation), (0.1, 0.3, 0.9)),
+    "CMA-ES": (lambda deviation, _, __: cma_es(deviation), (0.1, 0.3, 0.9)),
     "OurG": (lambda rate, _, smooth: (smoothed(), _adam(rate, smooth)), RATES),
     "OurJoint": (lambda radius, n, _: (smoothed(order="hvp"), _newton(radius, n)), RADII),
     "OurHVPA": (
-        lambda radius, n, _: (smoothed(fig5_mesh.SAMPLES // 2, order="hvp", joint=False), _newton(radius, n)),
+        lambda radius, n, _: (smoothed(SAMPLES // 2, order="hvp", joint=False), _newton(radius, n)),
         RADII,
     ),
 }
@@ -65,6 +87,21 @@ def problem(task: str, resolution: int, views: int, vertices: int, meshes: Path)
     return shapes.banana(resolution, views, vertices)
 
 
+def one(problem: ur.Problem, make: Callable[[int], tuple[Any, Any]], seconds: float, seed: int) -> dict[str, Any]:
+    """One run: the images' loss at some steps."""
+    kept = Kept(seconds, _POINTS)
+    estimator, optimizer = make(trees.ravel(problem.initial()).size)
+    ur.optimize(problem, estimator, optimizer, seconds=20 * seconds, seed=seed, callbacks=[kept])
+    points = [problem.initial(), *(values for _, values in kept.found)]
+    evaluate = black_box(problem, problem.initial(), _EXACT_SPP, Key(99))
+    losses = evaluate(np.stack([trees.ravel(point) for point in points]))
+    return {
+        "steps": kept.steps,
+        "final": float(losses[-1] / losses[0]),
+        "curve": [[0.0, *(round(at, 2) for at, _ in kept.found)], (losses / losses[0]).round(4).tolist()],
+    }
+
+
 def measure(made: ur.Problem, method: str, seconds: float, runs: int, strength: float) -> dict[str, Any]:
     """One method, tuned, over seeds 0, 1, ..."""
     make, settings = METHODS[method]
@@ -73,7 +110,7 @@ def measure(made: ur.Problem, method: str, seconds: float, runs: int, strength: 
         made = with_preconditioner(made, ur.preconditioners.LargeSteps(strength), *(p.key for p in made.parameters))
 
     def descent(setting: float, budget: float, seed: int) -> dict[str, Any]:
-        return fig5_mesh.one(made, lambda n: make(setting, n, smooth), budget, seed)
+        return one(made, lambda n: make(setting, n, smooth), budget, seed)
 
     best, tried = search(settings, lambda setting: descent(setting, seconds / 3, TUNING_SEED)["final"])
     print(made.name, method, tried, flush=True)
@@ -106,8 +143,31 @@ def run(
     dr.set_thread_count(1)
     for name in task:
         made = problem(name, resolution, views, vertices, meshes)
-        numbers = vectors.ravel(made.initial()).size
+        numbers = trees.ravel(made.initial()).size
         for method in only:
             found = measure(made, method, seconds, runs, strength)
             entry = {"numbers": numbers, "strength": strength, "methods": {method: found}}
             yield {"tasks": {name if strength else f"{name}, each vertex by itself": entry}}
+
+
+def table(record: Record) -> str:
+    """What was left of the loss."""
+    rows = []
+    for found in markdown.named(record["tasks"], "task", "methods", "method"):
+        finals = ", ".join(f"{run['final']:.3f}" for run in found["runs"])
+        steps = ", ".join(str(run["steps"]) for run in found["runs"])
+        rows.append([markdown.fill("{task} | {numbers} | {method} | {setting:g}", found), finals, steps])
+    text = "{views} views of {resolution}², {seconds:g} s of the processor, runs: {runs}."
+    head = "task | numbers | method | rate or radius, in σ | loss / at the start | steps"
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
+
+
+def plot(record: Record) -> figures.Figure:
+    """Loss over seconds."""
+    panels = {
+        f"{name}: {task['numbers']} numbers": {
+            method: [run["curve"] for run in found["runs"]] for method, found in task["methods"].items()
+        }
+        for name, task in record["tasks"].items()
+    }
+    return figures.curves(panels, "seconds", "loss / at the start", log="")

@@ -22,8 +22,10 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks import figures, markdown
 from benchmarks.higher_order.networks.cnn import RESOLUTION, PoseNetwork, parameter_count, torch
 from benchmarks.internals import SampleRequest, dr, prepare
+from benchmarks.runner.records import Record
 
 GOALS = (0.1, 0.01)
 COLOUR = "mug.bsdf.brdf_0.reflectance.value"
@@ -189,3 +191,33 @@ def run(
             print(name, method, best, [round(one["final"], 3) for one in found], flush=True)
         entry = {"weights": weights, "seconds": seconds, "methods": methods}
         yield {"tasks": {name: entry}}
+
+
+def table(record: Record) -> str:
+    """Errors of the networks' answers, and when they had fallen by 90 and 99 %."""
+    rows = []
+    for entry in markdown.named(record["tasks"], "task", "methods", "method"):
+        runs = entry["runs"]
+        middle = len(runs) // 2
+        finals, steps = (sorted(run[key] for run in runs) for key in ("final", "steps"))
+        times = [sorted(run["reached"][goal] for run in runs)[middle] for goal in range(2)]
+        row = "{task}, {weights} weights | {method} | {count} of {seconds:g} s | {rate:g}"
+        rows.append(
+            [
+                markdown.fill(row, entry, {"count": len(runs)}),
+                markdown.median_range((finals[middle], finals[0], finals[-1])),
+                *(f"{t:.3g}" if math.isfinite(t) else "—" for t in times),
+                steps[middle],
+            ]
+        )
+    head = "task | method | runs | rate or radius | final error: median (range) | s to 90 % | 99 % | steps"
+    return markdown.table(head, rows)
+
+
+def plot(record: Record) -> figures.Figure:
+    """Error over seconds."""
+    panels = {
+        name: {method: [run["curve"] for run in entry["runs"]] for method, entry in task["methods"].items()}
+        for name, task in record["tasks"].items()
+    }
+    return figures.curves(panels, "seconds", "error of the poses / at the start")

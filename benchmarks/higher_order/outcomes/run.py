@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks import figures, markdown
 from benchmarks.higher_order.table2.descents import WINDOW, descend
 from benchmarks.higher_order.table2.methods import METHODS, Config, configurations
 from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
-from benchmarks.internals import SampleRequest, arrays, dr, prepare, vectors
+from benchmarks.internals import SampleRequest, arrays, dr, prepare, trees
 from benchmarks.runner import records
+from benchmarks.runner.records import Record
 
 METHOD_NAMES = ("FR22", "OurHVPA")
 _TABLE_2 = Path(__file__).parents[1] / "table2"
@@ -29,7 +31,7 @@ def picture(problem: ur.Problem, point: np.ndarray) -> np.ndarray:
     """The first view's image at parameters (n,), (H, W, 3)."""
     initial = problem.initial()
     session = prepare(problem, initial, None, derivatives=False)
-    stacked = {key: value[None] for key, value in vectors.unravel(point, initial).items()}
+    stacked = {key: value[None] for key, value in trees.unravel(point, initial).items()}
     return arrays.numpy(session.image_batch(stacked, SampleRequest(problem.views[0].sensor, _SPP, 1)))[0]
 
 
@@ -40,7 +42,7 @@ def outcome(
     started = begin(problem, task, number, config.get("rate"))
     n = sum(value.size for value in problem.truth.values())
     found = descend(started, *METHODS[method].make(task, n, config), task.seconds, number)
-    start = vectors.ravel(started.initial())
+    start = trees.ravel(started.initial())
     return float(found.parameter[-WINDOW:].mean()), picture(problem, start), picture(problem, found.end)
 
 
@@ -75,3 +77,20 @@ def run(
             )
         print(name, errors[name], flush=True)
     return {"errors": errors, "maps": maps}
+
+
+def table(record: Record) -> str:
+    """Final errors of the runs whose outcomes the figure shows."""
+    methods = list(next(iter(record["errors"].values())))
+    rows = [[name, *(f"{errors[method]:.4f}" for method in methods)] for name, errors in record["errors"].items()]
+    text = "Error of the parameters at the end, over that at the start."
+    return markdown.blocks(text, markdown.table(" | ".join(["task", *methods]), rows))
+
+
+def plot(record: Record) -> figures.Figure:
+    """Per task: start, outcomes, reference."""
+    rows = [
+        {f"{name}: {kind}": record["maps"][f"{name}|{kind}"] for kind in ("start", *errors, "reference")}
+        for name, errors in record["errors"].items()
+    ]
+    return figures.pictures(rows)

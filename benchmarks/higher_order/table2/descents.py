@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, black_box, vectors
+from benchmarks.internals import Key, black_box, trees
 from benchmarks.runner.timing import work_time
 
 GOALS = (0.1, 0.01, 0.001)
@@ -78,7 +78,7 @@ class _Track(ur.protocols.Callback):
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         self.clock += work_time() - self.resumed
-        self.add(vectors.ravel(run.parameters), self.clock)
+        self.add(trees.ravel(run.parameters), self.clock)
         self.samples = record["samples"]
         if np.mean(self.errors[-WINDOW:]) < 0.8 * GOALS[-1]:
             run.stop("goal")
@@ -98,7 +98,7 @@ def descend(
     problem: ur.Problem, estimator: Any, optimizer: Any, seconds: float, seed: int, evaluations: float = math.inf
 ) -> Descent:
     """One run of the library's, of so many seconds and `Descent.evaluations` at most."""
-    truth, start = truth_of(problem), vectors.ravel(problem.initial())
+    truth, start = truth_of(problem), trees.ravel(problem.initial())
     size = sum(math.prod(problem.renderer.resolutions()[view.sensor]) for view in problem.views)
     track = _Track(truth, start, seconds, evaluations * size)
     longest = _PATIENCE * min(seconds, _LONGEST)

@@ -9,7 +9,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.higher_order.table2.descents import GOALS, WINDOW, Descent, measured, truth_of
-from benchmarks.internals import dr, mi, stock_scene, vectors
+from benchmarks.internals import dr, mi, stock_scene, trees
 from benchmarks.runner.timing import work_time
 
 MITSUBA = ("BUNNY", "TEXTURE")
@@ -51,7 +51,7 @@ def _texture(problem: ur.Problem, parameters: Any) -> tuple[Any, Callable[[Any],
 def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Descent:
     """One run of `mi.render`, `dr.backward`, `mi.ad.Adam`: projective sampling of silhouettes for BUNNY, `prb` for TEXTURE."""
     scene, parameters = stock_scene(problem)
-    start, truth = vectors.ravel(problem.initial()), truth_of(problem)
+    start, truth = trees.ravel(problem.initial()), truth_of(problem)
     integrator, place = _bunny(scene, parameters) if name == "BUNNY" else _texture(problem, parameters)
     points, times, errors = [start], [0.0], [1.0]
     scale = float(np.sqrt(np.mean((start - truth) ** 2)))

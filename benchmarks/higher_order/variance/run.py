@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, black_box, vectors
+from benchmarks import markdown
+from benchmarks.internals import Key, black_box, trees
+from benchmarks.runner.records import Record
 
 SIGMA = {"quad": 0.3, "box10": 0.3, "mug": 0.5}
 PLAIN = {"aggregate": False, "antithetic": False, "baseline": False, "low_discrepancy": False}
@@ -40,7 +42,7 @@ def efficiency(
     """Variance times evaluations. With `aggregate`, `samples` evaluations serve all elements; else they are divided among them."""
     parameters = problem.initial()
     evaluate = black_box(problem, parameters, 1, Key(0))
-    theta = vectors.ravel(parameters)
+    theta = trees.ravel(parameters)
     counted = [0]
 
     def losses(points: np.ndarray) -> np.ndarray:
@@ -82,3 +84,15 @@ def run(problem: tuple[str, ...] = tuple(SIGMA), runs: int = 100, samples: int =
             orders[order] = {cut: value / cuts["plain"] for cut, value in cuts.items()}
             print(name, order, {cut: float(f"{v:.3g}") for cut, v in orders[order].items()}, flush=True)
         yield {"sigma": SIGMA, "problems": {name: orders}}
+
+
+def table(record: Record) -> str:
+    """Variance times evaluations over that of the plain estimator."""
+    problems = record["problems"]
+    names = list(next(iter(next(iter(problems.values())).values())))
+    head = ["", *(f"{problem}: {order}" for problem, orders in problems.items() for order in orders)]
+    rows = [
+        [name, *(f"{cuts[name]:.2g}" for orders in problems.values() for cuts in orders.values())] for name in names
+    ]
+    text = "{runs} runs of {samples} evaluations; below 1 pays.".format(**record["settings"])
+    return markdown.blocks(text, markdown.table(" | ".join(head), rows))

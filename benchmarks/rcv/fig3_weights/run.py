@@ -23,7 +23,9 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks import figures, markdown
 from benchmarks.moments import Moments, summed_variances
+from benchmarks.runner.records import Record
 from benchmarks.weight_rules import one_run
 
 RULES = ("analytic", "online", "absolute", "relative", "greater")
@@ -63,3 +65,29 @@ def run(resolution: int = 48, spp: int = 8, steps: int = 50, runs: int = 24) -> 
             "bias_error": float(extra.std(ddof=1) / np.sqrt(runs)),
         }
     return {"rules": rules}
+
+
+def table(record: Record) -> str:
+    """Fig. 3."""
+    text = "{resolution}², {spp} spp, {steps} steps, {runs} runs; at the last step but where it says otherwise, variance relative to one "
+    text += "render's."
+    return markdown.blocks(
+        text.format(**record["settings"]),
+        markdown.records(
+            "rule | variance after 3 renders | weight | variance | bias",
+            "{rule} | {variance[2]:.3f} | {weight[-1]:.3f} | {variance[-1]:.4f} | {bias:+.2%} ± {bias_error:.2%}",
+            markdown.named(record["rules"], "rule"),
+        ),
+    )
+
+
+def plot(record: Record) -> figures.Figure:
+    """Weights and variance over the steps."""
+    steps, rules = range(record["settings"]["steps"]), record["rules"]
+    panels = {
+        "weight": {rule: figures.over_steps(found["weight"]) for rule, found in rules.items()},
+        "variance over one render's": {
+            rule: figures.band(steps, found["variance"], found["variance_error"]) for rule, found in rules.items()
+        },
+    }
+    return figures.curves(panels, "step", "")

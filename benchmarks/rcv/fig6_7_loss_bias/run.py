@@ -11,8 +11,10 @@ from __future__ import annotations
 from typing import Any
 
 import unrender as ur
-from benchmarks.derivative_bias import derivatives
+from benchmarks import figures, markdown
+from benchmarks.derivative_bias import METHODS, derivatives
 from benchmarks.paths import converged, descent
+from benchmarks.runner.records import Record
 
 LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 KEY = "back.bsdf.reflectance.data"
@@ -33,3 +35,27 @@ def run(
     target = converged(problem, {KEY: problem.renderer.array(problem.truth[KEY])}, reference_spp).mean
     fig7, maps = derivatives(problem, path, LOSSES, target, spp, runs, renders, reference_spp)
     return {"fig7": fig7, "maps": maps}
+
+
+def table(record: Record) -> str:
+    """Fig. 7."""
+    losses = {name: {method: entry[method] for method in METHODS} for name, entry in record["fig7"]["losses"].items()}
+    text = "{resolution}², {spp} spp, {runs} runs, step {step}; relative to the derivative's mean."
+    return markdown.blocks(
+        text.format(**record["settings"]),
+        markdown.records(
+            "loss | image | bias of the derivative | RMS over pixels | variance",
+            "{loss} | {method} | {signed:+.1%} ± {signed_error:.1%} | {rms:.2f} | {variance:.2f}",
+            markdown.named(losses, "loss", "", "method"),
+        ),
+        f"The image's variance is {record['fig7']['image_variance_ratio']:.1f} × lower with the control variate.",
+    )
+
+
+def plot(record: Record) -> figures.Figure:
+    """Fig. 7: the derivative of each loss, and the bias of its estimates."""
+    kinds = ("reference", "plain", "rcv", "plain/bias", "debiased/bias", "rcv/bias")
+    rows = [
+        {f"{loss}, {kind}": record["maps"][f"{loss}/{kind}"] for kind in kinds} for loss in record["fig7"]["losses"]
+    ]
+    return figures.pictures(rows, signed=True)

@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks import figures, markdown
 from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
 from benchmarks.races import TUNING_SEED, search
+from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import step_seed
 from benchmarks.timed_runs import POINTS, Kept, blind, measured
@@ -213,3 +215,28 @@ def run(
         found[name] = race(problem, seconds, seeds, rates, indirect, spp, strengths)
         print(name, found[name]["seconds to the stock loops' best"], flush=True)
         yield {"problems": found}
+
+
+def table(record: Record) -> str:
+    """What was left of the errors, and when `auto` was where the stock loops ended."""
+    rows = []
+    for name, found in record["problems"].items():
+        for method, of in ((method, of) for method, of in found.items() if "runs" in of):
+            finals = [markdown.spread([run[what] for run in of["runs"]]) for what in ("surface", "pictures")]
+            names = ("rate", "spp", "indirect", "strength") if method == "LargeSteps" else ("rate", "spp", "indirect")
+            tuned = ", ".join(f"{of[name]:g}" for name in names) if "rate" in of else ""
+            reached = found["seconds to the stock loops' best"] if method == "auto" else []
+            when = ", ".join("never" if at is None else f"{at:.1f} s" for at in reached)
+            rows.append([name, method, tuned, *finals, when])
+    head = "problem | method | rate, spp, indirect spp, λ | surface error | picture error | at the best stock loop's end after"
+    text = "Of the start's, after {seconds:g} s of the processor, {seeds} seeds: median (least to greatest)."
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
+
+
+def plot(record: Record) -> figures.Figure:
+    """Error of the surface over seconds."""
+    panels = {
+        name: {method: [run["curve"] for run in of["runs"]] for method, of in found.items() if "runs" in of}
+        for name, found in record["problems"].items()
+    }
+    return figures.curves(panels, "processor seconds", "surface error / at the start")

@@ -19,8 +19,7 @@ from typing import Any
 
 from unrender.backend import cache, install_hints, limits, llvm, plugins
 from unrender.core.errors import InputError, VariantError
-from unrender.core.suggestions import did_you_mean
-from unrender.core.text import reason_of
+from unrender.core.text import did_you_mean, reason_of
 
 CUDA = "cuda_ad_rgb"
 LLVM = "llvm_ad_rgb"

@@ -17,32 +17,32 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Protocol
 
 
-class Listener(Protocol):
-    """Receiver of the phases of all calls within `listening`. Phases may nest."""
+class Listener:
+    """Receiver of the phases of all calls within `listening`. Phases may nest. Override the methods of interest."""
 
     def on_phase(self, name: str) -> None:
-        """Handle the start of a phase."""
-        ...
+        """Called at the start of a phase."""
 
     def on_progress(self, share: float) -> None:
-        """Handle the progress of the innermost phase, in [0, 1]."""
-        ...
+        """Called with the progress of the innermost phase, in [0, 1]."""
 
     def on_phase_end(self, name: str) -> None:
-        """Handle the end of the innermost phase, whether it returned or raised."""
-        ...
+        """Called at the end of the innermost phase, whether it returned or raised."""
 
 
 _listeners: ContextVar[tuple[Listener, ...]] = ContextVar("listeners", default=())
 
 
 @contextmanager
-def listening(listener: Listener) -> Iterator[None]:
-    """Send the phases of all calls within this context to a listener."""
-    token = _listeners.set((*_listeners.get(), listener))
+def listening(*listeners: Listener) -> Iterator[None]:
+    """Send the phases of all calls within this context to listeners. One that already receives them receives them once."""
+    found = list(_listeners.get())
+    for listener in listeners:
+        if not any(listener is each for each in found):
+            found.append(listener)
+    token = _listeners.set(tuple(found))
     try:
         yield
     finally:
@@ -67,7 +67,7 @@ def phase(name: str) -> Iterator[Callable[[float], None]]:
             listener.on_phase_end(name)
 
 
-class Stopwatch:
+class Stopwatch(Listener):
     """Listener that sums the seconds of each phase. Time in a nested phase counts for the nested phase only.
 
     Attributes:
@@ -83,9 +83,6 @@ class Stopwatch:
         self._charge()
         self._within.append(name)
         self.seconds.setdefault(name, 0.0)
-
-    def on_progress(self, share: float) -> None:
-        """Ignore the progress."""
 
     def on_phase_end(self, name: str) -> None:
         del name

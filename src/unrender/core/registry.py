@@ -31,7 +31,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar, overload
 
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 
 GROUP = "unrender.components"
 """The entry-point group."""

@@ -21,7 +21,7 @@ import numpy as np
 from unrender.core import registry
 from unrender.core.errors import InputError
 from unrender.core.registry import GROUP
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 
 _CALL = re.compile(r"\s*([A-Za-z_]\w*)\s*(?:\(([^()]*)\))?\s*")
 _NEXT = "then"

@@ -1,9 +1,12 @@
-"""Arithmetic over parameter trees: dictionaries {name: array} of equal keys."""
+"""Parameter trees, dictionaries {name: array}: arithmetic over trees of equal keys, and conversion to one vector on the host."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from typing import Any
+
+import numpy as np
 
 from unrender.core import arrays
 
@@ -48,3 +51,44 @@ def all_finite(a: Tree) -> bool:
 def numpy(a: Tree) -> Tree:
     """Return NumPy copies of the arrays."""
     return map(arrays.numpy, a)
+
+
+def ravel(tree: Tree) -> np.ndarray:
+    """Concatenate all elements in key order, (n,), in double precision. Waits for the device."""
+    return np.concatenate([arrays.numpy(x).ravel().astype(np.float64) for x in tree.values()])
+
+
+def parts(vectors: np.ndarray, like: Tree) -> dict[str, np.ndarray]:
+    """Split vectors (..., n) into {key: array (..., *shape)} with the shapes of `like`."""
+    result, start = {}, 0
+    for key, x in like.items():
+        shape = arrays.shape(x)
+        size = math.prod(shape)
+        result[key] = vectors[..., start : start + size].reshape((*vectors.shape[:-1], *shape))
+        start += size
+    return result
+
+
+def unravel(vector: np.ndarray, like: Tree) -> Tree:
+    """Return a tree with the shapes and types of `like` from a vector (n,); the inverse of `ravel`. The arrays own their memory."""
+    result = {}
+    for key, part in parts(vector, like).items():
+        x = like[key]
+        if arrays.is_drjit(x):  # adding zero copies out of NumPy's memory, see `MitsubaRenderer.array`
+            result[key] = type(x)(part.astype(np.float32)) + arrays.scalar(0.0, x)
+        else:
+            result[key] = part.astype(x.dtype)
+    return result
+
+
+def repeat_per_element(numbers: Mapping[str, float | np.ndarray], like: Tree) -> np.ndarray:
+    """Return a vector (n,) from one number per parameter, or one per element."""
+    return np.concatenate(
+        [np.broadcast_to(np.asarray(numbers[key], float), arrays.shape(x)).ravel() for key, x in like.items()]
+    )
+
+
+def clip_norm(step: np.ndarray, radius: float | None) -> np.ndarray:
+    """Scale `step` down to the length `radius` if it is longer. None means no limit."""
+    length = float(np.linalg.norm(step))
+    return step if radius is None or length <= radius else step * (radius / length)

@@ -7,7 +7,7 @@ import io
 
 import numpy as np
 
-from unrender.io.thumbnails import reduced
+from unrender.io.resampling import reduced
 from unrender.losses.metrics import exposure, srgb
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from unrender.core import arrays, vectors
+from unrender.core import arrays, trees
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
@@ -90,7 +90,7 @@ def _second_order(
             transforms = problem.coordinates.transforms
 
             def losses(points: np.ndarray) -> np.ndarray:
-                split = vectors.parts(points, parameters)
+                split = trees.parts(points, parameters)
                 values = [transforms[k].forward(u) if k in transforms else u for k, u in split.items()]
                 return evaluate(np.concatenate([x.reshape(len(points), -1) for x in values], axis=1))
 

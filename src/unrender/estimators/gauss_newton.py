@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from unrender.core import arrays, checks, vectors
+from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
@@ -144,7 +144,7 @@ class GaussNewton:
         system = point.system(state, key.fold(0))
         estimate = Estimate(
             system.loss,
-            vectors.unravel(system.gradient, parameters),
+            trees.unravel(system.gradient, parameters),
             (Hessian(system.hessian), HessianNoise(system.noise), Smoothing(dict(state.widths))),
             {"samples": point.samples, "images": system.images},
         )
@@ -152,10 +152,10 @@ class GaussNewton:
 
     def _sharpened(self, state: GaussNewtonState, parameters: Tree) -> GaussNewtonState:
         """Return the state with half the shift if the last step was short relative to the widths."""
-        point = vectors.ravel(parameters)
+        point = trees.ravel(parameters)
         if state.point is None:
             return GaussNewtonState(state.widths, state.shift or self.coarse or self.shift, point)
-        moved = np.abs(point - state.point) / vectors.repeat_per_element(state.widths, parameters)
+        moved = np.abs(point - state.point) / trees.repeat_per_element(state.widths, parameters)
         settled = 0.0 < moved.max(initial=0.0) < _SETTLED
         shift = max(0.5 * state.shift, self.shift) if settled else state.shift
         return replace(state, shift=shift, point=point)
@@ -163,7 +163,7 @@ class GaussNewton:
     def _next(self, state: GaussNewtonState, system: _System, parameters: Tree, change: float) -> GaussNewtonState:
         """Return the state with updated widths, at which renders differ from the image as much as the target shift, in the root mean
         square over the elements of a parameter. Widths change by at most the factor `change`."""
-        squares, slopes = vectors.parts(system.squares, parameters), vectors.parts(system.slopes, parameters)
+        squares, slopes = trees.parts(system.squares, parameters), trees.parts(system.slopes, parameters)
         widths = {}
         for key, width in state.widths.items():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
@@ -190,7 +190,7 @@ def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
     )
     loss = 2.0 * mean - 0.5 * sum(losses)
     hessian = 0.5 * sum(arrays.numpy(estimate.require("explained", Hessian).matrix) for estimate in estimates)
-    one, other = (vectors.ravel(estimate.gradient) for estimate in estimates)
+    one, other = (trees.ravel(estimate.gradient) for estimate in estimates)
     units = np.sqrt(np.abs(np.diag(hessian)))
     if loss <= 0.0 or not np.isfinite(hessian).all() or not units.all():
         return 0.0
@@ -235,17 +235,17 @@ class _Point:
     def __init__(self, options: GaussNewton, problem: Problem, parameters: Tree):
         self.options, self.problem, self.parameters = options, problem, parameters
         self.session: RenderSession = problem.renderer.prepare(list(parameters), None, derivatives=False)
-        self.theta = vectors.ravel(parameters)
+        self.theta = trees.ravel(parameters)
         self.samples = 0
         known = problem.renderer.parameters()
         sensors = {key: -1 if known[key].sensor is None else known[key].sensor for key in parameters}
-        self._sensors = vectors.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
+        self._sensors = trees.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
 
     def system(self, state: GaussNewtonState, key: Key, derivatives: bool = True) -> _System:
         """Return gradient and Hessian for the state's widths. Without `derivatives`, only compute the quantities that the next widths
         need."""
         total = _System.zero(self.theta.size)
-        steps = vectors.repeat_per_element(state.widths, self.parameters)
+        steps = trees.repeat_per_element(state.widths, self.parameters)
         for view, sensor_view in enumerate(self.problem.views):
             elements = np.flatnonzero((self._sensors == -1) | (self._sensors == sensor_view.sensor))
             own = key.fold(view)
@@ -280,7 +280,7 @@ class _Point:
         offsets = np.zeros((2, elements.size, self.theta.size))
         offsets[0, np.arange(elements.size), elements] = steps[elements]
         offsets[1, np.arange(elements.size), elements] = -steps[elements]
-        states = vectors.parts(self.theta + offsets, self.parameters)
+        states = trees.parts(self.theta + offsets, self.parameters)
         inside = [unknowns[key].project(x).reshape(*x.shape[:2], -1) for key, x in states.items()]
         points = np.concatenate(inside, axis=-1).astype(np.float32).astype(np.float64)
         distances = points[0, np.arange(elements.size), elements] - points[1, np.arange(elements.size), elements]
@@ -289,7 +289,7 @@ class _Point:
     def _states(self, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
         """Render images (B, H, W, 3) at points (B, n) with half of the samples, all with the same random numbers."""
         request = SampleRequest(self.problem.views[view].sensor, spp // 2, key.uint32())
-        stacked = {key: x.astype(np.float32) for key, x in vectors.parts(points, self.parameters).items()}
+        stacked = {key: x.astype(np.float32) for key, x in trees.parts(points, self.parameters).items()}
         for name, x in stacked.items():
             if (x == x[:1]).all():  # shared by all, see `RenderSession.image_batch`
                 stacked[name] = np.broadcast_to(x[0], x.shape)

@@ -10,7 +10,7 @@ from unrender.core import arrays, checks, trees
 from unrender.core.errors import InputError
 from unrender.core.random import WARM_UP, Key
 from unrender.core.registry import register
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.capabilities import BlockEstimate, Capabilities, Capability, FreshGradient, Gradient, Variance

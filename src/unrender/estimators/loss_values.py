@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays, checks, vectors
+from unrender.core import arrays, checks, trees
 from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.registry import register
@@ -77,7 +77,7 @@ class BlackBox:
         self.problem, self.parameters, self.spp, self.key = problem, parameters, spp, key
         self.debiased = debiased
         self.info: dict[str, Any] = {"samples": 0}
-        self._theta = vectors.ravel(parameters)
+        self._theta = trees.ravel(parameters)
         self._center: float | None = None
 
     def losses(self, points: np.ndarray) -> np.ndarray:
@@ -108,7 +108,7 @@ class BlackBox:
         """Return the losses (B,) and, per view, the images (B, H, W, 3)."""
         renderer, unknowns = self.problem.renderer, self.problem.unknowns
         session = renderer.prepare(list(self.parameters), None, derivatives=False)
-        stacked = {key: unknowns[key].project(x) for key, x in vectors.parts(points, self.parameters).items()}
+        stacked = {key: unknowns[key].project(x) for key, x in trees.parts(points, self.parameters).items()}
         images, parts = {}, []
         for index, view in enumerate(self.problem.views):
             request = SampleRequest(view.sensor, self.spp, self.key.fold(index).uint32())

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from unrender.core import arrays, vectors
+from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -76,7 +76,7 @@ def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tr
             return FreshGradient(_sum(values, added))
         case Hessian(matrix):
             product, shape = _product(problem, parameters), parameters
-            rows = [vectors.ravel(product(vectors.parts(row, shape))) for row in np.eye(len(arrays.numpy(matrix)))]
+            rows = [trees.ravel(product(trees.parts(row, shape))) for row in np.eye(len(arrays.numpy(matrix)))]
             return Hessian(arrays.numpy(matrix).astype(np.float64) + np.stack(rows))
         case HessianProduct(apply):
             product = _product(problem, parameters)
@@ -88,7 +88,7 @@ def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tr
         case LossFunction(evaluate):
 
             def losses(points: np.ndarray) -> np.ndarray:
-                split = [vectors.parts(point, parameters) for point in points]
+                split = [trees.parts(point, parameters) for point in points]
                 return evaluate(points) + np.array([penalty(problem, x) for x in split])
 
             return LossFunction(losses)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from unrender.core import arrays, vectors
+from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
@@ -35,7 +35,7 @@ class PreconditionedPerturbations:
     def __init__(self, problem: Problem, parameters: Tree):
         maps = problem.coordinates.preconditioners
         self._maps: Mapping[str, Preconditioner] = {key: maps[key] for key in parameters if key in maps}
-        self._parameters, self._theta = parameters, vectors.ravel(parameters)
+        self._parameters, self._theta = parameters, trees.ravel(parameters)
         transformed = [key for key in problem.coordinates.transforms if key in parameters]
         if self._maps and transformed:
             smooth = next(iter(self._maps))
@@ -62,7 +62,7 @@ class PreconditionedPerturbations:
 
     def _to_u(self, points: np.ndarray) -> np.ndarray:
         """Return u at v, (B, n) each."""
-        changes = vectors.parts(points - self._theta, self._parameters)
+        changes = trees.parts(points - self._theta, self._parameters)
         rows = [
             np.stack([self._smoothed(key, row) for row in rows]) if key in self._maps else rows
             for key, rows in changes.items()

@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-from unrender.core import checks, vectors
+from unrender.core import checks, trees
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators import smoothing as smoothed
 from unrender.estimators.base import Estimate
@@ -191,7 +191,7 @@ class SmoothedDerivatives:
         PreconditionedPerturbations(problem, parameters)
         problem.renderer.prepare(list(parameters), None, derivatives=False)
         self._sigma_per_parameter(parameters)
-        size = vectors.ravel(parameters).size
+        size = trees.ravel(parameters).size
         if self.hessian_rate is not None and self.hessian_form == "full" and size > _MAX_STORED:
             raise InputError(
                 f"SmoothedDerivatives: hessian_rate would store a matrix of {size} × {size} elements, which is too large; "
@@ -216,7 +216,7 @@ class SmoothedDerivatives:
             perturbed.append(evaluate(points))
             return perturbed[-1]
 
-        point = vectors.ravel(parameters), vectors.repeat_per_element(sigma, parameters)
+        point = trees.ravel(parameters), trees.repeat_per_element(sigma, parameters)
         seed, hessian = key.fold(1).uint32(), state.hessian
         if self.hessian_rate is not None:
             gradient, error, hessian = self._stored_hessian(record_losses, *point, seed, hessian, self.hessian_rate)
@@ -231,13 +231,13 @@ class SmoothedDerivatives:
             gradient, error, curvature = derive(record_losses, *point, seed, parameters)
         losses = np.concatenate(perturbed)
         capabilities = (
-            Variance(vectors.unravel(error**2, parameters)),
+            Variance(trees.unravel(error**2, parameters)),
             *curvature,
             LossFunction(evaluate),
             Smoothing(sigma),
         )
         estimate = Estimate(
-            box.center(), vectors.unravel(gradient, parameters), capabilities, box.info, preconditioned=bool(smooth)
+            box.center(), trees.unravel(gradient, parameters), capabilities, box.info, preconditioned=bool(smooth)
         )
         age = state.age + (_convergence(losses, estimate.loss) if self.adaptive_annealing else 1.0)
         return estimate, SmoothedState(age, hessian)
@@ -316,7 +316,7 @@ class SmoothedDerivatives:
             case "hessian":
                 return (Hessian(hessian()),)
             case "hvp":
-                return (HessianProduct(lambda v: vectors.unravel(product(vectors.ravel(v)), like)),)
+                return (HessianProduct(lambda v: trees.unravel(product(trees.ravel(v)), like)),)
 
     def _sigma_per_parameter(self, parameters: Tree) -> dict[str, float]:
         """Return σ of each parameter before the schedule. Raise `InputError` for a key that is unknown or missing."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, mesh_files, meshes, parts, staging
+from unrender.gallery import fields, meshes, parts, staging
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
@@ -27,7 +27,7 @@ class Bunny:
     """
 
     resolution: int = fields.resolution(48)
-    mesh: str = mesh_files.option("PLY or OBJ file of an animal, y upwards, in place of the one made by code")
+    mesh: str = meshes.option("PLY or OBJ file of an animal, y upwards, in place of the one made by code")
     detail: int = fields.integer(
         1, "how fine the mesh made by code is: 3600 vertices at 1, times the square", at_least=1, at_most=16
     )
@@ -38,7 +38,7 @@ class Bunny:
     def scene(self) -> dict[str, Any]:
         """Return the animal, 1 along its longest side, on the floor y = 0 at the origin, with the sun at the camera's left."""
         fur = parts.twosided(parts.diffuse(0.75, 0.6, 0.45))
-        made = mesh_files.standing(self.mesh, fur) if self.mesh else meshes.sheets("bunny", _animal(self.detail), fur)
+        made = meshes.standing(self.mesh, fur) if self.mesh else meshes.sheets("bunny", _animal(self.detail), fur)
         return {
             "type": "scene",
             "camera": parts.camera((0.1, 2.0, 3.0), (0.1, 0.33, 0), 30.0, self.resolution),

@@ -7,8 +7,8 @@ from typing import Any
 from unrender.core import registry
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
-from unrender.core.suggestions import did_you_mean
-from unrender.display import notebook_bar
+from unrender.core.text import did_you_mean
+from unrender.display import notebook
 from unrender.gallery import fields
 from unrender.gallery.fields import Option
 from unrender.gallery.specification import ProblemSource, build_problem
@@ -53,7 +53,7 @@ def problem(name: str, **options: Any) -> Problem:
         VariantError: Mitsuba cannot run on this machine.
     """
     specification = fields.fill(name, _specification(name), options)
-    with notebook_bar.shown():
+    with notebook.shown():
         if isinstance(specification, ProblemSource):
             made = specification.problem(name)
         else:

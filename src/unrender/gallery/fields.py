@@ -9,7 +9,7 @@ from typing import Any
 
 from unrender.core import checks, registry, tables
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.losses import Loss
 
 _LONGEST_SIDE = 1 << 13

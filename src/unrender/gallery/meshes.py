@@ -1,18 +1,39 @@
-"""Procedural meshes: smooth sheets over grids (flat, bulged, surfaces of revolution, sweeps), and spheres of triangles."""
+"""Meshes of gallery problems: sheets over grids, spheres, bodies around implicit surfaces, and files of the user."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
+from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.described import load_described
+from unrender.rendering.mitsuba.description import load
 from unrender.scene.surfaces import Surface
 
-__all__ = ["Sheet", "ellipsoid", "icosphere", "lathe", "sheet", "sheets", "surface", "sweep", "triangles", "unrolled"]
+__all__ = [
+    "Ellipsoid",
+    "Sheet",
+    "around",
+    "centred",
+    "ellipsoid",
+    "icosphere",
+    "lathe",
+    "option",
+    "sheet",
+    "sheets",
+    "standing",
+    "surface",
+    "sweep",
+    "triangles",
+    "united",
+    "unrolled",
+]
 
 
 def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool = False) -> Any:
@@ -205,3 +226,120 @@ def _normals(positions: np.ndarray, closed: bool) -> np.ndarray:
         along_columns = np.gradient(positions, axis=1)
     normals = np.cross(along_columns, along_rows)
     return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+
+
+_KINDS = (".ply", ".obj")
+
+
+def option(about: str) -> Any:
+    """Return a dataclass field: the path of a PLY or OBJ file, or "" for none."""
+    return field(default="", metadata={"kind": str, "about": about, "check": _check})
+
+
+def standing(path: str, bsdf: dict[str, Any]) -> dict[str, Any]:
+    """Return the file as a Mitsuba dictionary: longest side 1, lowest point at y = 0, centred over the origin.
+
+    Raises `InputError` if it cannot be read or has no extent.
+    """
+    low, high = _extent(path)
+    scale = 1 / float(np.max(high - low))
+    foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    return _placed(path, bsdf, scale, foot)
+
+
+def centred(path: str, bsdf: dict[str, Any]) -> dict[str, Any]:
+    """Return the file as a Mitsuba dictionary: longest side 2, centre of its bounding box at the origin.
+
+    Raises `InputError` if it cannot be read or has no extent.
+    """
+    low, high = _extent(path)
+    return _placed(path, bsdf, 2 / float(np.max(high - low)), (low + high) / 2)
+
+
+def _placed(path: str, bsdf: dict[str, Any], scale: float, origin: np.ndarray) -> dict[str, Any]:
+    to_world = mi.ScalarTransform4f().scale(scale) @ mi.ScalarTransform4f().translate((-origin).tolist())
+    return {"type": _kind(path), "filename": path, "to_world": to_world, "bsdf": bsdf}
+
+
+def _extent(path: str) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        box = load({"type": _kind(path), "filename": path}).bbox()
+    except Exception as error:
+        reason = " ".join(str(error).split()).removeprefix(f"{path}: ")[:300]
+        raise InputError(f"mesh {path}: Mitsuba could not read it: {reason}") from error
+    low, high = (np.array(corner, float).reshape(3) for corner in (box.min, box.max))
+    if not np.isfinite([low, high]).all() or np.max(high - low) <= 0:
+        raise InputError(f"mesh {path}: expected vertices with some extent, got none")
+    return low, high
+
+
+def _kind(path: str) -> str:
+    return Path(path).suffix.lower().removeprefix(".")
+
+
+def _check(owner: str, name: str, value: Any) -> str:
+    if not isinstance(value, (str, Path)):
+        raise InputError(f"{owner}: {name} must be the path of a {' or '.join(_KINDS)} file, got {value!r}")
+    if value == "":
+        return ""
+    if Path(value).suffix.lower() not in _KINDS:
+        raise InputError(f"{owner}: {name} must be the path of a {' or '.join(_KINDS)} file, got {str(value)!r}")
+    if not Path(value).is_file():
+        raise InputError(f"{owner}: {name}: {value}: no such file")
+    return str(value)
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """A part of a body.
+
+    Attributes:
+        centre: (3,).
+        radii: along x, y and z before the tilt, (3,).
+        tilt: rotation about z in degrees.
+    """
+
+    centre: tuple[float, float, float]
+    radii: tuple[float, float, float]
+    tilt: float = 0.0
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Half-axes as columns, (3, 3)."""
+        c, s = np.cos(np.radians(self.tilt)), np.sin(np.radians(self.tilt))
+        return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) * np.array(self.radii)
+
+    def depth(self, points: np.ndarray) -> np.ndarray:
+        """Return the depth of points (N, 3), (N,): positive inside, approximately the distance near the surface."""
+        local = (points - np.array(self.centre)) @ np.linalg.inv(self.axes).T
+        length = np.linalg.norm(local, axis=1)
+        slope = np.linalg.norm(local @ np.linalg.inv(self.axes), axis=1) / np.maximum(length, 1e-9)
+        return (1.0 - length) / np.maximum(slope, 1e-9)
+
+
+def united(parts: Sequence[Ellipsoid], blend: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the depth function of the union of parts, rounded over `blend` where they meet."""
+
+    def depth(points: np.ndarray) -> np.ndarray:
+        return blend * np.logaddexp.reduce([part.depth(points) / blend for part in parts])
+
+    return depth
+
+
+def around(
+    depth: Callable[[np.ndarray], np.ndarray], low: Sequence[float], high: Sequence[float], spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mesh where a depth is 0, by marching cubes: positions (V, 3) and faces (F, 3), facing outward.
+
+    Args:
+        depth: function of points (N, 3) that returns (N,), positive inside; negative on the sides of the box.
+        low, high: corners of the box.
+        spacing: spacing of the grid.
+    """
+    from skimage import measure
+
+    axes = [np.arange(a, b + spacing, spacing) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    values = np.clip(depth(grid.reshape(-1, 3)), -3 * spacing, 3 * spacing).reshape(grid.shape[:3])
+    points, faces, _, _ = measure.marching_cubes(values, 0.0, gradient_direction="ascent")
+    return points * spacing + np.asarray(low, float), faces.astype(np.int64)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import blobs, fields, meshes, parts, staging
+from unrender.gallery import fields, meshes, parts, staging
 from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
 from unrender.rendering.mitsuba.scene_loading import load
@@ -47,7 +47,7 @@ class ShadowArt:
 
     def target(self) -> dict[str, Any]:
         """Return the same scene with a body in place of the sphere: the largest body with the two outlines."""
-        points, faces = blobs.around(_depth, (-1.2, -1.2, -1.2), (1.2, 1.2, 1.2), _SPACING)
+        points, faces = meshes.around(_depth, (-1.2, -1.2, -1.2), (1.2, 1.2, 1.2), _SPACING)
         return self._stage() | {"body": meshes.triangles("body", points, faces, _clay())}
 
     def parameters(self) -> tuple[Parameter, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import blobs, fields, mesh_files, meshes, parts, staging
+from unrender.gallery import fields, meshes, parts, staging
 from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
 from unrender.rendering.mitsuba.scene_loading import load
@@ -19,15 +19,15 @@ from unrender.scene.view import View
 _CENTRE, _RADIUS = np.array([0.0, -0.15, 0.0]), 0.62
 _SPACING = 0.035
 _PARTS = (
-    blobs.Ellipsoid((-0.1, -0.36, 0.0), (0.6, 0.44, 0.4), 12.0),
-    blobs.Ellipsoid((-0.32, -0.5, 0.26), (0.3, 0.3, 0.16)),
-    blobs.Ellipsoid((-0.32, -0.5, -0.26), (0.3, 0.3, 0.16)),
-    blobs.Ellipsoid((0.3, -0.5, 0.0), (0.2, 0.3, 0.26)),
-    blobs.Ellipsoid((0.42, 0.12, 0.0), (0.28, 0.25, 0.23), -15.0),
-    blobs.Ellipsoid((0.64, 0.05, 0.0), (0.13, 0.12, 0.12)),
-    blobs.Ellipsoid((0.26, 0.52, 0.16), (0.11, 0.38, 0.09), 18.0),
-    blobs.Ellipsoid((0.26, 0.52, -0.16), (0.11, 0.38, 0.09), 18.0),
-    blobs.Ellipsoid((-0.74, -0.36, 0.0), (0.14, 0.14, 0.14)),
+    meshes.Ellipsoid((-0.1, -0.36, 0.0), (0.6, 0.44, 0.4), 12.0),
+    meshes.Ellipsoid((-0.32, -0.5, 0.26), (0.3, 0.3, 0.16)),
+    meshes.Ellipsoid((-0.32, -0.5, -0.26), (0.3, 0.3, 0.16)),
+    meshes.Ellipsoid((0.3, -0.5, 0.0), (0.2, 0.3, 0.26)),
+    meshes.Ellipsoid((0.42, 0.12, 0.0), (0.28, 0.25, 0.23), -15.0),
+    meshes.Ellipsoid((0.64, 0.05, 0.0), (0.13, 0.12, 0.12)),
+    meshes.Ellipsoid((0.26, 0.52, 0.16), (0.11, 0.38, 0.09), 18.0),
+    meshes.Ellipsoid((0.26, 0.52, -0.16), (0.11, 0.38, 0.09), 18.0),
+    meshes.Ellipsoid((-0.74, -0.36, 0.0), (0.14, 0.14, 0.14)),
 )
 """Body, haunches, chest, head, muzzle, ears, tail."""
 _BLEND = 0.02
@@ -46,7 +46,7 @@ class SphereToBunny:
     resolution: int = fields.resolution(64)
     views: int = fields.integer(6, "cameras, around the animal, by turns lower and higher", at_least=1, at_most=64)
     subdivisions: int = fields.integer(4, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=7)
-    mesh: str = mesh_files.option("PLY or OBJ file of a body, in place of the one made by code")
+    mesh: str = meshes.option("PLY or OBJ file of a body, in place of the one made by code")
     remesh_at: int = fields.integer(
         0, "step before which the mesh gets even triangles of half the edge (unrender[remesh]); 0 for never", at_least=0
     )
@@ -62,7 +62,7 @@ class SphereToBunny:
     def target(self) -> dict[str, Any]:
         """Return the same scene with the animal in place of the sphere."""
         if self.mesh:
-            return self._stage() | {"body": mesh_files.centred(self.mesh, _fur())}
+            return self._stage() | {"body": meshes.centred(self.mesh, _fur())}
         return self._stage() | {"body": meshes.triangles("body", *_animal(), _fur())}
 
     def parameters(self) -> tuple[Parameter, ...]:
@@ -100,4 +100,4 @@ def _fur() -> dict[str, Any]:
 
 
 def _animal() -> tuple[np.ndarray, np.ndarray]:
-    return blobs.around(blobs.united(_PARTS, _BLEND), (-1.1, -1.0, -0.7), (1.0, 1.1, 0.7), _SPACING)
+    return meshes.around(meshes.united(_PARTS, _BLEND), (-1.1, -1.0, -0.7), (1.0, 1.1, 0.7), _SPACING)

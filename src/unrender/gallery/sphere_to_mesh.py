@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, mesh_files, meshes, parts, staging, textures
+from unrender.gallery import fields, meshes, parts, staging, textures
 from unrender.gallery.specification import reference
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
@@ -39,7 +39,7 @@ class SphereToMesh:
     resolution: int = fields.resolution(48)
     views: int = fields.integer(6, "cameras, around the body, by turns lower and higher", at_least=1, at_most=32)
     subdivisions: int = fields.integer(3, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=6)
-    mesh: str = mesh_files.option("PLY or OBJ file of the body, in place of the one made by code")
+    mesh: str = meshes.option("PLY or OBJ file of the body, in place of the one made by code")
     reference_spp: int = fields.reference_spp(512)
     max_depth: int = fields.max_depth(2, at_least=2)
     strength: int = fields.integer(0, "λ of large steps (LargeSteps) on the mesh, 0 for none; 19 is usual", at_least=0)
@@ -55,7 +55,7 @@ class SphereToMesh:
     def target(self) -> dict[str, Any]:
         """Return the same scene with the body in place of the sphere."""
         if self.mesh:
-            return self._stage() | {"body": mesh_files.centred(self.mesh, _clay())}
+            return self._stage() | {"body": meshes.centred(self.mesh, _clay())}
         points, faces = meshes.icosphere(5)
         return self._stage() | {"body": meshes.triangles("body", _body(points), faces, _clay())}
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from unrender.backend import variant
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 
 Denoiser = Literal["auto", "oidn", "optix", "variation"]
 """Denoisers: "oidn" (package pyoidn), "optix" (Mitsuba's, for GPU variants), "variation" (scikit-image's total variation, which preserves

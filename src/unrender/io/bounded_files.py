@@ -21,8 +21,7 @@ from typing import IO, Any
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
-from unrender.core.text import printable, shorten, visible
+from unrender.core.text import did_you_mean, printable, shorten, visible
 from unrender.io import files
 from unrender.io.npy_format import MalformedHeader, Shape, read_npy
 

@@ -1,4 +1,7 @@
-"""Resampling of textures and grids by Mitsuba's convention: values are at texel centres, and vary linearly between them."""
+"""Resampling of textures and grids by Mitsuba's convention, and smaller copies for display.
+
+By the convention, values are at texel centres, and vary linearly between them.
+"""
 
 from __future__ import annotations
 
@@ -49,3 +52,26 @@ def resize(values: np.ndarray, size: Sequence[int]) -> np.ndarray:
     """Resize (*old, C) to (*size, C): `downsample` along axes that shrink, then `upsample` along axes that grow."""
     least = [min(old, new) for old, new in zip(values.shape[:-1], size, strict=True)]
     return np.ascontiguousarray(upsample(downsample(values, least), size), np.float32)
+
+
+def resize_nearest(coarse: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Resize (rows, columns, ...) to (height, width, ...) by nearest neighbour."""
+    rows, columns = (np.arange(n) * m // n for n, m in zip((height, width), coarse.shape[:2], strict=True))
+    return coarse[rows][:, columns]
+
+
+def reduced(array: np.ndarray, largest: int, axes: int = 2) -> np.ndarray:
+    """Reduce an array by box filtering with an integer factor, so that its first `axes` sides are at most `largest`.
+
+    Borders are repeated if the factor does not divide a side. An array that is small enough is returned unchanged.
+    """
+    sides = array.shape[:axes]
+    factor = -(-max(sides, default=0) // largest)
+    if factor <= 1:
+        return array
+    # A side shorter than the factor, such as that of a strip, is averaged to a single value.
+    factors = [min(factor, side) for side in sides]
+    pad = [(0, -side % own) for side, own in zip(sides, factors, strict=True)] + [(0, 0)] * (array.ndim - axes)
+    padded = np.pad(array, pad, mode="edge")
+    blocks = [n for side, own in zip(padded.shape, factors, strict=False) for n in (side // own, own)]
+    return padded.reshape(*blocks, *array.shape[axes:]).mean(axis=tuple(range(1, 2 * axes, 2)))

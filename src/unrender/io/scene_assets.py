@@ -12,7 +12,7 @@ from typing import IO
 
 from unrender.core.errors import InputError
 from unrender.core.text import shorten
-from unrender.io import bounded_files, image_size, mesh_files, spectrum_files, volumes
+from unrender.io import bounded_files, image_size, mesh_files, volumes
 
 MOST_VALUES = 1 << 30
 """Largest number of values of all images and grids of a scene."""
@@ -77,7 +77,7 @@ _CHECKS: dict[str, Callable[[Path], int | None]] = {
     **dict.fromkeys(("measured", "measured_polarized"), lambda path: check_tensors(path)),
     "ply": mesh_files.check_ply,
     "obj": mesh_files.check_obj,
-    "spectrum": spectrum_files.check,
+    "spectrum": lambda path: check_spectrum(path),
 }
 
 
@@ -118,3 +118,20 @@ def _check_field(file: IO[bytes], size: int) -> None:
 
 def _read(file: IO[bytes], form: str) -> tuple[int, ...]:
     return struct.unpack(form, file.read(struct.calcsize(form)))
+
+
+_LARGEST_SPECTRUM = 1 << 20
+
+
+def check_spectrum(path: Path) -> None:
+    """Raise `InputError` unless the file is a spectrum: lines of a wavelength and a value."""
+    text = bounded_files.read_text(path, _LARGEST_SPECTRUM)
+    for number, line in enumerate(text.split("\n"), 1):
+        words = line.partition("#")[0].split()
+        try:
+            if len(words) not in (0, 2):
+                raise ValueError
+            for word in words:
+                float(word)
+        except ValueError as error:
+            raise InputError(f"{path}:{number}: expected a wavelength and a value") from error

@@ -16,7 +16,7 @@ from xml.parsers import expat
 
 from unrender.core.errors import InputError
 from unrender.core.text import shorten
-from unrender.io import bounded_files, spectrum_files
+from unrender.io import bounded_files, scene_assets
 
 _DEEPEST = 128
 _DEEPEST_INCLUDE = 14
@@ -214,5 +214,5 @@ class _File:
         path = resolve(name, [*self.search, Path()])
         if path is None:
             raise InputError(f"scene {self.shown}: spectrum {shorten(name, 200)}: no such file")
-        spectrum_files.check(path)
+        scene_assets.check_spectrum(path)
         self.reader.named.append(path)

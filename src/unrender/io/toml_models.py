@@ -10,7 +10,7 @@ import pydantic
 from pydantic import BaseModel, ConfigDict
 
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.io import bounded_files, toml_lines
 from unrender.io.toml_lines import Place, dotted
 

@@ -19,8 +19,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
-from unrender.core.suggestions import did_you_mean
-from unrender.core.text import reason_of
+from unrender.core.text import did_you_mean, reason_of
 from unrender.io import bounded_files
 
 _SAFE_UNPICKLER = (2, 6)

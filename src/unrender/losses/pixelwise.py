@@ -1,12 +1,14 @@
-"""Pixelwise losses."""
+"""Pixelwise losses, and one for photographs with saturated pixels, whose true radiance is at least white."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.losses.base import Loss
 
 
 class _Pixelwise:
@@ -104,3 +106,51 @@ class Huber(_WithNonlinearDerivative):
 
     def derivative(self, image: Array, reference: Array) -> Array:
         return arrays.clip(image - reference, -self.delta, self.delta)
+
+
+@register(position=6)
+@dataclass(frozen=True)
+class Censored:
+    """ℓ(min(I, R), R) where the reference R is at least `white`, and ℓ(I, R) elsewhere, per element.
+
+    A photograph cannot show more than white. At saturated pixels a darker rendering is wrong and a brighter one is not, so the loss is
+    one-sided there (censored regression, Tobin 1958).
+
+    The derivative is not linear in the image. If the true radiance is near white, image noise counts only where it is darker, so such
+    pixels become too bright by about the standard deviation of the image. Pixels far above white have no bias, and only a lower bound.
+    Excluding saturated pixels by a mask has no bias, but leaves highlights unconstrained.
+
+    Args:
+        loss: ℓ, a pixelwise loss.
+        white: smallest value of a saturated pixel, linear, > 0. Photographs are scaled to [0, 1]. Values below 1 include pixels that
+            resizing has mixed with their neighbours.
+    """
+
+    loss: Loss = field(default_factory=L1)
+    white: float = 0.95
+
+    def __post_init__(self):
+        checks.number("Censored", "white", self.white, above=0.0)
+        if isinstance(self.loss, type) or not getattr(self.loss, "pixelwise", False):
+            raise InputError(f"Censored: loss must be pixelwise, such as L1(), got {self.loss!r:.80}")
+
+    @property
+    def linear(self) -> bool:
+        """False."""
+        return False
+
+    @property
+    def pixelwise(self) -> bool:
+        """True."""
+        return True
+
+    def value(self, image: Array, reference: Array) -> Array:
+        return self.loss.value(self._censored(image, reference), reference)
+
+    def derivative(self, image: Array, reference: Array) -> Array:
+        """Return ∂ℓ/∂I per element; 0 at saturated pixels where the image is brighter than the reference."""
+        slope = self.loss.derivative(self._censored(image, reference), reference)
+        return arrays.where((reference >= self.white) & (image >= reference), slope * 0.0, slope)
+
+    def _censored(self, image: Array, reference: Array) -> Array:
+        return arrays.where(reference >= self.white, arrays.minimum(image, reference), image)

@@ -12,8 +12,7 @@ from pydantic import BaseModel, ConfigDict
 
 from unrender.core import registry, tables
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
-from unrender.core.text import grouped
+from unrender.core.text import did_you_mean, grouped
 from unrender.estimators.base import Estimator
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer

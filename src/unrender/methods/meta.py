@@ -1,4 +1,4 @@
-"""Method `meta`: meta-estimation (Balint et al. 2023)."""
+"""Methods of meta-estimation (Balint et al. 2023): `meta`, and `coupled`, whose samples contribute to both of its terms."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pydantic import Field, FiniteFloat, PositiveFloat, PositiveInt
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
 from unrender.estimators.meta import MetaEstimator
+from unrender.images.plain import Plain
+from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
@@ -72,3 +74,20 @@ class MetaMethod(MetaCommonOptions):
     def build(self) -> tuple[Estimator, Optimizer]:
         spp, images = (self.proportional_spp, self.difference_spp), self.difference_images
         return MetaEstimator(*spp, difference_images=images, **self.shared()), self.built_optimizer()
+
+
+@register(name="coupled", position=4)
+class CoupledMethod(MetaCommonOptions):
+    """meta-estimation with every sample in both of its terms, MetaAdam"""
+
+    spp: PositiveInt = Field(3, description="samples per pixel, each for the gradient and for its change")
+    image: Literal["plain", "rcv"] = Field(
+        "plain",
+        description="image estimator: a new rendering, or rcv's control variate (in path space, unless space is primary)",
+    )
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        image = Plain()
+        if self.image == "rcv":
+            image = RecursiveControlVariate("primary" if self.space == "primary" else "path")
+        return MetaEstimator(coupled=True, spp=self.spp, image=image, **self.shared()), self.built_optimizer()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.core import arrays, checks, vectors
+from unrender.core import arrays, checks, trees
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -105,7 +105,7 @@ class AveragedNewton:
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> AveragedNewtonState:
         own = rates.per_parameter("AveragedNewton", parameters, self.learning_rate, learning_rates)
-        n = vectors.ravel(parameters).size
+        n = trees.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
         radii = np.full(n, np.inf if self.trust_radius is None else self.trust_radius)
         return AveragedNewtonState(own, square, row, square, row, row, row, square, radii, row)
@@ -115,9 +115,9 @@ class AveragedNewton:
     ) -> tuple[Tree, AveragedNewtonState]:
         """Return the steps and the next state. Computed on the host."""
         hessian = arrays.numpy(estimate.require("AveragedNewton", Hessian).matrix).astype(np.float64)
-        gradient, x = vectors.ravel(estimate.gradient), vectors.ravel(parameters)
+        gradient, x = trees.ravel(estimate.gradient), trees.ravel(parameters)
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
-            return vectors.unravel(np.zeros_like(x), parameters), state
+            return trees.unravel(np.zeros_like(x), parameters), state
         hessian = 0.5 * (hessian + hessian.T)
         noise_estimate = estimate.get(HessianNoise)
         added = (
@@ -149,7 +149,7 @@ class AveragedNewton:
             moved = self._solve(own[:, None] * damped * own, own * slope, radius)
             lengths[block] = np.linalg.norm(moved)
             step[block] = own * moved
-        return vectors.unravel(step, parameters), AveragedNewtonState(
+        return trees.unravel(step, parameters), AveragedNewtonState(
             state.learning_rates, matrix, target, noise, shares, counts, lengths, scatter, radii, step
         )
 
@@ -174,8 +174,8 @@ class AveragedNewton:
             inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / np.outer(units, units)
             error = np.sqrt(np.abs(np.diag(inverse @ state.scatter[both] @ inverse)))
             errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.nan, error)
-        split = vectors.parts(errors[None], parameters)
-        counts = vectors.parts(state.counts[None], parameters)
+        split = trees.parts(errors[None], parameters)
+        counts = trees.parts(state.counts[None], parameters)
         return {
             key: x[0]
             for key, x in split.items()

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from unrender.core import checks, vectors
+from unrender.core import checks, trees
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -100,7 +100,7 @@ class CMAES:
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> CMAESState:
         own = rates.per_parameter("CMAES", parameters, self.learning_rate, learning_rates)
-        start = vectors.ravel(parameters) / vectors.repeat_per_element(own, parameters)
+        start = trees.ravel(parameters) / trees.repeat_per_element(own, parameters)
         population = self.population or 4 + math.floor(3 * math.log(start.size))
         ranks, held = np.zeros((0, population), np.int32), np.zeros(0, np.int32)
         return CMAESState(own, start, ranks, held, np.zeros((0, start.size)))
@@ -110,8 +110,8 @@ class CMAES:
         evaluate = estimate.require("CMAES", LossFunction).evaluate
         search = state._search or self._replay(state)
         object.__setattr__(state, "_search", None)  # the search advances to the next state
-        scale = vectors.repeat_per_element(state.learning_rates, parameters)
-        here, generation = vectors.ravel(parameters) / scale, len(state.ranks)
+        scale = trees.repeat_per_element(state.learning_rates, parameters)
+        here, generation = trees.ravel(parameters) / scale, len(state.ranks)
         if search.differs(here):
             search.bound_at(here)
             held = np.append(state.held, np.int32(generation))
@@ -125,7 +125,7 @@ class CMAES:
         state = replace(state, ranks=np.concatenate([state.ranks, ranks[None]]))
         object.__setattr__(state, "_search", search)
         step = scale * (search.mean - here) if ranks.any() else np.zeros_like(here)
-        return vectors.unravel(step, parameters), state
+        return trees.unravel(step, parameters), state
 
     def _replay(self, state: CMAESState) -> _Search:
         """Rebuild the search at a state from its ranks."""

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from unrender.core import arrays, checks, vectors
+from unrender.core import arrays, checks, trees
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -97,7 +97,7 @@ def coordinate_scales(estimate: Estimate, state: Scaled, parameters: Tree) -> np
     """Return the unit of each element's coordinate u, (n,): its learning rate times the σ of smoothed derivatives."""
     smoothing = estimate.get(Smoothing)
     scales = {key: η * (smoothing.sigma[key] if smoothing else 1.0) for key, η in state.learning_rates.items()}
-    return vectors.repeat_per_element(scales, parameters)
+    return trees.repeat_per_element(scales, parameters)
 
 
 def apply_direction(
@@ -111,11 +111,11 @@ def apply_direction(
         direction = np.zeros_like(direction)
     step, adam = options.step_scale * direction, state.adam
     if options.inner_optimizer is not None and adam is not None:
-        opposite = vectors.unravel(-direction, _on_host(parameters))
+        opposite = trees.unravel(-direction, _on_host(parameters))
         steps, adam = options.inner_optimizer.update(Estimate(0.0, opposite), adam, opposite)
-        step = vectors.ravel(steps)
+        step = trees.ravel(steps)
     factor = rates.factor(owner, options.schedule, state.step)
-    return vectors.unravel(factor * step, parameters), NewtonState(state.step + 1, state.learning_rates, adam)
+    return trees.unravel(factor * step, parameters), NewtonState(state.step + 1, state.learning_rates, adam)
 
 
 def _on_host(parameters: Tree) -> Tree:

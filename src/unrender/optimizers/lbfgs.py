@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from unrender.core import arrays, checks, vectors
+from unrender.core import arrays, checks, trees
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -101,7 +101,7 @@ class LBFGS:
     def update(self, estimate: Estimate, state: LBFGSState, parameters: Tree) -> tuple[Tree, LBFGSState]:
         """Return the steps and the next state. Computed on the host."""
         scale = coordinate_scales(estimate, state.newton, parameters)
-        here, gradient = vectors.ravel(parameters), vectors.ravel(estimate.gradient)
+        here, gradient = trees.ravel(parameters), trees.ravel(estimate.gradient)
         if state.newton.step:
             state = self._remember(state, here - state.parameters, gradient - state.gradient, scale)
         direction = scale * self._direction(state, scale * gradient, scale)
@@ -132,4 +132,4 @@ class LBFGS:
         # SciPy's B starts from the identity. In coordinates u / √β this is β in those of u.
         beta = float(moves[-1] @ changes[-1]) / float(changes[-1] @ changes[-1])
         inverse = LbfgsInvHessProduct(moves / math.sqrt(beta), changes * math.sqrt(beta))
-        return vectors.clip_norm(-beta * inverse.matvec(gradient), self.trust_radius)
+        return trees.clip_norm(-beta * inverse.matvec(gradient), self.trust_radius)

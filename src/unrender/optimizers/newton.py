@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.core import arrays, checks, vectors
+from unrender.core import arrays, checks, trees
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -49,7 +49,7 @@ def trust_region_step(curvatures: np.ndarray, gradient: np.ndarray, radius: floa
             break
         λ += length**2 / float(np.sum(step * step / (curvatures + λ))) * (length - radius) / radius
         step = -gradient / (curvatures + λ)
-    return vectors.clip_norm(step, radius)
+    return trees.clip_norm(step, radius)
 
 
 @register
@@ -108,7 +108,7 @@ class Newton:
         matrix = estimate.require("Newton", Hessian).matrix
         scale = coordinate_scales(estimate, state, parameters)
         hessian = scale[:, None] * arrays.numpy(matrix).astype(np.float64) * scale
-        step = self._solve(scale * vectors.ravel(estimate.gradient), hessian)
+        step = self._solve(scale * trees.ravel(estimate.gradient), hessian)
         return apply_direction("Newton", self, scale * step, state, parameters)
 
     def _solve(self, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.core import checks, conjugate_gradients, vectors
+from unrender.core import checks, conjugate_gradients, trees
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -92,9 +92,9 @@ class NewtonCG:
         scale = coordinate_scales(estimate, state, parameters)
 
         def product(v: np.ndarray) -> np.ndarray:
-            return scale * vectors.ravel(hvp(vectors.unravel(scale * v, parameters)))
+            return scale * trees.ravel(hvp(trees.unravel(scale * v, parameters)))
 
-        gradient = scale * vectors.ravel(estimate.gradient)
+        gradient = scale * trees.ravel(estimate.gradient)
         step = conjugate_gradients.solve(
             gradient, product, self.trust_radius, self.iterations, self.tolerance, self.damping
         )
@@ -105,7 +105,7 @@ class NewtonCG:
     @staticmethod
     def _losses(estimate: Estimate, step: np.ndarray, parameters: Tree) -> np.ndarray:
         """Return the losses one step behind the parameters, at the parameters, and one step ahead, (3,)."""
-        theta = vectors.ravel(parameters)
+        theta = trees.ravel(parameters)
         return estimate.require("NewtonCG", LossFunction).evaluate(np.stack([theta - step, theta, theta + step]))
 
     def _line_search(self, step: np.ndarray, losses: np.ndarray) -> np.ndarray:

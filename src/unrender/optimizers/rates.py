@@ -8,7 +8,7 @@ from typing import Any
 
 from unrender.core import checks
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.schedules.functions import Schedule
 
 

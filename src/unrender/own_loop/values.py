@@ -14,7 +14,7 @@ from unrender.core import arrays, checks, frameworks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.frameworks import Framework
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import ParameterInfo, Renderer
 

@@ -14,7 +14,7 @@ import numpy as np
 from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.io import bounded_files
 from unrender.rendering.expression_texts import Function, parse

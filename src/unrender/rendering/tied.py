@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core import checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import (

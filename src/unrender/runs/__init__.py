@@ -6,6 +6,7 @@ from unrender.core import lazy
 
 if TYPE_CHECKING:
     from unrender.runs.callbacks import TensorBoard
+    from unrender.runs.image_sensitivity import sensitivity
     from unrender.runs.live import Live
 
 __getattr__, _ = lazy.attach(
@@ -13,9 +14,11 @@ __getattr__, _ = lazy.attach(
     {
         "Live": "live",
         "TensorBoard": "callbacks",
+        "sensitivity": "image_sensitivity",
     },
 )
 __all__ = [
     "Live",
     "TensorBoard",
+    "sensitivity",
 ]

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any
 from unrender.backend import cache
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
-from unrender.runs.hooks import Hook
+from unrender.runs.callbacks import Callback
 from unrender.runs.result import NON_FINITE
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Descent
     from unrender.runs.run import Run
 
 _MOST_SKIPPED = 20
@@ -34,19 +33,18 @@ _MOST_STEPS = 1 << 63
 """Exclusive limit that the files of a run folder can store."""
 
 
-class Budget(Hook):
-    """Hook that stops a run after its steps or seconds, or after twenty consecutive steps that are not finite."""
+class Budget(Callback):
+    """Callback that stops a run after its steps or seconds, or after twenty consecutive steps that are not finite."""
 
     def __init__(self) -> None:
         self._least = self._looked = -math.inf
         self._kernels = cache.kernels_changed()
 
-    def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+    def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         del fresh, warm
-        descent.run.compiled = cache.kernels_changed() != self._kernels
+        run.compiled = cache.kernels_changed() != self._kernels
 
-    def on_start(self, descent: Descent) -> None:
-        run = descent.run
+    def on_start(self, run: Run) -> None:
         if run.deadline is not None:
             run.deadline -= run.clock  # of a resumed run, before
         self._least = time.perf_counter() + _LEAST_SHARE * max((run.seconds or 0.0) - run.clock, 0.0)
@@ -54,14 +52,13 @@ class Budget(Hook):
             late = _LATE_COMPILED if run.compiled else _LATE_SHARE * run.seconds + _LATE_SECONDS
             rest = (_END_SHARE * run.seconds + _END_SECONDS + _PAGE_SECONDS) * min(slowdown(), _MOST_SLOWDOWN)
             self._least = min(self._least, run.deadline + late - rest)
-        self._check(descent)
+        self._check(run)
 
-    def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
+    def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
         del estimate, applied
-        self._check(descent)
+        self._check(run)
 
-    def _check(self, descent: Descent) -> None:
-        run = descent.run
+    def _check(self, run: Run) -> None:
         self._set_last_step(run)
         if run.steps is not None and run.step >= run.steps:
             run.stop("steps")
@@ -72,7 +69,7 @@ class Budget(Hook):
         early = run.stopped == "seconds" and 0 < run.step <= _MEASURED
         if early or (run.step == _MEASURED and not run.stopped):
             _warn_of_few_steps(run)
-        if descent.state.skipped_in_a_row >= _MOST_SKIPPED:
+        if run.state.skipped_in_a_row >= _MOST_SKIPPED:
             run.stop(NON_FINITE)
             line = f"{_MOST_SKIPPED} steps in a row were not finite: the run was stopped; the result holds the last finite values"
             if line not in run.warnings:

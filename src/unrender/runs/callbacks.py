@@ -1,9 +1,10 @@
-"""Callbacks: user code that observes a run."""
+"""Callbacks: receivers of the events of a run, both parts of the run itself and user code."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,29 +12,115 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.errors import InputError
-from unrender.io.thumbnails import reduced
+from unrender.core.phases import Listener
+from unrender.io.resampling import reduced
 from unrender.losses.metrics import exposure, srgb
 
 if TYPE_CHECKING:
+    from unrender.estimators.base import Estimate
     from unrender.runs.result import Result
     from unrender.runs.run import Run
 
 
-class Callback:
-    """Base class of callbacks. Override the methods of interest; the run's time does not include them.
+class Callback(Listener):
+    """Receiver of the events of a run. Override the methods of interest; the run's time does not include them.
+
+    User code and the parts of a run besides its steps (budget, refinement, verification, the run folder) are callbacks alike. The run
+    calls each event on all of them, in order:
+
+        on_warm_up → on_start → (before_step → on_update → on_step)* → on_result → on_end
+
+    An exception before `on_end` is passed to `on_error`, and then to the caller. `on_phase`, `on_progress` and `on_phase_end` report
+    the phases within the run, such as compiling; see `Listener`.
 
     A callback that blocks to pause the run should check `run.stopped`, which Ctrl-C sets. The history so far is on disk (`run.folder`,
     None without a run folder).
     """
 
+    def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+        """Called after kernels are compiled; the run is still before its first step.
+
+        Args:
+            run: the run.
+            fresh, warm: snapshots before the first step and after two steps, which show the types and shapes of the states.
+        """
+
     def on_start(self, run: Run) -> None:
-        """Called before the first step, or before the first step after resuming (`run.step`)."""
+        """Called before the first step, or before the first step after resuming (`run.step`). From here on, Ctrl-C stops the run
+        gracefully."""
+
+    def before_step(self, run: Run) -> None:
+        """Called before each step. This time is not counted as the run's."""
+
+    def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
+        """Called after a step, before its record is made. `applied` is false for a step whose estimate was not finite."""
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """Called after each step with its record of the history. `run.stop()` ends the run."""
+        """Called after each step, with its record, the last of the history. `run.stop()` ends the run."""
+
+    def on_result(self, run: Run, result: Result) -> Result:
+        """Called after the last step. Returns the result, possibly with additions.
+
+        The run folder is written before the user's callbacks are called.
+        """
+        return result
+
+    def on_error(self, run: Run, error: BaseException) -> None:
+        """Called if the run ends by an exception."""
 
     def on_end(self, run: Run, result: Result) -> None:
-        """Called after the last step."""
+        """Called after everything is done and saved."""
+
+    def warnings(self, run: Run) -> list[str]:
+        """Return warnings for a result made now, in addition to `Run.warnings`, one line each."""
+        return []
+
+
+class UserCallbacks(Callback):
+    """The user's callbacks as one.
+
+    They see parameters at the scene's resolution where only the plan made them coarse (`Run.shown`). That takes time, so it is done only
+    for events that a callback overrides.
+    """
+
+    def __init__(self, callbacks: Sequence[Callback]):
+        self._callbacks = tuple(callbacks)
+
+    def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+        self._call(Callback.on_warm_up, run, fresh, warm)
+
+    def on_start(self, run: Run) -> None:
+        self._call(Callback.on_start, run)
+
+    def before_step(self, run: Run) -> None:
+        self._call(Callback.before_step, run)
+
+    def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
+        self._call(Callback.on_update, run, estimate, applied)
+
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
+        self._call(Callback.on_step, run, record)
+
+    def on_result(self, run: Run, result: Result) -> Result:
+        for callback in self._callbacks:
+            result = callback.on_result(run, result)
+        return result
+
+    def on_error(self, run: Run, error: BaseException) -> None:
+        self._call(Callback.on_error, run, error)
+
+    def on_end(self, run: Run, result: Result) -> None:
+        self._call(Callback.on_end, run, result)
+
+    def warnings(self, run: Run) -> list[str]:
+        return [line for callback in self._callbacks for line in callback.warnings(run)]
+
+    def _call(self, event: Callable[..., None], run: Run, *arguments: Any) -> None:
+        bound = [getattr(callback, event.__name__) for callback in self._callbacks]
+        if overridden := [each for each in bound if getattr(each, "__func__", None) is not event]:
+            with run.shown():
+                for each in overridden:
+                    each(run, *arguments)
 
 
 _LARGEST = 512

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.estimators.base import Estimator
 from unrender.methods import method, methods
 from unrender.methods.plan import Plan

@@ -10,7 +10,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import listed
-from unrender.runs.sensitivity import seen_cells
+from unrender.runs.image_sensitivity import seen_cells
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import render
@@ -91,7 +91,7 @@ def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
     """Return a line for each texture or grid with a notable part that hardly changes the images.
 
     Args:
-        sensitivities: {key: array}, see `unrender.sensitivity`.
+        sensitivities: {key: array}, see `unrender.runs.sensitivity`.
     """
     lines = []
     for key, sensitivity in sensitivities.items():

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import phases
-from unrender.io.thumbnails import resize_nearest
+from unrender.io.resampling import resize_nearest
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
+from unrender.runs.image_sensitivity import sensitivity
 from unrender.runs.least_squares import check_numbers, compile_check
 from unrender.runs.result import Result
-from unrender.runs.sensitivity import sensitivity
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.statistics import debiased

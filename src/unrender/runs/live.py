@@ -16,16 +16,16 @@ import numpy as np
 from pydantic import BaseModel
 
 from unrender.backend.variant import current
+from unrender.backend.versions import hardware, versions
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.io import files
-from unrender.io.thumbnails import reduced, resize_nearest
+from unrender.io.resampling import reduced, resize_nearest
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import lines
 from unrender.runs.folder.schema import COMMANDS, CONTROL, LIVE, LIVE_START, LIVE_STATUS, LIVE_VIEWS
 from unrender.runs.metadata import recorded_measures
-from unrender.runs.result import hardware, versions
 
 if TYPE_CHECKING:
     from unrender.runs.result import Result

@@ -1,10 +1,10 @@
-"""The optimisation loop: estimate, update, precondition, bound. Everything else is a `Hook`."""
+"""The optimisation loop: estimate, update, precondition, bound. Everything else is a `Callback`."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,84 +18,22 @@ from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.estimators.coordinates import by_coordinates
 from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
-from unrender.optimizers.base import Choosing, Measuring, Optimizer
-from unrender.runs.hooks import Hook
+from unrender.optimizers.base import Optimizer
 from unrender.runs.mesh_guard import guarded
-from unrender.runs.metadata import RunMetadata
 from unrender.runs.noise import GradientNoise
 from unrender.runs.phase_times import COMPILING
 from unrender.runs.result import Result
-from unrender.runs.run import Run, RunState, interruptible, snapshot
+from unrender.runs.run import Run, RunState, interruptible
 from unrender.scene.problem import Problem
 
-__all__ = ["Descent", "descend", "initialize", "prepare"]
+__all__ = ["descend", "initialize", "prepare", "warm_up"]
 
 _ERRORS_PER_SECOND = 10.0
 _ERROR_PAUSE = 20.0
 """Ratio of the pause before the next measurement of the parameters' error to the measurement's duration."""
 
 
-@dataclass
-class Descent:
-    """A run with everything that belongs to it.
-
-    Attributes:
-        run: part that callbacks get.
-        state: further state from step to step.
-        log: history and description of the run.
-        hooks: hooks in calling order.
-    """
-
-    run: Run
-    state: RunState
-    log: RunMetadata
-    hooks: Sequence[Hook] = field(default_factory=tuple)
-
-    def result(self, info: bool = False) -> Result:
-        """Return the current result; with `info`, including the information of the last estimate."""
-        optimizer = self.run.optimizer
-        adapted = optimizer.choices(self.state.optimizer) if isinstance(optimizer, Choosing) else ()
-        result = self.log.result(self.run, [line for hook in self.hooks for line in hook.warnings(self)], info, adapted)
-        return replace(result, standard_error=self._standard_errors())
-
-    def _standard_errors(self) -> dict[str, np.ndarray]:
-        """Return the standard error of the parameters that have one, in their units."""
-        run, optimizer = self.run, self.run.optimizer
-        if not isinstance(optimizer, Measuring):
-            return {}
-        coordinates = run.problem.coordinates
-        errors = optimizer.standard_errors(self.state.optimizer, coordinates.of(run.parameters))
-        slopes = coordinates.slopes({key: run.parameters[key] for key in errors})
-        by_x = {key: np.abs(arrays.numpy(slopes[key])) * x if key in slopes else x for key, x in errors.items()}
-        return {key: x.astype(np.float32) for key, x in by_x.items()}
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return everything that determines the next steps."""
-        return snapshot(self.run, self.state)
-
-    def warm_up(self) -> tuple[float, dict[str, Any]]:
-        """Trace and compile every kernel of a step by taking two steps whose results are discarded.
-
-        Returns:
-            The elapsed seconds, and the snapshot after the two steps.
-        """
-        started = time.perf_counter()
-        run, state = replace(self.run, warnings=[]), replace(self.state, noise=GradientNoise())
-        for _ in range(2):
-            estimate, state.estimator = run.estimator.estimate(
-                run.problem, run.parameters, state.estimator, Key(run.seed, 0, WARM_UP)
-            )
-            estimate = penalized(estimate, run.problem, run.parameters)
-            memory.trim_cache(run.parameters)
-            update = _apply(run.problem, estimate, state.optimizer, run.optimizer, run.parameters)
-            run.parameters, state.optimizer = update.parameters, update.state
-            del update
-            memory.evaluate_in_turn(state.optimizer)
-            state.noise.update(estimate.gradient, estimate.variance)
-        return time.perf_counter() - started, snapshot(run, state)
-
-
-def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> tuple[Run, RunState]:
+def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> Run:
     """Return a run before its first step. Raises `InputError` for a seed that files cannot store."""
     seed = check_seed("seed", seed)
     problem, estimator = plan.configured(), plan.estimator
@@ -106,68 +44,84 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
             raise InputError(
                 f"{type(optimizer).__name__}: parameter {key} has a preconditioner; remove it, because a search adapts its own covariance"
             )
-    run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {})
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
-    initialize(run, state, 0)
-    return run, state
+    run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {}, state)
+    initialize(run, 0)
+    return run
 
 
-def initialize(run: Run, state: RunState, step: int) -> None:
+def initialize(run: Run, step: int) -> None:
     """Set the initial parameters of a new run at the resolution of a step, and initial states for that resolution."""
     problem = run.problem
     run.parameters = {k: problem.unknowns[k].project(x) for k, x in problem.start(step).items()}
-    state.estimator = run.estimator.init(problem, run.parameters)
-    state.optimizer = run.optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
+    run.state.estimator = run.estimator.init(problem, run.parameters)
+    run.state.optimizer = run.optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
 
 
-def descend(descent: Descent) -> Result:
-    """Take steps until a hook, a callback or Ctrl-C stops the run. See `Hook` for the order of events."""
-    run, hooks = descent.run, descent.hooks
+def descend(run: Run) -> Result:
+    """Take steps until a callback or Ctrl-C stops the run. See `Callback` for the order of events."""
+    callbacks = run.callbacks
     try:
-        fresh = descent.snapshot()
+        fresh = run.snapshot()
         with phases.phase(COMPILING):
-            seconds, warm = descent.warm_up()
-        descent.log.warmup_seconds += seconds
-        for hook in hooks:
-            hook.on_warm_up(descent, fresh, warm)
+            seconds, warm = warm_up(run)
+        run.warmup_seconds += seconds
+        for callback in callbacks:
+            callback.on_warm_up(run, fresh, warm)
         del fresh, warm  # they hold as much as the run itself does
         memory.trim_cache(run.parameters)
         with interruptible(run):
-            for hook in hooks:
-                hook.on_start(descent)
+            for callback in callbacks:
+                callback.on_start(run)
             while not run.stopped:
-                for hook in hooks:
-                    hook.before_step(descent)
-                record = _step(run, descent.state, lambda estimate, applied: _announce(descent, estimate, applied))
-                descent.log.history.append(record)
-                for hook in hooks:
-                    hook.on_step(descent, record)
+                for callback in callbacks:
+                    callback.before_step(run)
+                record = _step(run)
+                run.history.append(record)
+                for callback in callbacks:
+                    callback.on_step(run, record)
         memory.trim_cache(run.parameters)
-        result = descent.result(info=True)
-        for hook in hooks:
-            result = hook.on_result(descent, result)
+        result = run.result(info=True)
+        for callback in callbacks:
+            result = callback.on_result(run, result)
     except BaseException as error:
-        for hook in hooks:
-            hook.on_error(descent, error)
+        for callback in callbacks:
+            callback.on_error(run, error)
         raise
-    for hook in hooks:
-        hook.on_end(descent, result)
+    for callback in callbacks:
+        callback.on_end(run, result)
     return result
 
 
-def _announce(descent: Descent, estimate: Estimate, applied: bool) -> None:
-    for hook in descent.hooks:
-        hook.on_update(descent, estimate, applied)
+def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
+    """Trace and compile every kernel of a step by taking two steps whose results are discarded.
+
+    Returns:
+        The elapsed seconds, and the snapshot after the two steps.
+    """
+    started = time.perf_counter()
+    run = replace(run, warnings=[], state=replace(run.state, noise=GradientNoise()))
+    state = run.state
+    for _ in range(2):
+        estimate, state.estimator = run.estimator.estimate(
+            run.problem, run.parameters, state.estimator, Key(run.seed, 0, WARM_UP)
+        )
+        estimate = penalized(estimate, run.problem, run.parameters)
+        memory.trim_cache(run.parameters)
+        update = _apply(run.problem, estimate, state.optimizer, run.optimizer, run.parameters)
+        run.parameters, state.optimizer = update.parameters, update.state
+        del update
+        memory.evaluate_in_turn(state.optimizer)
+        state.noise.update(estimate.gradient, estimate.variance)
+    return time.perf_counter() - started, run.snapshot()
 
 
-def _step(
-    run: Run, state: RunState, on_update: Callable[[Estimate, bool], None] = lambda estimate, applied: None
-) -> dict[str, Any]:
+def _step(run: Run) -> dict[str, Any]:
     """Take one step, and return its record of the history.
 
     A step is not applied if its estimate is not finite, or if the optimizer's step is not finite.
     """
-    problem = run.problem
+    problem, state = run.problem, run.state
     started = time.perf_counter()
     run.estimate = None  # frees a gradient as large as the next one
     memory.trim_cache(run.parameters)
@@ -193,7 +147,8 @@ def _step(
     state.samples += int(estimate.info.get("samples", 0))
     state.skipped_in_a_row = 0 if finite else state.skipped_in_a_row + 1
     run.skipped += not finite
-    on_update(estimate, finite)
+    for callback in run.callbacks:
+        callback.on_update(run, estimate, finite)
     record: dict[str, Any] = {
         "step": run.step - 1,
         "seconds": run.clock,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unrender.scene.self_intersections import crossing_triangles
-from unrender.scene.surfaces import area_normals
+from unrender.scene.surfaces import area_normals, crossing_triangles
 
 _HALVINGS = 3
 _LEAST_AREA = 0.01

@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from unrender.core import arrays
 from unrender.estimators.base import Estimator
 from unrender.rendering.parameter_errors import PLAIN
 from unrender.runs.folder.meshes import arrays_of
-from unrender.runs.result import Result
 from unrender.runs.run import Run
 from unrender.scene.fingerprint import fingerprint
 from unrender.scene.problem import Problem
@@ -50,46 +48,6 @@ def first_values(run: Run) -> dict[str, np.ndarray]:
     arrays."""
     known = run.problem.unknowns
     return {k: known[k].initial if np.array_equal(known[k].initial, x) else x for k, x in run.full().items()}
-
-
-@dataclass
-class RunMetadata:
-    """Description of a run, from which results are made.
-
-    Attributes:
-        description: fields of `Result`, see `describe_run`.
-        initial: {key: array}, initial parameters.
-        history: one record per step.
-        warmup_seconds: seconds of tracing and compiling.
-    """
-
-    description: dict[str, Any]
-    initial: dict[str, np.ndarray]
-    history: list[dict[str, Any]] = field(default_factory=list)
-    warmup_seconds: float = 0.0
-
-    def result(self, run: Run, warnings: Sequence[str] = (), info: bool = False, adapted: Sequence[str] = ()) -> Result:
-        """Return the current result of the run.
-
-        Args:
-            run: the run.
-            warnings: lines in addition to the run's.
-            info: whether to include `Estimate.info` of the last step.
-            adapted: see `Result.adapted`.
-        """
-        return Result(
-            parameters=run.full(),
-            initial=self.initial,
-            history=self.history,
-            seconds=run.clock,
-            warmup_seconds=self.warmup_seconds,
-            stopped=run.stopped,
-            skipped=run.skipped,
-            warnings=[*run.warnings, *warnings],
-            info=to_numpy(run.estimate.info) if info and run.estimate else {},
-            adapted=list(adapted),
-            **self.description,
-        )
 
 
 def describe(estimator: Estimator) -> str:
@@ -134,10 +92,3 @@ def fingerprint_of(run: Run) -> dict[str, str]:
     """Return the fingerprints of the problem, the estimator and the optimizer, without memory addresses."""
     components = {"estimator": run.estimator, "optimizer": run.optimizer}
     return fingerprint(run.problem) | {name: _ADDRESS.sub("", repr(part)) for name, part in components.items()}
-
-
-def to_numpy(info: Any) -> Any:
-    """Convert the Dr.Jit arrays of `Estimate.info` to NumPy."""
-    if isinstance(info, Mapping):
-        return {key: to_numpy(value) for key, value in info.items()}
-    return arrays.numpy(info) if arrays.is_drjit(info) else info

@@ -9,7 +9,7 @@ import numpy as np
 
 from unrender.core import periodic, phases
 from unrender.display import formatting, notebook, pictures
-from unrender.display.notebook_bar import NotebookBar
+from unrender.display.notebook import NotebookBar
 from unrender.display.pictures import shown_image, shown_map
 from unrender.display.plots import Line, chart
 from unrender.rendering import parameter_errors

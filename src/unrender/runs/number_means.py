@@ -7,30 +7,30 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unrender.core import arrays, vectors
+from unrender.core import arrays, trees
 from unrender.core.text import grouped
 from unrender.core.trees import Tree
 from unrender.optimizers.base import averaged_by
-from unrender.runs.hooks import Hook
+from unrender.runs.callbacks import Callback
 from unrender.runs.result import Result
 from unrender.scene.problem import Problem
 from unrender.statistics.stationary import stationary_mean
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Descent
+    from unrender.runs.run import Run
 
 _MOST_OF_ONE, _MOST_ELEMENTS = 4, 256
 """Elements of one number, and of all numbers, up to which they are averaged."""
 
 
-class NumberMeans(Hook):
-    """Hook that records the numbers of a run at each step, for `averaged`."""
+class NumberMeans(Callback):
+    """Callback that records the numbers of a run at each step, for `averaged`."""
 
-    def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
         del record
-        if shapes := numbers_of(descent.run.problem, descent.run.optimizer):
-            values = [arrays.numpy(descent.run.parameters[key]).astype(np.float64).ravel() for key in shapes]
-            descent.state.numbers.append(np.concatenate(values))
+        if shapes := numbers_of(run.problem, run.optimizer):
+            values = [arrays.numpy(run.parameters[key]).astype(np.float64).ravel() for key in shapes]
+            run.state.numbers.append(np.concatenate(values))
 
 
 def numbers_of(problem: Problem, optimizer: Any) -> dict[str, tuple[int, ...]]:
@@ -44,9 +44,9 @@ def numbers_of(problem: Problem, optimizer: Any) -> dict[str, tuple[int, ...]]:
     return found if sum(int(np.prod(shape, dtype=int)) for shape in found.values()) <= _MOST_ELEMENTS else {}
 
 
-def averaged(descent: Descent, result: Result) -> Result:
+def averaged(run: Run, result: Result) -> Result:
     """Return the result with the mean of each number over its last steps, where these are stationary, and its standard error."""
-    run, trace = descent.run, descent.state.numbers
+    trace = run.state.numbers
     shapes = numbers_of(run.problem, run.optimizer)
     if not shapes or not trace.rows:
         return result
@@ -70,7 +70,7 @@ def _means(
     means: dict[str, np.ndarray] = {}
     errors: Tree = {}
     steps: dict[str, str] = {}
-    for key, columns in vectors.parts(rows, last).items():
+    for key, columns in trees.parts(rows, last).items():
         found = [stationary_mean(column) for column in columns.reshape(len(rows), -1).T]
         if not any(found):
             continue

@@ -9,37 +9,33 @@ from pathlib import Path
 
 import numpy as np
 
-from unrender.core import checks
+from unrender.core import checks, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
-from unrender.display.notebook_bar import in_notebook
+from unrender.display.notebook import in_notebook
 from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
-from unrender.runs import advice, components
+from unrender.runs import components, watches
 from unrender.runs.budget import Budget, check_budget
-from unrender.runs.callbacks import Callback
+from unrender.runs.callbacks import Callback, UserCallbacks
 from unrender.runs.folder import method_file
 from unrender.runs.folder.writer import RunWriter
-from unrender.runs.hooks import CallbackHook, Hook
-from unrender.runs.loop import Descent, descend, prepare
+from unrender.runs.loop import descend, prepare
 from unrender.runs.metadata import (
     RunAnnotations,
-    RunMetadata,
     describe,
     describe_run,
     fingerprint_of,
     first_values,
-    to_numpy,
 )
 from unrender.runs.notebook import NotebookProgress
 from unrender.runs.number_means import NumberMeans
 from unrender.runs.phase_times import PhaseTimes
-from unrender.runs.refinement import Refinement
-from unrender.runs.remeshing import MeshRefinement
+from unrender.runs.refinement import MeshRefinement, Refinement
 from unrender.runs.result import Result
-from unrender.runs.run import Run, terminate_if_told
+from unrender.runs.run import Run, terminate_if_told, to_numpy
 from unrender.runs.verify import Verify
 from unrender.runs.watches import BoundsWatch, InfluenceWatch, MeshWatch
 from unrender.scene.bounds import off_ends
@@ -47,7 +43,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree
 from unrender.scene.serialization import origin
 
-__all__ = ["RunAnnotations", "assemble_hooks", "check", "estimate", "open_writer", "optimize"]
+__all__ = ["RunAnnotations", "check", "descend_with", "estimate", "open_writer", "optimize"]
 
 
 @exclusive("optimize", long=True)
@@ -104,13 +100,12 @@ def optimize(
     annotations = annotations or RunAnnotations()
     if isinstance(estimator, str) and not annotations.method:
         annotations = replace(annotations, method=estimator, choices=plan.lines)
-    run, state = prepare(plan, steps, seconds, seed)
+    run = prepare(plan, steps, seconds, seed)
     run.begin_budget(annotations.began)
-    run.warnings += advice.remarks(problem, plan.optimizer)
-    log = RunMetadata(describe_run(run, annotations), first_values(run))
-    with _progress(progress) as shown, _folder(run, log, annotations, run_directory, checkpoint_every) as writers:
-        hooks = assemble_hooks([*shown, *callbacks], *writers, earlier=annotations.phases)
-        return descend(Descent(run, state, log, hooks))
+    run.warnings += watches.remarks(problem, plan.optimizer)
+    run.description, run.initial = describe_run(run, annotations), first_values(run)
+    with _progress(progress) as shown, _folder(run, annotations, run_directory, checkpoint_every) as writers:
+        return descend_with(run, [*shown, *callbacks], *writers, earlier=annotations.phases)
 
 
 @contextmanager
@@ -127,28 +122,36 @@ def _progress(show: bool | None) -> Iterator[list[Callback]]:
 
 @contextmanager
 def _folder(
-    run: Run, log: RunMetadata, annotations: RunAnnotations, directory: str | Path | None, checkpoint_every: int | None
+    run: Run, annotations: RunAnnotations, directory: str | Path | None, checkpoint_every: int | None
 ) -> Iterator[list[RunWriter]]:
     """Yield the writer of the run folder after its start; an empty list without a folder."""
     if directory is None:
         yield []
         return
     run.folder = Path(directory)
-    log.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(run.problem)}
+    run.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(run.problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
-        writer.start(log.result(run))
+        writer.start(run.result())
         yield [writer]
     terminate_if_told(run)
 
 
-def assemble_hooks(
-    callbacks: Sequence[Callback], *folder: Hook, earlier: Mapping[str, float] | None = None
-) -> list[Hook]:
-    """Return the hooks of every run, then those of the run folder, then the user's callbacks.
+def descend_with(
+    run: Run, callbacks: Sequence[Callback], *folder: Callback, earlier: Mapping[str, float] | None = None
+) -> Result:
+    """Take the steps of a run with the callbacks of every run, those of the run folder, and, last, the user's.
 
-    `earlier` contains the seconds of phases before the run.
+    The first ones of the folder restore a run, so that they come before all others. The last one writes.
+
+    Args:
+        run: the run.
+        callbacks: the user's callbacks.
+        folder: callbacks of the run folder, the writer last.
+        earlier: seconds of phases before the run.
     """
-    return [
+    restoring, writing = folder[:-1], folder[-1:]
+    run.callbacks = [
+        *restoring,
         PhaseTimes(earlier),
         InfluenceWatch(),
         MeshWatch(),
@@ -158,9 +161,11 @@ def assemble_hooks(
         MeshRefinement(),
         NumberMeans(),
         Verify(),
-        *folder,
-        CallbackHook(callbacks),
+        *writing,
+        UserCallbacks(callbacks),
     ]
+    with phases.listening(*callbacks):
+        return descend(run)
 
 
 def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | None, final_spp: int | None) -> RunWriter:

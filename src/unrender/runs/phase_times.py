@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from unrender.runs.hooks import Hook
+from unrender.runs.callbacks import Callback
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Descent
     from unrender.runs.result import Result
+    from unrender.runs.run import Run
 
 COMPILING, STEPS, ASIDE = "compiling", "steps", "checkpoints and callbacks"
 VERIFYING, PICTURES = "verification", "final pictures"
@@ -20,8 +20,8 @@ VERIFYING, PICTURES = "verification", "final pictures"
 RUN_PHASES = (COMPILING, STEPS, ASIDE, VERIFYING, PICTURES)
 
 
-class PhaseTimes(Hook):
-    """Hook that records the seconds of each phase in `Result.phases`. It is the first hook, so that saved results contain them.
+class PhaseTimes(Callback):
+    """Callback that records the seconds of each phase in `Result.phases`. It is the first callback, so that saved results contain them.
 
     Args:
         earlier: {phase: seconds} before the run, such as loading.
@@ -32,11 +32,11 @@ class PhaseTimes(Hook):
         self._made = self._started = time.perf_counter()
         self._clock = 0.0
 
-    def on_start(self, descent: Descent) -> None:
-        self._started, self._clock = time.perf_counter(), descent.run.clock
+    def on_start(self, run: Run) -> None:
+        self._started, self._clock = time.perf_counter(), run.clock
 
-    def on_result(self, descent: Descent, result: Result) -> Result:
-        steps = descent.run.clock - self._clock
+    def on_result(self, run: Run, result: Result) -> Result:
+        steps = run.clock - self._clock
         aside = time.perf_counter() - self._started - steps
         run_phases = {COMPILING: self._started - self._made, STEPS: steps, ASIDE: max(aside, 0.0)}
         return replace(result, phases={**self._earlier, **run_phases})

@@ -1,4 +1,4 @@
-"""Coarse to fine: refinement of parameters during a run.
+"""Refinement during a run: of resolutions (coarse to fine), and of meshes (remeshing).
 
 By default (`CoarseToFine.states`) the estimator's state is interpolated (`scene.upsampling`), and the optimizer's is not: a control
 variate stays valid, whereas Adam's mean squares take a thousand steps to adapt.
@@ -7,18 +7,25 @@ variate stays valid, whereas Adam's mean squares take a thousand steps to adapt.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from unrender.core import arrays, trees
-from unrender.runs.hooks import Hook
+from unrender.core.errors import InputError
+from unrender.optimizers.partitioned import PartitionedState
+from unrender.rendering.picture_format import format_of
+from unrender.rendering.renderer import Remeshable, ReplacedMesh
+from unrender.runs.callbacks import Callback
+from unrender.runs.folder.meshes import arrays_of
+from unrender.runs.loop import warm_up
 from unrender.runs.noise import GradientNoise
-from unrender.runs.run import Run, RunState
+from unrender.runs.run import Run
 from unrender.scene.coarse_to_fine import NEVER
+from unrender.scene.problem import Problem
 from unrender.scene.upsampling import NotCarried, Upsampler, restarted, upsampled
-
-if TYPE_CHECKING:
-    from unrender.runs.loop import Descent
-
 
 _MEASURED, _COARSE_SHARE = 3, 0.4
 """Number of steps that are timed to predict the number of steps in the budget, and the fraction of these after which all resolutions are
@@ -55,9 +62,9 @@ def unfinished(run: Run) -> list[str]:
     return lines
 
 
-def refine(run: Run, state: RunState) -> float:
+def refine(run: Run) -> float:
     """Convert parameters and states to the resolution of the next step. Returns the elapsed seconds."""
-    started = time.perf_counter()
+    started, state = time.perf_counter(), run.state
     upsampler = Upsampler(run.problem, run.step + run.ahead, run.parameters)
     modes = {schedule.states for key, schedule in run.problem.coarse_to_fine.items() if key in upsampler.shares}
     carry = {"estimator": "reset" not in modes, "optimizer": modes == {"carry"}}
@@ -79,8 +86,8 @@ def refine(run: Run, state: RunState) -> float:
     return time.perf_counter() - started
 
 
-class Refinement(Hook):
-    """Hook that refines parameters and states before the steps at which their resolution changes, and records the resolutions.
+class Refinement(Callback):
+    """Callback that refines parameters and states before the steps at which their resolution changes, and records the resolutions.
 
     Compiling the kernels of the new resolution counts as warm-up.
     """
@@ -88,18 +95,99 @@ class Refinement(Hook):
     def __init__(self) -> None:
         self._refined = False
 
-    def before_step(self, descent: Descent) -> None:
-        hurry(descent.run)
-        self._refined = is_due(descent.run)
+    def before_step(self, run: Run) -> None:
+        hurry(run)
+        self._refined = is_due(run)
         if self._refined:
-            descent.log.warmup_seconds += refine(descent.run, descent.state) + descent.warm_up()[0]
+            run.warmup_seconds += refine(run) + warm_up(run)[0]
 
-    def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
-        run = descent.run
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
         keys = run.problem.coarse_to_fine
         if self._refined or (run.step == 1 and keys):
             record["resolution"] = {key: run.parameters[key].shape[:-1] for key in keys}
 
-    def warnings(self, descent: Descent) -> list[str]:
+    def warnings(self, run: Run) -> list[str]:
         """Return warnings about parameters that did not reach their scene's resolution."""
-        return unfinished(descent.run) if descent.run.stopped else []
+        return unfinished(run) if run.stopped else []
+
+
+def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
+    """Return the same problem with other meshes, {key of vertex positions: mesh}, which are also the initial values of these parameters.
+
+    Raises `InputError` if the renderer does not support it.
+    """
+    if not isinstance(problem.renderer, Remeshable):
+        raise InputError(f"{', '.join(meshes)}: this renderer does not support remeshing")
+    schedules = [
+        replace(p, initial=meshes[p.key].vertices.reshape(-1).astype(np.float32)) if p.key in meshes else p
+        for p in problem.parameters
+    ]
+    shapes = {key.rpartition(".")[0]: mesh for key, mesh in meshes.items()}
+    renderer = problem.renderer.with_meshes(shapes, [p.key for p in schedules])
+    # Checked views are RGB; films of other formats would misinterpret them.
+    plain = all(format_of(renderer, view.sensor).colour == "rgb" for view in problem.views)
+    made = Problem(
+        renderer,
+        schedules,
+        problem.views if plain else problem.given_views,
+        problem.loss,
+        problem.max_depth,
+        truth={key: value for key, value in problem.truth.items() if key not in meshes},
+        name=problem.name,
+        surfaces={key: unknown.surface for key, unknown in problem.unknowns.items() if unknown.surface is not None},
+    )
+    return made.with_parts(
+        origin=problem.origin, executor=problem.executor, remeshed_from=problem.remeshed_from or problem
+    )
+
+
+class MeshRefinement(Callback):
+    """Callback that remeshes before the steps in `Parameter.remeshing`. Compiling new kernels counts as warm-up.
+
+    If a mesh cannot be remeshed, it stays unchanged, with a warning.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[str, int] = {}
+
+    def before_step(self, run: Run) -> None:
+        state = run.state
+        remeshings = {key: unknown.remeshing for key, unknown in run.problem.unknowns.items()}
+        due = {
+            key: remeshing
+            for key, remeshing in remeshings.items()
+            if remeshing is not None and run.step in remeshing.steps
+        }
+        if not due:
+            return
+        started, meshes = time.perf_counter(), {}
+        for key, remeshing in due.items():
+            vertices = arrays.numpy(run.parameters[key]).reshape(-1, 3)
+            try:
+                mesh = remeshing.apply(vertices, run.problem.faces[key], run.problem.texture_coordinates(key))
+            except InputError as error:
+                run.warnings.append(f"step {run.step}: {key}: {error}; the mesh is unchanged")
+                continue
+            meshes[key] = mesh
+            self._made[key] = len(mesh.faces)
+        if not meshes:
+            return
+        run.problem = remeshed(run.problem, meshes)
+        unchanged = {key: arrays.numpy(value) for key, value in run.parameters.items() if key not in meshes}
+        values = {key: unchanged.get(key, run.problem.unknowns[key].initial) for key in run.parameters}
+        run.parameters = {key: run.problem.renderer.array(value) for key, value in values.items()}
+        fresh = run.optimizer.init(run.problem.coordinates.of(run.parameters), run.problem.learning_rates)
+        state.estimator = run.estimator.init(run.problem, run.parameters)
+        before = state.optimizer
+        state.optimizer = restarted(before, fresh)
+        if isinstance(before, PartitionedState) and isinstance(fresh, PartitionedState):
+            state.optimizer = PartitionedState(restarted(before.own, fresh.own), before.others)
+        state.noise = GradientNoise()
+        run.description["meshes"] = arrays_of(run.problem, run.description["meshes"])
+        arrays.evaluate(run.parameters, state.estimator, state.optimizer)
+        run.warmup_seconds += time.perf_counter() - started + warm_up(run)[0]
+
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
+        if self._made:
+            record["faces"] = dict(self._made)
+            self._made = {}

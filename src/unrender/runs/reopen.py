@@ -16,7 +16,7 @@ from unrender.optimizers.base import Optimizer
 from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder.reader import RunFolder, read_run_record
-from unrender.runs.remeshing import remeshed
+from unrender.runs.refinement import remeshed
 from unrender.runs.result import Result
 from unrender.runs.resume import load_run, resume_run
 from unrender.scene import serialization

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import platform
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unrender.backend.limits import cores
-from unrender.backend.variant import LLVM, current, llvm_version
-from unrender.core.errors import InputError
-from unrender.core.text import plain
-from unrender.io import files
-from unrender.runs.folder import schema
-from unrender.runs.folder.history import lines, steps_in
+from unrender.runs.folder.contents import write_result
+from unrender.runs.folder.history import steps_in
 
 if TYPE_CHECKING:
     from unrender.runs.figure import ResultFigure
@@ -69,7 +60,7 @@ class Result:
         phases: {phase: seconds} in order: "compiling", "steps", "checkpoints and callbacks", "final pictures", and, on the command line,
             earlier phases. For a resumed run, those of the last session.
         sensitivity: {key: array} of the parameters' shapes: change of the images per unit of each element, as root sum of squares over
-            all pixels and channels, see `unrender.sensitivity`. {} for runs without a run folder, and for parameters without path
+            all pixels and channels, see `unrender.runs.sensitivity`. {} for runs without a run folder, and for parameters without path
             gradients. Where it is small, the images do not determine the element.
         pictures: {"view0/reference": (H, W, 3), ...}, linear, for reports.
         undetermined: one line for each unknown that the images do not determine, see `runs.determination`; empty for runs without a run
@@ -159,121 +150,5 @@ class Result:
         Raises `InputError` if the folder is not writable.
         """
         folder = Path(directory)
-        record = self.encoded_record(status or self.status, "", folder / schema.RECORD)
-        for key in self.parameters:
-            files.check_member(key, f"run folder {folder}: parameter")
-        try:
-            files.make_folder(folder)
-            archives = {schema.PARAMETERS: self.parameters, schema.INITIAL: self.initial, schema.TRUTH: self.truth}
-            last = {} if self.last is self.parameters else dict(self.last)
-            others = {schema.PICTURES: self.pictures, schema.SENSITIVITY: self.sensitivity, schema.MESHES: self.meshes}
-            others[schema.LAST] = last
-            for name, values in {**archives, **others}.items():
-                if values or name in (schema.PARAMETERS, schema.INITIAL):
-                    files.write_arrays(folder / name, values, name_too=False)
-            if not last:
-                (folder / schema.LAST).unlink(missing_ok=True)
-            files.write(folder / schema.HISTORY, lines(self.history), name_too=False)
-            files.sync_folder(folder)
-            files.write(folder / schema.RECORD, record)
-        except OSError as error:
-            raise InputError(f"run folder {folder}: cannot be written: {error.strerror or error}") from error
+        write_result(folder, self, status or self.status)
         return folder
-
-    def encoded_record(self, status: str, error: str, path: Path) -> bytes:
-        """Return the bytes of run.json. Raises `InputError` that names `path` if the reader would reject them."""
-        return schema.encode(schema.RunRecord, self.record(status, error), str(path))
-
-    def record(self, status: str, error: str = "") -> dict[str, Any]:
-        """Return the contents of run.json, see `schema.RunRecord`.
-
-        Args:
-            status: "running", or a value of `Result.status`.
-            error: exception by which the run failed; "" for none.
-        """
-        if status == "failed" and not error:
-            error = "stopped: the last gradients were not finite"
-        fields: dict[str, Any] = {
-            "status": status,
-            "name": self.name,
-            "method": self.method,
-            "settings": dict(self.settings),
-            "choices": list(self.choices),
-            "adapted": [plain(line) for line in self.adapted],
-            "seed": self.seed,
-            "command": self.command,
-            "versions": versions(),
-            "hardware": hardware(),
-            "variant": current() or "",
-            "stopped": plain(self.stopped),
-            "steps": self.steps,
-            "seconds": self.seconds,
-            "warmup_seconds": self.warmup_seconds,
-            "skipped": self.skipped,
-            "warnings": [plain(line) for line in self.warnings],
-            "problem": dict(self.problem),
-            "resumed": list(self.resumed),
-            "image_errors": {
-                name: list(error) for name, error in self.image_errors.items() if np.isfinite(error).all()
-            },
-            "undetermined": list(self.undetermined),
-            "standard_error": {
-                key: [float(f"{value:.6g}") for value in np.ravel(error)] for key, error in self.standard_error.items()
-            },
-            "verification": dict(self.verification),
-            "phases": {name: round(seconds, 3) for name, seconds in self.phases.items()},
-        }
-        if error:
-            fields["error"] = plain(error)
-        return schema.serialize(schema.RunRecord.model_construct(None, **fields))
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages on which the numbers depend."""
-    return dict(_versions())
-
-
-@cache
-def _versions() -> dict[str, str]:
-    versions_by_package = {"python": platform.python_version()}
-    for package in ("unrender", "mitsuba", "drjit", "numpy"):
-        try:
-            versions_by_package[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions_by_package[package] = "not installed"
-    return versions_by_package
-
-
-def deciding_versions() -> dict[str, str]:
-    """Return the versions on which the bits of a run's numbers depend: packages, LLVM, the variant."""
-    return dict(_deciding_versions(current() or "none"))
-
-
-@cache
-def _deciding_versions(name: str) -> dict[str, str]:
-    versions_by_package = {name: version for name, version in versions().items() if name != "python"}
-    for package in ("scipy", "cholespy", "cma"):
-        versions_by_package[package] = metadata.version(package)
-    llvm = llvm_version() if name == LLVM else None
-    return {**versions_by_package, "variant": name, **({"llvm": ".".join(map(str, llvm))} if llvm else {})}
-
-
-def hardware() -> dict[str, Any]:
-    """Return the processor, and the number of cores that this process may use."""
-    return dict(_hardware())
-
-
-@cache
-def _hardware() -> dict[str, Any]:
-    return {"processor": _processor(), "cores": cores(), "system": f"{platform.system()} {platform.machine()}"}
-
-
-def _processor() -> str:
-    if sys.platform == "linux":
-        try:
-            for line in Path("/proc/cpuinfo").read_text().splitlines():
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-        except OSError:
-            pass
-    return platform.processor() or platform.machine()

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.backend.versions import deciding_versions
 from unrender.core import arrays, trees
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
@@ -25,13 +26,12 @@ from unrender.runs.folder.method_file import Method
 from unrender.runs.folder.schema import ENDED, HISTORY, METHOD, RunRecord
 from unrender.runs.folder.state import check_alike, not_finite, unpack
 from unrender.runs.folder.writer import RunWriter
-from unrender.runs.hooks import Hook
-from unrender.runs.loop import Descent, descend, initialize, prepare
-from unrender.runs.metadata import RunAnnotations, RunMetadata, describe_run, fingerprint_of, first_values
+from unrender.runs.loop import initialize, prepare
+from unrender.runs.metadata import RunAnnotations, describe_run, fingerprint_of, first_values
 from unrender.runs.number_trace import NumberTrace
-from unrender.runs.optimize import assemble_hooks, check, open_writer
-from unrender.runs.result import NON_FINITE, Result, deciding_versions
-from unrender.runs.run import SNAPSHOT_COUNTS, Run, restore, terminate_if_told
+from unrender.runs.optimize import check, descend_with, open_writer
+from unrender.runs.result import NON_FINITE, Result
+from unrender.runs.run import SNAPSHOT_COUNTS, Run, terminate_if_told
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.fingerprint import differences
 from unrender.scene.problem import Problem
@@ -102,10 +102,10 @@ def resume_run(
     folder, method = stored.folder, stored.method
     plan = Plan.from_table(problem, method.model_dump(), str(folder / METHOD), estimator, optimizer)
     check(plan.estimator, plan.optimizer, method.steps, method.seconds)
-    run, state = prepare(plan, method.steps, method.seconds, method.seed)
+    run = prepare(plan, method.steps, method.seconds, method.seed)
     run.folder = folder
     run.begin_budget(began)
-    initial, fingerprint = first_values(run), fingerprint_of(run)
+    run.initial, fingerprint = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
         for source in _sources(stored):
             changes = _changes(stored, source.checkpoint, fingerprint)
@@ -116,13 +116,11 @@ def resume_run(
             _check_budget_left(folder, method, source.checkpoint)
             if source.checkpoint is not None:
                 run.ahead = _ahead(source.checkpoint)
-                initialize(run, state, max(source.checkpoint.manifest.step - 1 + run.ahead, 0))
+                initialize(run, max(source.checkpoint.manifest.step - 1 + run.ahead, 0))
             restoring = _Restore(stored.record, source, changes, writer)
-            log = _metadata(run, stored, initial, fingerprint)
+            run.description, run.history, run.warmup_seconds = _description(run, stored, fingerprint), [], 0.0
             try:
-                result = descend(
-                    Descent(run, state, log, [restoring, *assemble_hooks(callbacks, writer, earlier=earlier)])
-                )
+                result = descend_with(run, callbacks, restoring, writer, earlier=earlier)
                 break
             except _UnusableCheckpoint as error:
                 source.passed_over.append(str(error))  # an earlier checkpoint may be usable
@@ -140,15 +138,15 @@ class _UnusableCheckpoint(InputError):
     """A readable checkpoint without a state that suits this run."""
 
 
-def _metadata(run: Run, stored: StoredRun, initial: dict[str, np.ndarray], fingerprint: dict[str, str]) -> RunMetadata:
+def _description(run: Run, stored: StoredRun, fingerprint: dict[str, str]) -> dict[str, Any]:
     """Return the description of the run for its result."""
     record = stored.record
     annotations = RunAnnotations(
         record.method, _method_settings(record), record.choices, record.command, stored.method.final_spp
     )
-    log = RunMetadata(describe_run(run, annotations), initial)
-    log.description["problem"] |= {"fingerprint": fingerprint, "origin": origin(run.problem)}
-    return log
+    description = describe_run(run, annotations)
+    description["problem"] |= {"fingerprint": fingerprint, "origin": origin(run.problem)}
+    return description
 
 
 @dataclass(frozen=True)
@@ -210,8 +208,8 @@ def _check_budget_left(folder: Path, method: Method, source: Checkpoint | None) 
 
 
 @dataclass
-class _Restore(Hook):
-    """Hook that restores a warmed-up run.
+class _Restore(Callback):
+    """Callback that restores a warmed-up run.
 
     Attributes:
         record: run.json of the run so far.
@@ -225,23 +223,21 @@ class _Restore(Hook):
     changes: str
     writer: RunWriter
 
-    def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
-        log, source = descent.log, self.source
+    def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+        source = self.source
         saved = (
-            fresh
-            if source.checkpoint is None
-            else self._unpack(source.checkpoint, fresh, warm, descent.run.problem.shapes())
+            fresh if source.checkpoint is None else self._unpack(source.checkpoint, fresh, warm, run.problem.shapes())
         )
         warnings = [f"skipped: {line}" for line in source.passed_over]
         warnings += [f"resumed with force although changed since: {self.changes}"] if self.changes else []
         saved[_WARNINGS] = [*saved[_WARNINGS], *warnings]
-        log.history[:] = (record for record in source.records if record["step"] < saved["step"])
-        log.description["resumed"] = [*self.record.resumed, saved["step"]]
-        log.warmup_seconds += self.record.warmup_seconds
-        restore(descent.run, descent.state, saved)
+        run.history[:] = (record for record in source.records if record["step"] < saved["step"])
+        run.description["resumed"] = [*self.record.resumed, saved["step"]]
+        run.warmup_seconds += self.record.warmup_seconds
+        run.restore(saved)
         if self.record.stopped == NON_FINITE:  # resuming a stopped run means another attempt
-            descent.state.skipped_in_a_row = 0
-        self.writer.resume(log.history, descent.result())
+            run.state.skipped_in_a_row = 0
+        self.writer.resume(run.history, run.result())
 
     def _unpack(
         self,

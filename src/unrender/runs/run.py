@@ -1,4 +1,4 @@
-"""A run: its public part for callbacks, and its state from step to step."""
+"""A run: components, budget, parameters, history, and its state from step to step."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,16 +19,19 @@ from unrender.core.signals import GRACEFUL
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.methods.plan import Plan
-from unrender.optimizers.base import Optimizer
+from unrender.optimizers.base import Choosing, Measuring, Optimizer
 from unrender.runs.noise import GradientNoise
 from unrender.runs.number_trace import NumberTrace
-from unrender.runs.result import INTERRUPTED, TERMINATED
+from unrender.runs.result import INTERRUPTED, TERMINATED, Result
 from unrender.scene.problem import Problem
+
+if TYPE_CHECKING:
+    from unrender.runs.callbacks import Callback
 
 
 @dataclass
 class Run:
-    """A run as callbacks see it.
+    """A run, with everything that belongs to it. Callbacks get it.
 
     Attributes:
         plan: Plan of the run, with the problem as passed.
@@ -39,6 +42,12 @@ class Run:
         step: number of completed steps.
         clock: seconds of optimisation so far.
         parameters: current parameters (arrays of the renderer), possibly at a coarse resolution.
+        state: further state from step to step.
+        callbacks: callbacks in calling order.
+        description: fields of `Result` that are known before the first step, see `metadata.describe_run`.
+        initial: {key: array}, initial parameters at the scene's resolution.
+        history: one record per step.
+        warmup_seconds: seconds of tracing and compiling.
         estimate: last estimate.
         skipped: number of steps that were not applied.
         ahead: number of steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
@@ -58,6 +67,12 @@ class Run:
     steps: int | None
     seconds: float | None
     parameters: Tree
+    state: RunState
+    callbacks: Sequence[Callback] = ()
+    description: dict[str, Any] = field(default_factory=dict)
+    initial: dict[str, np.ndarray] = field(default_factory=dict)
+    history: list[dict[str, Any]] = field(default_factory=list)
+    warmup_seconds: float = 0.0
     folder: Path | None = None
     step: int = 0
     clock: float = 0.0
@@ -117,6 +132,68 @@ class Run:
             shares.append(1.0 - (self.last_step - time.perf_counter()) / self.seconds)
         return min(max(shares), 1.0)
 
+    def result(self, info: bool = False) -> Result:
+        """Return the current result; with `info`, including the information of the last estimate."""
+        state, optimizer = self.state.optimizer, self.optimizer
+        return Result(
+            parameters=self.full(),
+            initial=self.initial,
+            history=self.history,
+            seconds=self.clock,
+            warmup_seconds=self.warmup_seconds,
+            stopped=self.stopped,
+            skipped=self.skipped,
+            warnings=[*self.warnings, *(line for callback in self.callbacks for line in callback.warnings(self))],
+            info=to_numpy(self.estimate.info) if info and self.estimate else {},
+            adapted=list(optimizer.choices(state)) if isinstance(optimizer, Choosing) else [],
+            standard_error=self._standard_errors(),
+            **self.description,
+        )
+
+    def _standard_errors(self) -> dict[str, np.ndarray]:
+        """Return the standard error of the parameters that have one, in their units."""
+        if not isinstance(self.optimizer, Measuring):
+            return {}
+        coordinates = self.problem.coordinates
+        errors = self.optimizer.standard_errors(self.state.optimizer, coordinates.of(self.parameters))
+        slopes = coordinates.slopes({key: self.parameters[key] for key in errors})
+        by_x = {key: np.abs(arrays.numpy(slopes[key])) * x if key in slopes else x for key, x in errors.items()}
+        return {key: x.astype(np.float32) for key, x in by_x.items()}
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return everything that determines the next steps, for checkpoints (`state.pack`)."""
+        state, noise, executor = self.state, self.state.noise, self.problem.executor
+        candidate = None if state.candidate is None else vars(state.candidate)
+        parts = {"sent": executor.snapshot(), "candidate": candidate, "ahead": self.ahead or None}
+        parts |= {"numbers": state.numbers.snapshot()}
+        return {
+            "parameters": self.parameters,
+            "step": self.step,
+            "clock": self.clock,
+            "skipped": self.skipped,
+            "warnings": list(self.warnings),
+            "estimator": executor.collect(state.estimator),
+            "optimizer": state.optimizer,
+            "noise": {"mean": noise.mean, "second_moment": noise.second_moment, "weight": noise.weight},
+            "zero_gradient": dict(state.zero_gradient),
+            "samples": state.samples,
+            "skipped_in_a_row": state.skipped_in_a_row,
+            "next_error": state.next_error,
+        } | {name: part for name, part in parts.items() if part is not None}
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Restore a snapshot, which has been checked to be one of this run's."""
+        self.parameters, self.step, self.clock = saved["parameters"], saved["step"], saved["clock"]
+        self.skipped, self.warnings, self.ahead = saved["skipped"], list(saved["warnings"]), saved.get("ahead", 0)
+        state = self.state
+        state.estimator, state.optimizer = saved["estimator"], saved["optimizer"]
+        state.noise = GradientNoise(**saved["noise"])
+        state.zero_gradient, state.samples = saved["zero_gradient"], saved["samples"]
+        state.skipped_in_a_row, state.next_error = saved["skipped_in_a_row"], saved["next_error"]
+        state.candidate = Candidate(**saved["candidate"]) if "candidate" in saved else None
+        state.numbers = NumberTrace.restored(saved.get("numbers"))
+        self.problem.executor.restore(saved.get("sent"))
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -135,7 +212,7 @@ class Candidate:
 
 @dataclass
 class RunState:
-    """State of a run from step to step, in addition to `Run`.
+    """State of a run from step to step, in addition to `Run`'s parameters.
 
     Attributes:
         estimator, optimizer: their states.
@@ -159,46 +236,8 @@ class RunState:
     numbers: NumberTrace = field(default_factory=NumberTrace)
 
 
-def snapshot(run: Run, state: RunState) -> dict[str, Any]:
-    """Return everything that determines the next steps, for checkpoints (`state.pack`)."""
-    noise, executor = state.noise, run.problem.executor
-    parts = {"sent": executor.snapshot(), "candidate": _packed(state.candidate), "ahead": run.ahead or None}
-    parts["numbers"] = state.numbers.snapshot()
-    return {
-        "parameters": run.parameters,
-        "step": run.step,
-        "clock": run.clock,
-        "skipped": run.skipped,
-        "warnings": list(run.warnings),
-        "estimator": executor.collect(state.estimator),
-        "optimizer": state.optimizer,
-        "noise": {"mean": noise.mean, "second_moment": noise.second_moment, "weight": noise.weight},
-        "zero_gradient": dict(state.zero_gradient),
-        "samples": state.samples,
-        "skipped_in_a_row": state.skipped_in_a_row,
-        "next_error": state.next_error,
-    } | {name: part for name, part in parts.items() if part is not None}
-
-
-def _packed(candidate: Candidate | None) -> dict[str, Any] | None:
-    return None if candidate is None else vars(candidate)
-
-
 SNAPSHOT_COUNTS = ("step", "clock", "skipped", "samples", "skipped_in_a_row", "next_error")
 """Fields of a snapshot that are finite numbers of at least 0."""
-
-
-def restore(run: Run, state: RunState, saved: dict[str, Any]) -> None:
-    """Restore a run from a snapshot, which has been checked to be one of this run's."""
-    run.parameters, run.step, run.clock = saved["parameters"], saved["step"], saved["clock"]
-    run.skipped, run.warnings, run.ahead = saved["skipped"], list(saved["warnings"]), saved.get("ahead", 0)
-    state.estimator, state.optimizer = saved["estimator"], saved["optimizer"]
-    state.noise = GradientNoise(**saved["noise"])
-    state.zero_gradient, state.samples = saved["zero_gradient"], saved["samples"]
-    state.skipped_in_a_row, state.next_error = saved["skipped_in_a_row"], saved["next_error"]
-    state.candidate = Candidate(**saved["candidate"]) if "candidate" in saved else None
-    state.numbers = NumberTrace.restored(saved.get("numbers"))
-    run.problem.executor.restore(saved.get("sent"))
 
 
 @contextmanager
@@ -238,3 +277,10 @@ def terminate_if_told(run: Run) -> None:
     """End the process by SIGTERM after a run that it stopped has been saved, if it has no handler."""
     if run.stopped == TERMINATED and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.raise_signal(signal.SIGTERM)
+
+
+def to_numpy(info: Any) -> Any:
+    """Convert the Dr.Jit arrays of `Estimate.info` to NumPy."""
+    if isinstance(info, Mapping):
+        return {key: to_numpy(value) for key, value in info.items()}
+    return arrays.numpy(info) if arrays.is_drjit(info) else info

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.runs.sensitivity import seen_cells, sensitivity
+from unrender.runs.image_sensitivity import seen_cells, sensitivity
 from unrender.runs.verification import FreshPictures
 from unrender.scene.problem import Problem
 
@@ -42,7 +42,7 @@ def further_from_truth(
 
     The error of a texture or grid includes only cells that affect the images at the truth. It must exceed the first error by a tenth, and
     by more than the noise of the references and of a new image explains. The sensitivity converts that noise to a standard error of the
-    parameter, see `unrender.sensitivity`.
+    parameter, see `unrender.runs.sensitivity`.
 
     Args:
         problem: problem with truth, views and scene.

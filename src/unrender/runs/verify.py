@@ -14,8 +14,8 @@ from unrender.core import phases
 from unrender.display import formatting
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import phase_times
+from unrender.runs.callbacks import Callback
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
-from unrender.runs.hooks import Hook
 from unrender.runs.number_means import averaged
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
@@ -30,7 +30,7 @@ from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Descent
+    from unrender.runs.run import Run
 
 __all__ = ["Memory", "Verify", "compare_memory"]
 
@@ -82,8 +82,8 @@ class Memory:
 
 
 @dataclass
-class Verify(Hook):
-    """Hook that verifies a run at its end by new images, and returns the best parameters.
+class Verify(Callback):
+    """Callback that verifies a run at its end by new images, and returns the best parameters.
 
     Candidates are the start, the parameters after 64, 128, 256, … steps, and the end. The one with the least loss becomes
     `Result.parameters`; another one than the end must be significantly better. Each image uses 0.4 % of the run's paths, or about 8,000
@@ -93,17 +93,16 @@ class Verify(Hook):
     _pictures: FreshPictures | None = field(default=None, init=False)
     _earlier: list[_Earlier] = field(default_factory=list, init=False)
 
-    def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+    def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Compile the kernels of fresh pictures, so that nothing compiles after the last step."""
         del fresh, warm
-        run = descent.run
         with phases.phase(phase_times.COMPILING):
             FreshPictures(run.problem, run.seed, 0, _END).images(run.full())
 
-    def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """Render a candidate at steps 64, 128, 256, …"""
         del record
-        run, ratio = descent.run, descent.run.step / _FIRST_CANDIDATE
+        ratio = run.step / _FIRST_CANDIDATE
         if ratio < 1 or run.step % _FIRST_CANDIDATE or math.log2(ratio) % 1 or _other_meshes(run.problem):
             return
         if self._pictures is None:
@@ -112,35 +111,35 @@ class Verify(Hook):
         earlier = _Earlier.of(run.step, self._pictures, values)
         self._earlier = [*self._earlier[-1:], earlier]
         loss = earlier.loss
-        known = descent.state.candidate
+        known = run.state.candidate
         if known is None or loss < known.loss:
-            descent.state.candidate = Candidate(run.step, loss, values)
+            run.state.candidate = Candidate(run.step, loss, values)
 
-    def on_result(self, descent: Descent, result: Result) -> Result:
+    def on_result(self, run: Run, result: Result) -> Result:
         """Verify the result, unless the run was interrupted, terminated or pruned."""
         if result.stopped in (INTERRUPTED, TERMINATED, PRUNED) or not result.steps:
             return result
         started = time.perf_counter()
         with phases.phase(phase_times.VERIFYING):
-            result = self._verified(descent, result)
+            result = self._verified(run, result)
         return phase_times.with_phase(result, phase_times.VERIFYING, time.perf_counter() - started)
 
-    def _verified(self, descent: Descent, result: Result) -> Result:
-        run, problem = descent.run, descent.run.problem
-        pictures = FreshPictures(problem, run.seed, _SHARE * descent.state.samples, _END)
+    def _verified(self, run: Run, result: Result) -> Result:
+        problem = run.problem
+        pictures = FreshPictures(problem, run.seed, _SHARE * run.state.samples, _END)
         first = pictures.picture(result.initial, problem.remeshed_from or problem)
-        result, last = _end(descent, result, pictures)
+        result, last = _end(run, result, pictures)
         worse = _is_worse(pictures, first, last)
         places: dict[str, tuple[Picture, Mapping[str, np.ndarray]]] = {}
         if worse and problem.remeshed_from is None:
             places["start"] = first, result.initial
-        candidate = descent.state.candidate
+        candidate = run.state.candidate
         if candidate is not None and not _other_meshes(problem) and not candidate.loss >= last.loss[0]:
             candidate_picture = pictures.picture(candidate.parameters)
             if _is_worse(pictures, candidate_picture, last):
                 places[f"step {candidate.step}"] = candidate_picture, candidate.parameters
         best = min(places, key=lambda name: places[name][0].loss[0], default="end")
-        memory = _memory(descent, pictures, last)
+        memory = _memory(run, pictures, last)
         disagrees = memory is not None and memory.disagrees
         best_picture = places[best][0] if places else last
         lines = self._residual(problem, result, last)
@@ -239,9 +238,9 @@ class _Earlier:
         return cls(step, picture.loss[0], np.concatenate(picture.images, axis=1) - pictures.references)
 
 
-def _end(descent: Descent, result: Result, pictures: FreshPictures) -> tuple[Result, Picture]:
+def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Picture]:
     """Return the result with means of its numbers, unless its picture is worse than with the last values, and that picture."""
-    mean = averaged(descent, result)
+    mean = averaged(run, result)
     picture = pictures.picture(mean.parameters)
     if mean is result:
         return result, picture
@@ -281,14 +280,14 @@ def compare_memory(
     return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), shared.score)
 
 
-def _memory(descent: Descent, pictures: FreshPictures, last: Picture) -> Memory | None:
+def _memory(run: Run, pictures: FreshPictures, last: Picture) -> Memory | None:
     """Compare the control variates of the estimator's state with a new image; returns the worst of several, None for none.
 
     Those in workers are compared only in runs with a run folder, whose last checkpoint collects them anyway.
     """
-    problem, state = descent.run.problem, descent.state.estimator
+    problem, state = run.problem, run.state.estimator
     if problem.executor.variant is not None:
-        if descent.run.folder is None:
+        if run.folder is None:
             return None
         state = problem.executor.collect(state)
     memories = [

@@ -1,4 +1,4 @@
-"""Hooks that warn of parameters without influence, numbers at their bounds, and faulty meshes."""
+"""Warnings of a run: settings before its first step; parameters without influence, numbers at their bounds, and faulty meshes."""
 
 from __future__ import annotations
 
@@ -9,27 +9,29 @@ import numpy as np
 from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate
-from unrender.runs.hooks import Hook
-from unrender.scene.self_intersections import crossing_triangles
-from unrender.scene.surfaces import folds
+from unrender.optimizers import rates
+from unrender.optimizers.adam import Adam
+from unrender.optimizers.base import Optimizer
+from unrender.optimizers.meta_adam import MetaAdam
+from unrender.runs.callbacks import Callback
+from unrender.scene.problem import Problem
+from unrender.scene.surfaces import crossing_triangles, folds
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Descent
     from unrender.runs.run import Run
-
 
 _NEAR = 0.01
 """Distance to a bound, relative to the range, below which a number counts as at the bound."""
 
 
-class BoundsWatch(Hook):
-    """Hook that warns of numbers that started inside of a bounded range and end next to one of its bounds.
+class BoundsWatch(Callback):
+    """Callback that warns of numbers that started inside of a bounded range and end next to one of its bounds.
 
     A derivative may vanish there or be mostly noise, so an optimisation that overshot does not return.
     """
 
-    def warnings(self, descent: Descent) -> list[str]:
-        run, lines = descent.run, []
+    def warnings(self, run: Run) -> list[str]:
+        lines = []
         for key, unknown in run.problem.unknowns.items() if run.stopped else ():
             first, (low, high) = unknown.initial, unknown.bounds
             if first.size != 1 or low is None or high is None:
@@ -47,14 +49,14 @@ class BoundsWatch(Hook):
 _STEPS = 5
 
 
-class InfluenceWatch(Hook):
-    """Hook that warns of parameters whose gradient was exactly zero in each of the first five steps.
+class InfluenceWatch(Callback):
+    """Callback that warns of parameters whose gradient was exactly zero in each of the first five steps.
 
     Parameters of a block that is not estimated yet are excluded.
     """
 
-    def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
-        run, zero = descent.run, descent.state.zero_gradient
+    def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
+        zero = run.state.zero_gradient
         if not applied or run.step > _STEPS:
             return
         block = estimate.get(BlockEstimate)
@@ -71,15 +73,14 @@ _EVERY, _TRIANGLES = 25, 100
 """Steps between two tests for self-intersections: the first number, or the number of triangles divided by the second if larger."""
 
 
-class MeshWatch(Hook):
-    """Hook that warns of meshes that no image shows any more, and of new self-intersections and folds."""
+class MeshWatch(Callback):
+    """Callback that warns of meshes that no image shows any more, and of new self-intersections and folds."""
 
     def __init__(self) -> None:
         self._seen: set[str] = set()
         self._crossing: set[str] = set()
 
-    def on_update(self, descent: Descent, estimate: Estimate, applied: bool) -> None:
-        run = descent.run
+    def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
         for key, faces in run.problem.faces.items() if applied else ():
             # None for estimators of losses only, or of directions instead of gradients.
             gradient = estimate.gradient.get(key)
@@ -94,8 +95,8 @@ class MeshWatch(Hook):
             if run.step % max(_EVERY, len(faces) // _TRIANGLES) == 0 and (line := self._crosses(run, key)):
                 run.warnings.append(f"step {run.step}: {line}")
 
-    def warnings(self, descent: Descent) -> list[str]:
-        run, lines = descent.run, []
+    def warnings(self, run: Run) -> list[str]:
+        lines = []
         for key in run.problem.faces if run.stopped else ():
             before, after, joined = _joined(run, key)
             if (count := folds(after, joined)) > folds(before, joined):
@@ -128,3 +129,32 @@ def _joined(run: Run, key: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     )
     _, first, places = np.unique(start, axis=0, return_index=True, return_inverse=True)
     return start[first], end[first], places.reshape(-1)[run.problem.faces[key]]
+
+
+_LARGEST_STEP = 0.5
+"""Fraction of a bounded parameter's range: a longer first step always ends at a bound."""
+
+
+def remarks(problem: Problem, optimizer: Optimizer) -> list[str]:
+    """Return one line for each parameter whose first step crosses at least half of its range.
+
+    Adam's steps are about as long as the learning rate, in units of the parameter, whatever the scale of the loss.
+    """
+    if not isinstance(optimizer, (Adam, MetaAdam)):
+        return []
+    lines = []
+    each = rates.per_parameter(
+        type(optimizer).__name__, problem.unknowns, optimizer.learning_rate, problem.learning_rates
+    )
+    for key, unknown in problem.unknowns.items():
+        rate, (low, high) = each[key], unknown.bounds
+        if unknown.transform is None and low is not None and high is not None and rate >= _LARGEST_STEP * (high - low):
+            lines.append(
+                f"parameter {key}: a learning_rate of {rate:g} crosses its range, {low:g} to {high:g}, in "
+                f"{_steps((high - low) / rate)}; 0.005 to 0.05 of the range are usual"
+            )
+    return lines
+
+
+def _steps(number: float) -> str:
+    return "one step" if number <= 1 else f"{number:.2g} steps"

@@ -6,7 +6,7 @@ import difflib
 import re
 from collections.abc import Mapping
 
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.rendering.renderer import ParameterInfo
 
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")

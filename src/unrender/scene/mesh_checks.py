@@ -9,7 +9,7 @@ import numpy as np
 
 from unrender.core import tables
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.scene import remeshing
 from unrender.scene.errors import FieldError
 from unrender.scene.mesh_regularizer import MeshRegularizer

@@ -30,7 +30,7 @@ class Prior:
 
     over elements e, over texels, voxels or vertices c (or the one colour or number), and over pairs (c ~ d) of neighbours. Terms that
     are not set are absent. s is the loss that the noise of the references alone causes, per pixel value and likelihood unit
-    (`reference_noise.likelihood_scale`): with an L2 or L1 loss and weight 1 the minimum is the maximum a posteriori estimate. Norms below
+    (`references.likelihood_scale`): with an L2 or L1 loss and weight 1 the minimum is the maximum a posteriori estimate. Norms below
     a tenth of `total_variation` are rounded to be differentiable. A prior biases the result towards itself, by design.
 
     Args:

@@ -27,8 +27,7 @@ from unrender.scene.errors import FieldError
 from unrender.scene.executor import LOCAL, Executor
 from unrender.scene.mesh_checks import check_surfaces
 from unrender.scene.parameter import Parameter, ParameterSettings, scene_keys, tied, ties_of
-from unrender.scene.reference_noise import likelihood_scale
-from unrender.scene.references import References
+from unrender.scene.references import References, likelihood_scale
 from unrender.scene.surfaces import Surface
 from unrender.scene.unknown import Unknown
 from unrender.scene.validation import (
@@ -249,7 +248,7 @@ class Problem(ViewLosses):
 
     @cached_property
     def prior_scale(self) -> float:
-        """The factor by which negative log densities of priors enter the loss, see `reference_noise.likelihood_scale`."""
+        """The factor by which negative log densities of priors enter the loss, see `references.likelihood_scale`."""
         return likelihood_scale(self)
 
     @cached_property

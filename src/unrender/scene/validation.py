@@ -13,8 +13,7 @@ import numpy as np
 
 from unrender.core import arrays, tables
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
-from unrender.core.text import shorten
+from unrender.core.text import did_you_mean, shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
 from unrender.losses import FunctionLoss, Loss
 from unrender.parameterisations.base import Bounds, Parameterisation, Transform

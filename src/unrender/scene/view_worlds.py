@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core import arrays, checks
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.io import parameter_values
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.picture_format import AOVS, AovRenderer

@@ -12,7 +12,7 @@ is at most 1 / (2 − α_{i-1}) (Eq. 17), which from α_0 = 0 equals the bound i
 
 The *coupled* form is not in the paper. It takes F_i and the estimate H_i of the previous state from the same samples, so ΔF_i = F_i − H_i
 is not independent of F_i. Its recursion M_i = F_i + w_i (M_{i-1} − H_i) equals Eq. 7 with H = F − ΔF. Its weight and variance are those
-of a control variate (`control_weight.py`) with Cov[F, H] = Var F − Var[F − H] / 2, where Var H is approximated by Var F.
+of a control variate (`recursion.py`) with Cov[F, H] = Var F − Var[F − H] / 2, where Var H is approximated by Var F.
 
 Deviations from the paper:
 
@@ -33,8 +33,7 @@ from dataclasses import dataclass, replace
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
-from unrender.statistics.control_weight import control_variate_variance, control_weight
-from unrender.statistics.recursion import advance
+from unrender.statistics.recursion import advance, control_variate_variance, control_weight
 
 __all__ = [
     "BETA_DIFFERENCE",

@@ -11,12 +11,12 @@ from PIL import Image
 
 from unrender.app.capture import (
     atlas,
-    decoding,
     field_folder,
     formats,
     hull,
     overlays,
     photometric_folder,
+    pictures,
     problem_folder,
     turntable,
     writing,
@@ -95,13 +95,13 @@ class ImportOptions:
     band: int = 0
     turntable: bool | None = None
     field: int | None = None
-    response: str = decoding.SRGB
+    response: str = pictures.SRGB
 
     def __post_init__(self) -> None:
         for name in ("mesh", "masks"):
             value = getattr(self, name)
             object.__setattr__(self, name, None if value is None else Path(value))
-        decoding.check(self.response)
+        pictures.check_response(self.response)
         if self.unknowns is not None:
             object.__setattr__(self, "unknowns", self.chosen(()))
         for name, least in (("resolution", 8), ("voxels", 1), ("faces", 1), ("texture", 1), ("band", 0)):
@@ -115,7 +115,7 @@ class ImportOptions:
 
     def chosen(self, default: tuple[str, ...]) -> tuple[str, ...]:
         """Return the selected unknowns, or `default` without a selection, and `response` if it is fitted."""
-        fitted = ("response",) if self.response == decoding.FIT else ()
+        fitted = ("response",) if self.response == pictures.FIT else ()
         return parse(",".join((*(default if self.unknowns is None else self.unknowns), *fitted)))
 
 
@@ -217,7 +217,7 @@ def import_capture(
 
 def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """Import a capture of one camera under known lights."""
-    if options.response != decoding.SRGB:
+    if options.response != pictures.SRGB:
         raise InputError(
             "--response: with one camera under known lights, the better fit of sRGB and linear is selected automatically"
         )
@@ -239,7 +239,7 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
 def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """Import a capture as a radiance field."""
     assert options.field is not None
-    if options.response == decoding.FIT:
+    if options.response == pictures.FIT:
         raise InputError(
             "--response fit: a radiance field can represent any curve; expected srgb, linear or an exponent"
         )

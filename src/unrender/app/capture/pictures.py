@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import warnings
 from collections.abc import Iterator
@@ -12,11 +13,12 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from unrender.app.capture import decoding
 from unrender.app.capture.cameras import Lens, opencv
 from unrender.core.errors import InputError
-from unrender.core.text import reason_of
+from unrender.core.text import printable, reason_of
 from unrender.io import bounded_files, image_size, images, tiff_header
+
+SRGB, LINEAR, FIT = "srgb", "linear", "fit"
 
 _PILLOW_KINDS = {
     "JPEG": ("JPEG", "MPO"),
@@ -88,13 +90,13 @@ def _oriented_size(width: int, height: int, orientation: int) -> tuple[int, int]
     return (height, width) if orientation in _QUARTER_TURNS else (width, height)
 
 
-def read(path: Path, orientation: int = 1, response: str = decoding.SRGB) -> Pixels:
+def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
     """Read a photograph. 8- and 16-bit integers are decoded, floating-point numbers are linear; CMYK becomes RGB.
 
     Args:
         path: the file.
         orientation: EXIF orientation to apply; 1 for none.
-        response: response of integers, see `decoding.linear`.
+        response: response of integers, see `decode`.
 
     Raises:
         InputError: the file cannot be read completely.
@@ -105,7 +107,7 @@ def read(path: Path, orientation: int = 1, response: str = decoding.SRGB) -> Pix
     array = _turn(array, orientation)
     if array.dtype in (np.uint8, np.uint16):
         largest = np.iinfo(array.dtype).max
-        curve = decoding.linear(np.arange(largest + 1) / largest, response).astype(np.float32)
+        curve = decode(np.arange(largest + 1) / largest, response).astype(np.float32)
         values = curve[array[..., :3]]
         alpha = array[..., 3].astype(np.float32) / largest if array.shape[2] == 4 else None
     else:
@@ -247,3 +249,36 @@ def _check_size(path: Path, width: int, height: int) -> None:
         most = image_size.MOST_VALUES // 3_000_000
         limits = f"at most {most} megapixels and less than {_LONGEST_SIDE} pixels a side"
         raise InputError(f"{path}: {width} x {height} pixels, expected {limits}")
+
+
+_LEAST, _MOST = 1.0, 4.0
+"""Range of exponents. Those of cameras and screens are between 1 and 2.6."""
+
+
+def check_response(response: str) -> str:
+    """Return the name of a response unchanged. Raise `InputError` if it is invalid."""
+    if response not in (SRGB, LINEAR, FIT):
+        _exponent(response)
+    return response
+
+
+def decode(levels: np.ndarray, response: str) -> np.ndarray:
+    """Decode levels in [0, 1], of any shape, to linear values by a response. The curve is increasing and maps 0 and 1 to themselves.
+
+    "srgb" and "fit" select the sRGB curve, a number γ the power levels ** γ, and "linear" the identity.
+    """
+    if response in (SRGB, FIT):
+        return images.srgb_to_linear(levels)
+    return levels if response == LINEAR else levels ** _exponent(response)
+
+
+def _exponent(text: str) -> float:
+    names = f"{SRGB}, {LINEAR}, {FIT} or an exponent from {_LEAST:g} to {_MOST:g}, such as 2.2"
+    expected = f"--response {printable(text[:40])}: expected {names}"
+    try:
+        exponent = float(text)
+    except ValueError as error:
+        raise InputError(expected) from error
+    if not math.isfinite(exponent) or not _LEAST <= exponent <= _MOST:
+        raise InputError(expected)
+    return exponent

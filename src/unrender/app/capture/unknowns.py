@@ -24,7 +24,7 @@ import numpy as np
 
 from unrender.app.stages.stages_file import Stage, Stages
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.photographs import check_response

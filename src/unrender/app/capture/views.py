@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.app.capture import decoding, pictures
+from unrender.app.capture import pictures
 from unrender.app.capture.cameras import Lens
 from unrender.app.capture.capture import Capture, CapturedView, Photograph
 from unrender.app.capture.stored import StoredViews
@@ -25,7 +25,7 @@ def prepare(
     scale: float | None,
     hold_out: int | None,
     progress: Callable[[int, int], None] = lambda done, count: None,
-    response: str = decoding.SRGB,
+    response: str = pictures.SRGB,
 ) -> tuple[StoredViews, list[str]]:
     """Read, undistort and check all photographs, one by one. Results of the chosen resolution are stored in a temporary file.
 
@@ -35,7 +35,7 @@ def prepare(
         scale: factor of each photograph's own resolution, at most 1, instead of `resolution`.
         hold_out: interval of held-out photographs, beginning with the first; 0 for none; None for the capture's own split, or 8.
         progress: function of the number of processed photographs and their total.
-        response: response of files of 8 or 16 bits, see `decoding.linear`.
+        response: response of files of 8 or 16 bits, see `pictures.decode`.
 
     Returns:
         The views in the capture's order, and notices.

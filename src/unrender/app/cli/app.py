@@ -8,16 +8,15 @@ from typing import Annotated
 import typer
 
 from unrender.app.cli.compare import compare
+from unrender.app.cli.evaluation import judge, turntable
 from unrender.app.cli.export import export
 from unrender.app.cli.gallery import gallery
 from unrender.app.cli.import_ import import_
-from unrender.app.cli.judge import judge
 from unrender.app.cli.methods import methods
 from unrender.app.cli.report import report
 from unrender.app.cli.resume import resume
 from unrender.app.cli.run import run
 from unrender.app.cli.sweep import sweep_command
-from unrender.app.cli.turntable import turntable
 from unrender.app.cli.watch import watch
 
 app = typer.Typer(

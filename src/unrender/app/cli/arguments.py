@@ -17,7 +17,7 @@ from unrender.backend import cache, variant
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.random import LARGEST_SEED
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.io import confinement
 
 if TYPE_CHECKING:

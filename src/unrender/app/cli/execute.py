@@ -16,15 +16,15 @@ from unrender.display import formatting
 from unrender.display.terminal import Console
 from unrender.methods import Method
 from unrender.methods.plan_file import PlanFile
-from unrender.runs import advice
+from unrender.runs import watches
 from unrender.runs.callbacks import Callback
 from unrender.runs.final_images import image_name
+from unrender.runs.image_sensitivity import seen_cells
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.progress import Progress
 from unrender.runs.result import Result
-from unrender.runs.sensitivity import seen_cells
 from unrender.scene.notebook import describe_views
 from unrender.scene.problem import Problem
 from unrender.statistics import debiased
@@ -77,7 +77,7 @@ def execution(
     options = order.method.options_of(order.settings)
     settings = {"options": options, "problem_options": dict(order.problem_settings)}
     settings = {name: value for name, value in settings.items() if value}
-    for line in advice.remarks(problem, plan.optimizer):
+    for line in watches.remarks(problem, plan.optimizer):
         console.print(f"note: {escape(line)}", soft_wrap=True)
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # earlier runs
     annotations = RunAnnotations(

@@ -253,7 +253,7 @@ def _begin(console: Console, planned: tuple[SweepPlan, Search], command: str, se
 
 def _kind(search: str | None, axes: Any) -> Any:
     """Return the search by name. Raises `InputError`."""
-    from unrender.core.suggestions import did_you_mean
+    from unrender.core.text import did_you_mean
 
     if search is None:
         try:

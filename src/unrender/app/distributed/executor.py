@@ -12,10 +12,9 @@ import numpy as np
 
 from unrender.app.distributed import assignment
 from unrender.app.distributed.assignment import joined, split, total
-from unrender.app.distributed.memories import Memories, Memory, Recipe
 from unrender.app.distributed.messages import Call, ImageState, Pair, Pilot, Reply, payload_bytes
-from unrender.app.distributed.outbox import Outbox, Sent
 from unrender.app.distributed.share import Hosts
+from unrender.app.distributed.worker_state import Memories, Memory, Outbox, Recipe, Sent
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree

@@ -11,7 +11,7 @@ import numpy as np
 from unrender.app.exporting import blender, gltf, ready_made, textures, usd
 from unrender.app.exporting.asset import Asset, Part
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.io import mesh_files
 
 

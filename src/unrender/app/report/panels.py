@@ -13,7 +13,7 @@ from unrender.core import periodic
 from unrender.display import formatting, pictures
 from unrender.display.pictures import is_map
 from unrender.runs.folder.reader import RunFolder, ViewPictures
-from unrender.runs.sensitivity import around, hardly_seen
+from unrender.runs.image_sensitivity import around, hardly_seen
 
 __all__ = [
     "ColourScale",

@@ -14,7 +14,7 @@ from unrender.display.plots import Chart, Line
 from unrender.rendering import parameter_errors
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 from unrender.runs.folder.schema import DOUBTFUL, RunRecord
-from unrender.runs.sensitivity import seen_cells
+from unrender.runs.image_sensitivity import seen_cells
 from unrender.statistics import debiased
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from PIL import Image
 
-from unrender.io.thumbnails import reduced
+from unrender.io.resampling import reduced
 from unrender.losses.metrics import exposure, srgb
 
 _LARGEST = 1024

@@ -12,7 +12,7 @@ import numpy as np
 from unrender.app.exporting import scene_folder
 from unrender.app.stages.stages_file import Stage, Stages
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.losses import Loss
 from unrender.rendering.photographs import OF_PHOTOGRAPHS
 from unrender.rendering.renderer import ParameterInfo

@@ -20,7 +20,7 @@ import mitsuba as mi
 from unrender.backend import plugins, variant
 from unrender.core.errors import InputError
 from unrender.core.text import one_line, shorten
-from unrender.io import scene_assets, scene_files, spectrum_files
+from unrender.io import scene_assets, scene_files
 
 _DEEPEST = 128
 _MOST_PATHS = 1 << 20
@@ -207,7 +207,7 @@ class _Dictionary:
         path = scene_files.resolve(str(name), [*self.search, *self.others])
         if path is None:
             raise InputError(f"spectrum {shorten(str(name), 200)}: no such file")
-        spectrum_files.check(path)
+        scene_assets.check_spectrum(path)
         return path.absolute()
 
 

@@ -27,9 +27,8 @@ from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
 from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
-from unrender.rendering.mitsuba.scene_graph import ObjectGraph
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph, refusal, replace_meshes
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
-from unrender.rendering.mitsuba.scene_objects import refusal, replace_meshes
 from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 from unrender.rendering.renderer import ReplacedMesh

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
-from unrender.rendering.mitsuba.scene_objects import Holders, children, class_name
+from unrender.rendering.mitsuba.scene_graph import Holders, children, class_name
 
 
 @dataclass(frozen=True)

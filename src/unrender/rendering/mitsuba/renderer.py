@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles

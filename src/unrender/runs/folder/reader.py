@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
-from unrender.core.text import printable
+from unrender.core.text import did_you_mean, printable
 from unrender.io import bounded_files
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.folder import schema

@@ -38,8 +38,7 @@ from pydantic import BaseModel, ConfigDict, Field, StrictInt, StrictStr, Validat
 
 from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
-from unrender.core.suggestions import did_you_mean
-from unrender.core.text import printable, reason_of
+from unrender.core.text import did_you_mean, printable, reason_of
 from unrender.io import bounded_files
 from unrender.rendering import parameter_errors
 from unrender.rendering.parameter_errors import ErrorMeasure

@@ -16,13 +16,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from unrender.backend.versions import deciding_versions
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import files
 from unrender.runs import phase_times
+from unrender.runs.callbacks import Callback
 from unrender.runs.final_images import render_final_images, warm_up
-from unrender.runs.folder import checkpoint, method_file
+from unrender.runs.folder import checkpoint, contents, method_file
 from unrender.runs.folder.history import MOST_KEPT, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
 from unrender.runs.folder.meshes import FOLDER as MESH_FILES
@@ -44,13 +46,12 @@ from unrender.runs.folder.schema import (
     TRUTH,
 )
 from unrender.runs.folder.state import not_finite, pack
-from unrender.runs.hooks import Hook
-from unrender.runs.result import PRUNED, TERMINATED, Result, deciding_versions
+from unrender.runs.result import PRUNED, TERMINATED, Result
 from unrender.scene import serialization
 from unrender.scene.problem import Problem
 
 if TYPE_CHECKING:
-    from unrender.runs.loop import Descent
+    from unrender.runs.run import Run
 
 _FILES = (
     *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES, SENSITIVITY, MESHES, LAST),
@@ -67,8 +68,8 @@ _log = logging.getLogger("unrender")
 
 
 @dataclass
-class RunWriter(Hook):
-    """Hook that writes a run folder: the history at every step, checkpoints, and the result with final images.
+class RunWriter(Callback):
+    """Callback that writes a run folder: the history at every step, checkpoints, and the result with final images.
 
     A failure during the run is a warning, issued once, and does not end the run; a failure at the end raises. As a context manager it
     holds the folder's lock; `start` or `resume` must be called before the run.
@@ -143,41 +144,39 @@ class RunWriter(Hook):
             _sweep(self.folder)
             self._history.rewrite(records)
             files.write(self.folder / METHOD, method_file.encode(self.method, self.folder / METHOD))
-            self._write_record(result, "running")
+            contents.write_record(self.folder, result, "running")
             self._written_step, self._started = result.steps, True
         except OSError as error:
             raise InputError(f"run folder {self.folder}: cannot be written: {error.strerror or error}") from error
 
-    def on_warm_up(self, descent: Descent, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+    def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Compile the kernels of the final pictures, so that nothing compiles after the last step."""
         del fresh, warm
-        if self.final_spp != 1 and not descent.run.stopped:
-            run = descent.run
+        if self.final_spp != 1 and not run.stopped:
             share = _TESTED_SHARE[run.compiled]
             self._tested = run.seconds is None or run.time_left() > share * run.seconds
             with phases.phase(phase_times.COMPILING):
                 warm_up(run.problem, run.full(), self._tested)
 
-    def on_step(self, descent: Descent, record: dict[str, Any]) -> None:
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """Append the step to the history, and write a checkpoint if due."""
         self.append(record)
         if self._history.size > max(MOST_KEPT, self._thin_from):
-            self._guarded("history", lambda: self._thin(descent.log.history))
-        if self.checkpoint_due(descent.run.step):
-            self.write_checkpoint(descent)
+            self._guarded("history", lambda: self._thin(run.history))
+        if self.checkpoint_due(run.step):
+            self.write_checkpoint(run)
 
-    def on_result(self, descent: Descent, result: Result) -> Result:
+    def on_result(self, run: Run, result: Result) -> Result:
         """Write the last checkpoint and the result, render the final images, and write the result with them.
 
         A terminated run has no final images, because its caller waits for seconds only, nor does a pruned one.
         """
-        self.write_checkpoint(descent, result)
+        self.write_checkpoint(run, result)
         if result.stopped not in (TERMINATED, PRUNED):
             if result.status not in ENDED or self._written_step != result.steps:
                 # Save the long computation and its outcome before the final images take more time.
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
-            run = descent.run
             images = render_final_images(run.problem, result, self.final_spp, run.time_left, self._tested)
             result = replace(
                 result,
@@ -189,16 +188,16 @@ class RunWriter(Hook):
             )
             result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
-        self._guarded("meshes", lambda: write_files(self.folder, descent.run.problem, result.parameters))
+        self._guarded("meshes", lambda: write_files(self.folder, run.problem, result.parameters))
         return result
 
-    def on_error(self, descent: Descent, error: BaseException) -> None:
+    def on_error(self, run: Run, error: BaseException) -> None:
         """Record that the run ended by an exception, if it had started and still holds the folder."""
         if not self._started or not self._lock.is_held():
             return
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         message = reason_of(error, 300)
-        self._guarded("end", lambda: self._write_record(descent.result(), status, message))
+        self._guarded("end", lambda: contents.write_record(self.folder, run.result(), status, message))
 
     # ------------------------------------------------------------------ the parts of a step
 
@@ -219,17 +218,17 @@ class RunWriter(Hook):
         since = time.perf_counter() - self._written_at
         return (step % _STEPS == 0 or since >= _MOST_SECONDS) and since * _SHARE >= self._cost
 
-    def write_checkpoint(self, descent: Descent, result: Result | None = None) -> None:
+    def write_checkpoint(self, run: Run, result: Result | None = None) -> None:
         """Write a checkpoint after the last step with `result`, by default the current one; at most once per step."""
-        result = result or descent.result()
-        if descent.run.problem.remeshed_from is not None:
+        result = result or run.result()
+        if run.problem.remeshed_from is not None:
             return  # the last checkpoint precedes remeshing: a resumed run remeshes again, to the same mesh
         if result.steps == self._written_step and not self._checkpoint_at_once:
             return
         started = time.perf_counter()
-        state = descent.snapshot()  # takes time if workers hold a part of it
+        state = run.snapshot()  # takes time if workers hold a part of it
         self._checkpoint_at_once = False
-        self._guarded("checkpoint", lambda: self._write_checkpoint(result, descent.run.seed, state))
+        self._guarded("checkpoint", lambda: self._write_checkpoint(result, run.seed, state))
         self._written_at = time.perf_counter()
         self._cost = self._written_at - started
 
@@ -247,29 +246,20 @@ class RunWriter(Hook):
         self._restore_folder(result)
         if self._taken_over:
             raise InputError(f"run folder {self.folder}: another run has taken its place; the result is not saved")
-        result.save(self.folder, status)
+        contents.write_result(self.folder, result, status)
 
     def _check(self, result: Result) -> None:
         """Raise `InputError` if the reader would reject the files of this run."""
-        result.encoded_record("running", "", self.folder / RECORD)
+        contents.check_writable(self.folder, result, "running")
         method_file.encode(self.method, self.folder / METHOD)
-        for key in result.parameters:
-            files.check_member(key, f"run folder {self.folder}: parameter")
 
     def _write_start(self, result: Result) -> None:
         serialization.save(self.problem, self.folder)
         files.write(self.folder / METHOD, method_file.encode(self.method, self.folder / METHOD), name_too=False)
-        files.write_arrays(self.folder / INITIAL, result.initial, name_too=False)
-        for name, values in ((TRUTH, result.truth), (MESHES, result.meshes)):
-            if values:
-                files.write_arrays(self.folder / name, values, name_too=False)
-        files.write_arrays(self.folder / PARAMETERS, result.parameters, name_too=False)
+        contents.write_arrays(self.folder, result, (INITIAL, TRUTH, MESHES, PARAMETERS))
         self._history.rewrite(result.history, name_too=False)
         files.sync_folder(self.folder)
-        self._write_record(result, "running")
-
-    def _write_record(self, result: Result, status: str, error: str = "") -> None:
-        files.write(self.folder / RECORD, result.encoded_record(status, error, self.folder / RECORD))
+        contents.write_record(self.folder, result, "running")
 
     def _write_checkpoint(self, result: Result, seed: int, state: Any) -> None:
         self._restore_folder(result)
@@ -281,7 +271,7 @@ class RunWriter(Hook):
         problem = result.problem["fingerprint"]
         checkpoint.write(self.folder, result.steps, seed, pack(state), deciding_versions(), problem)
         files.write_arrays(self.folder / PARAMETERS, result.parameters, compress=False, name_too=False)
-        self._write_record(result, "running")
+        contents.write_record(self.folder, result, "running")
         self._written_step = result.steps
 
     def _thin(self, records: list[dict[str, Any]]) -> None:

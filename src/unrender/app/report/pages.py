@@ -1,9 +1,10 @@
-"""Comparison of several runs at equal time: compare.html, compare.png and compare.json."""
+"""Pages: report.html of one run; compare.html, compare.png and compare.json of several runs at equal time."""
 
 from __future__ import annotations
 
 import json
 import math
+import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.app.report import curves, html, image_metrics, panels
+from unrender.app.report import curves, html, image_metrics, panels, shapes, tables
 from unrender.app.report import groups as grouping
 from unrender.app.report.equal_time import Comparison, compare_groups
 from unrender.display import plots
@@ -19,8 +20,54 @@ from unrender.display.plots import Chart, Line
 from unrender.io.files import write
 from unrender.runs.folder.reader import RunFolder, read
 
-_VIEWS = 4
-_MAPS = 8
+_RUN_VIEWS = 8
+_RUN_MAPS = 24
+_SHAPES = 6
+
+
+def page(directory: str | Path, open_after: bool = False) -> Path:
+    """Write report.html into a run folder: one file, no network needed.
+
+    Args:
+        directory: the run folder.
+        open_after: show it in the web browser.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        InputError: the folder is not a run folder, or a file or field of it is malformed, or it cannot be written to.
+    """
+    run = read(directory)
+    shown = dict(list(run.views.items())[:_RUN_VIEWS])
+    maps = [key for key, value in run.parameters.items() if panels.is_map(value)]
+    shown_shapes = [shapes.panel(run, key) for key in list(run.meshes)[:_SHAPES]]
+    content = html.render(
+        "page.html",
+        run=run,
+        stopped=tables.ending(run.record),
+        command=run.record.command,
+        facts=html.facts(run.record),
+        tiles=tables.tiles(run),
+        views=[panels.view_of_run(view, of) for view, of in shown.items()],
+        more_views=len(run.views) - len(shown),
+        view_rows=tables.view_rows(run),
+        measures=image_metrics.available()[1:],
+        shapes=shown_shapes,
+        more_script="shapes.js" if shown_shapes else "",
+        maps=[panels.map_of_run(run, key) for key in maps[:_RUN_MAPS]],
+        more_maps=max(0, len(maps) - _RUN_MAPS),
+        rows=[tables.parameter_row(run, key) for key in run.parameters],
+        charts={axis: tables.charts(run, axis) for axis in plots.AXES},
+    )
+    path = write(run.path / "report.html", content)
+    if open_after:
+        webbrowser.open(path.resolve().as_uri())
+    return path
+
+
+_COMPARED_VIEWS = 4
+_COMPARED_MAPS = 8
 
 
 def compare(directories: Sequence[str | Path], out: str | Path) -> Path:
@@ -82,14 +129,14 @@ def _page(comparison: Comparison, notices: list[str]) -> bytes:
         commands={str(run.path): run.record.command for group in comparison.groups for run in group.runs},
         views=[
             panels.view_of_methods(v, {name: run.views[v] for name, run in representatives.items()})
-            for v in views[:_VIEWS]
+            for v in views[:_COMPARED_VIEWS]
         ],
-        more_views=max(0, len(views) - _VIEWS),
+        more_views=max(0, len(views) - _COMPARED_VIEWS),
         maps=[
             panels.map_of_methods(k, {name: run.parameters[k] for name, run in representatives.items()}, first.truth[k])
-            for k in maps[:_MAPS]
+            for k in maps[:_COMPARED_MAPS]
         ],
-        more_maps=max(0, len(maps) - _MAPS),
+        more_maps=max(0, len(maps) - _COMPARED_MAPS),
         charts={axis: _charts(comparison, axis) for axis in plots.AXES},
     )
 

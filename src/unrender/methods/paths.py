@@ -1,20 +1,52 @@
-"""Method `adaptive`: pixel mini-batches."""
+"""Methods on path gradients: `plain`, `rcv` (Nicolet et al. 2023), `adaptive`, and `stock`, the loop of Mitsuba's tutorials."""
 
 from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, FiniteFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from unrender import pixels
 from unrender.core.registry import register
 from unrender.estimators.base import Estimator
 from unrender.estimators.path import PathGradient
+from unrender.estimators.stock import StockGradient
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.adam_options import SamplingOptions
+from unrender.methods.adam_options import AdamOptions, PathOptions, SamplingOptions
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
+
+
+@register(name="plain", position=1)
+class PlainMethod(PathOptions):
+    """a new rendering at each step, leave-one-out sample groups, Adam"""
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        return self.estimator(Plain()), self.optimizer()
+
+
+@register(name="rcv", position=2)
+class RecursiveControlVariateMethod(PathOptions):
+    """recursive control variates, which reuse earlier renderings of the image (Nicolet et al. 2023), Adam"""
+
+    spp: PositiveInt = Field(2, description="samples per pixel; from 2 on, the adjoint shares their paths")
+    space: Literal["path", "primary"] = Field(
+        "path",
+        description="what two steps share: paths (materials, emitters, meshes), or random numbers (any parameter)",
+    )
+    alpha: FiniteFloat = Field(0.9, ge=0, lt=1, description="decay of the means in the control weight")
+    beta: FiniteFloat = Field(0.999, ge=0, lt=1, description="decay of the covariances in the control weight")
+    max_weight: FiniteFloat = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="upper bound of the control weight: 0.95 forgets errors of the image after about 20 steps",
+    )
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        image = RecursiveControlVariate(self.space, self.alpha, self.beta, max_weight=self.max_weight)
+        return self.estimator(image), self.optimizer()
 
 
 @register(name="adaptive", position=5)
@@ -54,3 +86,13 @@ class AdaptiveMethod(SamplingOptions):
         if self.scheme == "loss":
             return pixels.LossProportional(self.pixels, **guided)
         return pixels.Uniform(self.pixels)
+
+
+@register(name="stock", position=8)
+class StockMethod(AdamOptions):
+    """the loop of Mitsuba's tutorials, for comparison: mi.render with prb, dr.backward, Adam"""
+
+    spp: PositiveInt = Field(16, description="samples per pixel of the image, and as many of the adjoint")
+
+    def build(self) -> tuple[Estimator, Optimizer]:
+        return StockGradient(self.spp), self.optimizer()

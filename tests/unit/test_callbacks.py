@@ -1,0 +1,130 @@
+"""One protocol of events: the user's callbacks receive what the parts of a run receive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import unrender as ur
+from tests.unit.test_budget import problem
+from unrender.core import phases
+from unrender.runs.callbacks import Callback, UserCallbacks
+
+EVENTS = [name for name in vars(Callback) if not name.startswith("_")]
+
+
+class Recorder(Callback):
+    """Records the events in the order in which they arrive."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+
+    def on_phase(self, name: str) -> None:
+        self.events.append(name)
+
+    def on_progress(self, share: float) -> None:
+        self.events.append("progress")
+
+    def on_phase_end(self, name: str) -> None:
+        self.events.append(f"{name} ends")
+
+    def on_warm_up(self, run: Any, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
+        assert fresh.keys() == warm.keys()
+        self.events.append("warm-up")
+
+    def on_start(self, run: Any) -> None:
+        self.events.append("start")
+
+    def before_step(self, run: Any) -> None:
+        self.events.append("before")
+
+    def on_update(self, run: Any, estimate: Any, applied: bool) -> None:
+        assert applied
+        self.events.append("update")
+
+    def on_step(self, run: Any, record: dict[str, Any]) -> None:
+        assert run.history[-1] is record
+        self.events.append("step")
+
+    def on_result(self, run: Any, result: ur.Result) -> ur.Result:
+        self.events.append("result")
+        return replace(result, info={"added": 1})
+
+    def on_error(self, run: Any, error: BaseException) -> None:
+        self.events.append(f"error: {error}")
+
+    def on_end(self, run: Any, result: ur.Result) -> None:
+        self.events.append("end")
+
+    def warnings(self, run: Any) -> list[str]:
+        return ["a line of one's own"]
+
+
+STEP = ["before", "update", "step"]
+
+
+def test_user_callbacks_receive_every_event_in_order() -> None:
+    recorder = Recorder()
+    with phases.listening(recorder):  # as a progress bar does, which is a callback of the run, too
+        result = ur.optimize(problem(), ur.PathGradient(), ur.optimizers.Adam(0.01), steps=2, callbacks=[recorder])
+    verification = ["verification", "verification ends"]
+    start = [
+        "compiling",
+        "compiling ends",
+        "compiling",
+        "compiling ends",
+        "warm-up",
+        "start",
+    ]  # of steps and of new images
+    assert recorder.events == [*start, *STEP, *STEP, *verification, "result", "end"]
+    assert result.info == {"added": 1}
+    assert "a line of one's own" in result.warnings
+
+
+def test_user_callbacks_receive_errors() -> None:
+    class Fails(Callback):
+        def on_step(self, run: Any, record: dict[str, Any]) -> None:
+            raise RuntimeError("planted")
+
+    recorder = Recorder()
+    with pytest.raises(RuntimeError, match="planted"):
+        ur.optimize(problem(), "plain", steps=2, callbacks=[recorder, Fails()])
+    assert recorder.events[-1] == "error: planted"
+
+
+@pytest.mark.mitsuba
+def test_a_resumed_run_tells_its_callbacks_of_phases_too(tmp_path: Path) -> None:
+    made, recorder = problem(), Recorder()
+    ur.optimize(made, "plain", steps=2, run_directory=tmp_path / "run")
+    ur.resume(tmp_path / "run", made, steps=3, callbacks=[recorder])
+    assert recorder.events.count("compiling") >= 1
+    assert recorder.events[-1] == "end"
+
+
+def test_every_event_is_passed_on_and_undefined_ones_cost_nothing() -> None:
+    """`run.shown` upsamples coarse parameters, so it is entered only for overridden events."""
+    assert set(EVENTS) == {name for name in vars(UserCallbacks) if not name.startswith("_")}
+
+    class Run:
+        shown_count = 0
+
+        def shown(self) -> Any:
+            self.shown_count += 1
+            return pytest.MonkeyPatch.context()
+
+    class Steps(Callback):
+        def on_step(self, run: Any, record: dict[str, Any]) -> None:
+            record["seen"] = True
+
+    run: Any = Run()
+    record: dict[str, Any] = {}
+    both = UserCallbacks([Steps(), Steps()])
+    both.before_step(run)
+    both.on_start(run)
+    assert run.shown_count == 0
+    both.on_step(run, record)
+    assert run.shown_count == 1
+    assert record == {"seen": True}
