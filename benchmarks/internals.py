@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from unrender.runs.sensitivity import hardly_seen
 
 import unrender as ur
 from unrender.app.stages import stages_file
@@ -44,6 +43,7 @@ from unrender.rendering.numpy.one_pixel import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.runs import loop
 from unrender.runs.budget import Budget
+from unrender.runs.image_sensitivity import hardly_seen
 from unrender.scene.batches import WholeView
 from unrender.scene.bounds import project
 from unrender.scene.executor import LOCAL

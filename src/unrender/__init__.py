@@ -92,7 +92,6 @@ _HOMES = {
 _MOVED = {
     "Callback": "protocols.Callback",
     "CoarseToFine": "scene.CoarseToFine",
-    "FilteredGradient": "estimators.FilteredGradient",
     "Grid": "io.Grid",
     "HybridGradient": "estimators.HybridGradient",
     "ImportOptions": "app.ImportOptions",

@@ -197,7 +197,6 @@ def test_a_state_that_was_stored_goes_on_as_it_would_have() -> None:
         lambda: ur.PathGradient(CV(), Counts(), spp=4, tolerance=2.0),
         lambda: ur.MetaEstimator(4, 3, pixels=Counts()),
         lambda: ur.MetaEstimator(coupled=True, spp=4, image=CV(), pixels=Counts()),
-        lambda: ur.estimators.FilteredGradient(ur.PathGradient(CV(), Counts(), spp=4)),
     ],
 )
 def test_others_take_different_numbers(made: Any) -> None:

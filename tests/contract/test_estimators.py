@@ -96,9 +96,6 @@ ESTIMATORS: dict[str, Callable[[], Any]] = {
         ur.MetaEstimator(coupled=True, spp=2, image=CV(whole_views=3), pixels=ur.pixels.Adaptive(24, denoiser="none"))
     ),
     "stock": lambda: ur.estimators.StockGradient(spp=2),
-    "filtered": lambda: ur.estimators.FilteredGradient(ur.PathGradient(spp=2)),
-    "filtered, control variate": lambda: ur.estimators.FilteredGradient(ur.PathGradient(CV(), spp=2)),
-    "filtered, coupled": lambda: ur.estimators.FilteredGradient(ur.MetaEstimator(coupled=True, spp=3)),
     "denoised": lambda: ur.PathGradient(Denoised(by="variation"), spp=4),
     "denoised control variate": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=6),
     "denoised, own paths": lambda: ur.PathGradient(Denoised(CV(), by="variation"), spp=1),
@@ -118,7 +115,6 @@ BIASED = {
     "coupled, own paths",
     "coupled, control variate",
     "coupled, control variate, adaptive pixels",
-    "filtered, coupled",
 }
 # A black box's loss is that of noisy images: a test of its own.
 BIASED |= {name for name in ESTIMATORS if "denoised" in name}
@@ -129,8 +125,6 @@ DEAR = {
     "meta, images of F, other statistics",
     "meta, adaptive pixels, other statistics",
     "coupled, other statistics",
-    "filtered",
-    "filtered, control variate",
     "Gauss-Newton",
 }
 """Their means take many runs of a few steps each: in the quick tier, the drift of a coupled gradient stands for them."""

@@ -25,7 +25,6 @@ from unrender.app.distributed.share import ViewShare
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
-from unrender.estimators.filtered import FilteredGradientState
 from unrender.estimators.meta import MetaState
 from unrender.io.resampling import downsample, resize, upsample
 from unrender.io.volumes import write_grid
@@ -51,7 +50,6 @@ PAIRS: dict[str, tuple[Any, Any]] = {
     "uniform": (ur.PathGradient(pixels=ur.pixels.Uniform(16), spp=2), ur.optimizers.Adam(0.02)),
     "loss": (ur.PathGradient(pixels=ur.pixels.LossProportional(16, refresh=4, denoiser="none"), spp=2), ur.optimizers.Adam(0.02)),
     "views": (ur.PathGradient(image=rcv(), pixels=ur.pixels.Views(1), spp=2), ur.optimizers.Adam(0.02)),
-    "filtered": (ur.estimators.FilteredGradient(ur.PathGradient(image=rcv(), spp=2)), ur.optimizers.Adam(0.02)),
     "momentum": (ur.PathGradient(spp=2), ur.optimizers.SGD(0.5, momentum=0.9)),
 }  # fmt: skip
 
@@ -175,11 +173,6 @@ def at_the_change(name: str, states: str, steps: int = 5) -> tuple[Any, Any, Any
     return *before, run, run.state
 
 
-def innermost(state: Any) -> Any:
-    """The state itself; of a filtered gradient that of its second half."""
-    return state.halves[1] if isinstance(state, FilteredGradientState) else state
-
-
 def held(state: ChainState, field: str) -> np.ndarray:
     """What a transform of the chain holds of the parameter."""
     return next(getattr(part, field)[KEY] for part in state.states if hasattr(part, field))
@@ -205,9 +198,9 @@ def test_carried_states_are_the_hand_upsampled_ones(name: str) -> None:
         second, before_second = (held(state, "second_moment") for state in (new, old))
         np.testing.assert_allclose(second, by_hand(before_second, SQUARES), rtol=1e-10)
         assert new.begun == 0
-    old, new = innermost(before.estimator), innermost(memory.estimator)
+    old, new = before.estimator, memory.estimator
     image, past = new.image, old.image
-    if name in ("rcv", "coupled", "filtered", "views"):
+    if name in ("rcv", "coupled", "views"):
         np.testing.assert_allclose(image.parameters[KEY], by_hand(past.parameters[KEY]), rtol=1e-12)
         assert image.views is past.views
     if name in ("adaptive", "loss"):
@@ -258,8 +251,8 @@ def test_reset_states_know_nothing_but_the_step(name: str) -> None:
     for field in ("first_moment", "second_moment", "velocity"):
         if any(hasattr(part, field) for part in fresh.states):
             np.testing.assert_array_equal(held(memory.optimizer, field), np.zeros(TRUTH.shape))
-    fresh = innermost(estimator.init(run.problem, run.parameters))
-    assert repr(innermost(memory.estimator).image) == repr(fresh.image)
+    fresh = estimator.init(run.problem, run.parameters)
+    assert repr(memory.estimator.image) == repr(fresh.image)
     if isinstance(memory.estimator, MetaState):
         assert memory.estimator.parameters is None
         assert not memory.estimator.elements

@@ -38,7 +38,6 @@ ESTIMATORS = {
     "rcv of mini-batches": lambda: ur.PathGradient(
         RCV(whole_views=3, learn_from_draws=False), pixels=ur.pixels.Uniform(40), spp=2
     ),
-    "filtered": lambda: ur.estimators.FilteredGradient(ur.PathGradient(RCV(), spp=2)),
 }
 
 
@@ -173,7 +172,7 @@ def test_auto_chooses_the_same_whoever_has_the_views() -> None:
     assert apart(alone, together) < 1e-12
 
 
-@pytest.mark.parametrize("name", ["plain", "rcv", "coupled", "rcv of mini-batches", "filtered", "adaptive"])
+@pytest.mark.parametrize("name", ["plain", "rcv", "coupled", "rcv of mini-batches", "adaptive"])
 def test_a_share_that_is_lost_changes_nothing(name: str) -> None:
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
     whole, broken = dealt(problem, 2), dealt(problem, 2, lose=(5, 9, 10, 16))

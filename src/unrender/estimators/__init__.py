@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from unrender.core import lazy
 
 if TYPE_CHECKING:
-    from unrender.estimators.filtered import FilteredGradient
     from unrender.estimators.gauss_newton import GaussNewton
     from unrender.estimators.hybrid import HybridGradient
     from unrender.estimators.loss_values import LossValues
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 __getattr__, _ = lazy.attach(
     __name__,
     {
-        "FilteredGradient": "filtered",
         "GaussNewton": "gauss_newton",
         "HybridGradient": "hybrid",
         "LossValues": "loss_values",
@@ -28,7 +26,6 @@ __getattr__, _ = lazy.attach(
     },
 )
 __all__ = [
-    "FilteredGradient",
     "GaussNewton",
     "HybridGradient",
     "LossValues",

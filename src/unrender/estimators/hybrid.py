@@ -104,7 +104,7 @@ class HybridGradient:
     would take steps longer than its learning rate. The loss is that of `path`.
 
     Args:
-        path: an estimator of path gradients: `PathGradient`, `MetaEstimator`, or `FilteredGradient` of one.
+        path: an estimator of path gradients: `PathGradient` or `MetaEstimator`.
         perturbed: of order "gradient", with `sigma` for the perturbed parameters; or `GaussNewton`.
         keys: the perturbed parameters; None for all poses and all parameters without a path gradient.
         averaged: for `MetaAdam`, which has no momentum: the gradient by the perturbed parameters is the running mean of about ten steps,

@@ -18,7 +18,6 @@ from unrender.app.distributed.worker_state import Memories, Memory, Outbox, Reci
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.estimators.filtered import FilteredGradient
 from unrender.estimators.meta import MetaEstimator
 from unrender.estimators.path import PathGradient
 from unrender.estimators.sample_groups import GradientRequest, GradientSample
@@ -97,29 +96,26 @@ class DistributedExecutor:
     # ------------------------------------------------------------------ Executor
 
     def check(self, estimator: Any) -> None:
-        inner = estimator
-        while isinstance(inner, FilteredGradient):
-            inner = inner.inner
-        name = type(inner).__name__
-        if not isinstance(inner, (PathGradient, MetaEstimator)):
+        name = type(estimator).__name__
+        if not isinstance(estimator, (PathGradient, MetaEstimator)):
             raise InputError(
                 f"{name} renders all views of a problem itself, so they cannot be dealt to workers; "
                 "methods plain, rcv, meta, coupled, adaptive and most choices of auto can"
             )
-        if getattr(inner, "differential_bsdf", False):
+        if getattr(estimator, "differential_bsdf", False):
             raise InputError(f"{name}: differential_bsdf is not supported by workers; leave it out")
-        if getattr(inner, "emitters", "scene") == "adaptive":
+        if getattr(estimator, "emitters", "scene") == "adaptive":
             raise InputError(f'{name}: emitters="adaptive" is not supported by workers; leave emitters="scene"')
-        if isinstance(inner.pixels, AdaptiveCounts):
+        if isinstance(estimator.pixels, AdaptiveCounts):
             raise InputError(
                 f"{name}: pixels=AdaptiveCounts(...) is not supported by workers; use unrender.pixels.All()"
             )
-        image = inner.image.inner if isinstance(inner.image, Denoised) else inner.image
+        image = estimator.image.inner if isinstance(estimator.image, Denoised) else estimator.image
         if not isinstance(image, (Plain, RecursiveControlVariate)):
             raise InputError(
                 f"{name}: the memory of {type(image).__name__} cannot be distributed to workers; use another image estimator"
             )
-        if isinstance(inner, MetaEstimator) and not (isinstance(inner.pixels, All) or isinstance(image, Plain)):
+        if isinstance(estimator, MetaEstimator) and not (isinstance(estimator.pixels, All) or isinstance(image, Plain)):
             raise InputError(
                 f"{name}: a control variate of images and mini-batches of pixels at once cannot be dealt to workers; leave out one"
             )
