@@ -57,7 +57,7 @@ def test_means_of_a_resumed_run_are_those_of_one_run(tmp_path: Path) -> None:
     run(steps=70, run_directory=tmp_path / "run")
     resumed = ur.resume(tmp_path / "run", steps=120, problem=problem())
     assert np.array_equal(resumed.parameters["gain"], whole.parameters["gain"])
-    assert np.array_equal(resumed.standard_error["gain"], whole.standard_error["gain"])
+    assert str(resumed.standard_error) == str(whole.standard_error)
     assert not np.array_equal(resumed.parameters["gain"], resumed.last["gain"])
 
 

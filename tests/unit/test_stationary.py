@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -21,10 +23,26 @@ def wandering(correlation: float, seed: int = 0, steps: int = STEPS) -> np.ndarr
     return values
 
 
-@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
-def test_standard_errors_of_a_mean_cover_it(correlation: float) -> None:
+def oscillating(period: float = 60.0, decay: float = 30.0, seed: int = 0) -> np.ndarray:
+    """Return sequences like `wandering` of order 2, as steps with momentum give."""
+    generator = np.random.default_rng(seed)
+    shrink = np.exp(-1.0 / decay)
+    values = np.zeros((RUNS, 2 * STEPS))
+    news = generator.standard_normal(values.shape)
+    for step in range(2, 2 * STEPS):
+        values[:, step] = 2.0 * shrink * np.cos(2.0 * np.pi / period) * values[:, step - 1] + news[:, step]
+        values[:, step] -= shrink**2 * values[:, step - 2]
+    return values[:, STEPS:] / values.std()
+
+
+@pytest.mark.parametrize(
+    "paths",
+    [lambda: wandering(0.0), lambda: wandering(0.5), lambda: wandering(0.9), oscillating],
+    ids=[0, 0.5, 0.9, "waves"],
+)
+def test_standard_errors_of_a_mean_cover_it(paths: Callable[[], np.ndarray]) -> None:
     """Of 400 sequences, some 68 % are within one standard error. 8 % are 3.4 standard deviations of that number."""
-    found = [mean for x in wandering(correlation) if (mean := stationary.stationary_mean(x)) is not None]
+    found = [mean for x in paths() if (mean := stationary.stationary_mean(x)) is not None]
     assert len(found) > 0.95 * RUNS
     inside = np.mean([abs(mean.value) < mean.error for mean in found])
     assert inside == pytest.approx(0.68, abs=0.08)

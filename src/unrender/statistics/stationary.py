@@ -14,8 +14,11 @@ _FEW = 4.0
 """Length of a window relative to its correlation time up to which it shows no mean."""
 _DIFFERENT = 2.0
 """Standard errors between the means of two parts of a window from which it is not stationary."""
-_LONGEST = 0.7
-"""Largest fraction of a sequence whose autocovariances are summed."""
+_CROSSING_TIMES = 4
+"""Largest lag of the autocovariances that are summed, in units of the lag at which they first reach 0."""
+_LOST, _LARGEST_LOSS = 1.25, 0.7
+"""Fraction of the variance that is lost to the subtracted mean, in units of the largest lag over the length, and its limit. Source: the
+coverage of the mean of autoregressive and of oscillating sequences."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,9 @@ def stationary_mean(sequence: np.ndarray) -> StationaryMean | None:
 def long_run_variance(values: np.ndarray) -> tuple[float, float]:
     """Return n times the variance of the mean of n correlated values (n,), and their correlation time, which is 1 for independent ones.
 
-    The autocovariances up to some lag M are summed: in pairs, until a pair is not positive (Geyer 1992). The mean that is subtracted
-    makes the sum of all of them smaller by (2 M + 1) / n, which is corrected.
+    The autocovariances up to some lag K are summed with the weights 1 − l / (K + 1) (Bartlett). K is four times the lag at which they
+    first reach 0 (the pairs of Geyer 1992), since values that oscillate are anticorrelated beyond it. The mean that is subtracted makes
+    the sum smaller by a fraction of about K / n, which is corrected.
     """
     n = len(values)
     spectrum = np.fft.rfft(values - values.mean(), 2 * n)
@@ -73,10 +77,12 @@ def long_run_variance(values: np.ndarray) -> tuple[float, float]:
     if covariances[0] <= 0.0:
         return 0.0, 1.0
     pairs = covariances[: n - n % 2].reshape(-1, 2).sum(axis=1)
-    ends = np.flatnonzero(pairs <= 0.0)
-    count = int(ends[0]) if ends.size else len(pairs)
-    total = max(2.0 * pairs[:count].sum() - covariances[0], 0.0) / (1.0 - min((4 * count - 1) / n, _LONGEST))
-    return float(total), float(total / covariances[0])
+    crossing = 2 * int(np.argmax(pairs <= 0.0)) if (pairs <= 0.0).any() else n
+    lags = np.arange(1, min(_CROSSING_TIMES * crossing, n // 2) + 1)
+    width = len(lags) + 1
+    total = float(covariances[0] + 2.0 * ((1.0 - lags / width) @ covariances[lags]))
+    total = max(total, 0.0) / (1.0 - min(_LOST * width / n, _LARGEST_LOSS))
+    return total, total / float(covariances[0])
 
 
 def _without_trend(values: np.ndarray) -> np.ndarray:
