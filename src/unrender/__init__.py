@@ -1,4 +1,4 @@
-"""unrender: recover what a scene is made of from images of it.
+"""unrender: inverse rendering on Mitsuba 3. Recovers parameters of a scene from images.
 
     import unrender as ur
 

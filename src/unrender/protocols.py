@@ -1,7 +1,7 @@
-"""What components are, for those who write their own: protocols, and the types that their methods take and return.
+"""Protocols of components, for those who write their own, and the types that their methods take and return.
 
 No class needs to inherit from a protocol: an object that has its methods is one (`typing.Protocol`). `Callback` is a base class, whose
-methods do nothing until they are overridden. Estimators say by capability types what they provide, optimizers what they require.
+methods do nothing until they are overridden. Estimators state by capability types what they compute, optimizers what they require.
 """
 
 from unrender.estimators.base import Estimate, Estimator

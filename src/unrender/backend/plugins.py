@@ -5,7 +5,7 @@ The resolver starts with the current directory, and `mitsuba.load_file` puts the
 could thus execute code in its own folder. A name that no folder has is looked up once more in the current directory, and a type such as
 `../x` or `/tmp/x` leaves the folder `plugins`.
 
-So Mitsuba's own folder comes first for the entire process (`prefer_own`), scenes are loaded with no other folder (`only`), and the names
+So Mitsuba's own folder comes first for the entire process (`prefer_own`), and scenes are loaded with no other folder (`only`). The names
 of types are checked before Mitsuba reads them (`check_type`).
 """
 

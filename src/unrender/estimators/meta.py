@@ -97,8 +97,8 @@ class MetaEstimator:
     paths, so ΔF is unbiased. But F and ΔF then share the noise of an image, and the variance by Eq. 8, which assumes independence,
     lacks their covariance.
 
-    The coupled form, an extension of the paper, computes F and the previous state's H from the same `spp` samples, and M = F + w (M −
-    H) with w from their covariance. Each sample serves both terms, at little more than the cost of a plain gradient. With
+    The coupled form, an extension of the paper, computes F and the previous state's H from the same `spp` samples. M = F + w (M − H) with
+    w from their covariance. Each sample serves both terms, at little more than the cost of a plain gradient. With
     `image=RecursiveControlVariate()` the images that the loss sees have a control variate too, from the same passes. For mini-batches
     it is that of the last full views, which costs an additional pass for the intermediate state.
 

@@ -92,8 +92,8 @@ def room(walls: dict[str, Any], left: dict[str, Any], right: dict[str, Any]) -> 
 def uplight(place: Vector, radiance: Sequence[float], name: str = "lamp") -> dict[str, Any]:
     """Return a lamp that lights the ceiling: a small square light at the bottom of a wide box that is open at the top.
 
-    Light leaves over the edge of the box and reaches a ceiling 2 above it within 2 (half + opening) / height - half = 0.94 of the lamp's
-    axis, so walls farther away get none of it. The sides are visible from outside only; inside they are black.
+    Light leaves over the edge of the box. It reaches a ceiling 2 above it within 2 (half + opening) / height - half = 0.94 of the lamp's
+    axis, so no wall farther away is lit directly. The sides are visible from outside only; inside they are black.
 
     Args:
         place: centre of the light.

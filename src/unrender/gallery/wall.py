@@ -1,7 +1,7 @@
 """Problem `wall`: an image of few texels that fills the film, lit by indirect light only.
 
 The simplest texture problem with noise. Sixteen pixels show every texel, and the best step of each is nearly known from the image alone.
-Whatever a method needs beyond a few steps of the right length, it needs because of the noise.
+Without noise, a few steps of the right length would suffice.
 """
 
 from __future__ import annotations

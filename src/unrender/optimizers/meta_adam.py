@@ -23,8 +23,8 @@ class MetaAdam(Recipe):
 
     Adam divides by the root mean square of many gradients, which it assumes to be independent. A meta-estimate is already an average, and
     correlated with earlier ones. Here the divisor is the standard deviation of the current gradient. Where noise dominates, the step is
-    about η at most. Where many samples agree, it grows with their number, up to η √n after n steps of a constant gradient (Var g is the
-    mean square of a sample), and decreases as soon as the gradient or the weight of the past becomes small. So learning rates are lower
+    about η at most. Where many samples agree, it grows with their number: up to η √n after n steps of a constant gradient, where Var g is
+    the mean square of a sample. It decreases when the gradient or the weight of the past becomes small. So learning rates are lower
     than Adam's, and one learning rate serves the start and the end of a run.
 
     The noise of successive meta-estimates is correlated, so the steps of a noisy element do not average out. After n steps with full

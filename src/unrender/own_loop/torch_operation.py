@@ -14,7 +14,7 @@ Backward = Callable[[tuple[Any, ...]], list[Any]]
 class _Render(torch.autograd.Function):
     """Operation from parameters to images that are already rendered.
 
-    The node refers to what the backward pass needs, and to nothing that refers to the node, so it is freed with the graph of its step.
+    The node refers to the data of the backward pass. None of these refer to the node, so it is freed with the graph of its step.
     """
 
     @staticmethod

@@ -154,8 +154,8 @@ def costs(
     traced.
 
     The cost is 1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor, a path that leaves
-    the scene costs as much as half a vertex in mini-batches of 16384 pixels, and as four in batches of 2048, where launches dominate.) It
-    is estimated from one path per tile, and pooled. Ones if the renderer does not count vertices.
+    the scene costs as much as half a vertex in mini-batches of 16384 pixels. In batches of 2048, where launches dominate, it costs as much
+    as four.) It is estimated from one path per tile, and pooled. Ones if the renderer does not count vertices.
 
     Args:
         problem, parameters: what to render.

@@ -1,6 +1,6 @@
 """Solvers of (C + λ L) y = x on a mesh with graph Laplacian L and vertex multiplicities C, and powers of their inverse.
 
-A *place* is a set of vertices that move together, C is the diagonal matrix of their numbers, and (L x)_i is the sum of x_i − x_j over the
+A *place* is a set of vertices that move together. C is the diagonal matrix of their numbers. (L x)_i is the sum of x_i − x_j over the
 places j that share an edge with place i. For positions, vertices at the same position form one place, so that both sides of a seam of
 texture coordinates or normals move together. For attributes such as colours, each vertex is its own place, and both sides of a seam are
 neighbours.

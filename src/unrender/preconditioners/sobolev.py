@@ -31,7 +31,7 @@ class Sobolev:
     It suits textures with the statistics of photographs, whose power spectra decrease with frequency f as 1/f²: (I + λ L)^-1 is the
     covariance of such a texture at distances beyond √λ texels.
 
-    Supports textures (H, W, C), grids (Z, Y, X, C) and values at the V vertices of a mesh (n V,), where L is that of the mesh's edges and
+    Supports textures (H, W, C), grids (Z, Y, X, C) and values at the V vertices of a mesh (n V,). For a mesh, L is that of its edges, and
     S is approximated to a few percent (`MeshSpectrum`). Computed on the host in float32. The result has the argument's type. For Dr.Jit
     arrays it waits for the device, and copies to and from a GPU. S is symmetric with eigenvalues in [(1 + 4 d λ)^(-1/2), 1].
 

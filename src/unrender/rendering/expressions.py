@@ -85,7 +85,7 @@ class _Reads(Mapping[str, Any]):
 
 
 class ExpressionRenderer(RendererWrapper):
-    """A renderer with unknowns of their own, of which parameters of the scene are functions.
+    """A renderer with additional unknowns; some parameters of the scene are functions of these.
 
     Images and gradients are as unbiased as the inner renderer's: the gradient by an unknown is that by the parameters times the
     derivatives of the functions.
@@ -117,7 +117,7 @@ class ExpressionRenderer(RendererWrapper):
         self._targets = targets
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """Return the unknowns and the parameters of the scene that are no functions."""
+        """Return the unknowns, and the parameters of the scene without an expression."""
         return self._info
 
     def values(self, keys: list[str]) -> Tree:
@@ -184,7 +184,7 @@ class ExpressionRenderer(RendererWrapper):
 
 
 def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknowns: Mapping[str, Any]) -> Renderer:
-    """Return the renderer with expressions, or itself where it has those already or there are none.
+    """Return the renderer with these expressions; the renderer itself if there are none or it already has them.
 
     Args:
         renderer: Renders the scene.

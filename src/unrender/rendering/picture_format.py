@@ -1,4 +1,4 @@
-"""What the pictures of a renderer contain: pixel formats of films, and properties of surfaces in place of radiance (AOVs)."""
+"""Contents of a renderer's pictures: pixel formats of films, and properties of surfaces in place of radiance (AOVs)."""
 
 from __future__ import annotations
 

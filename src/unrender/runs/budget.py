@@ -24,7 +24,7 @@ _END_SHARE, _END_SECONDS = 0.1, 1.0
 _LOOK_SECONDS, _MOST_SLOWDOWN = 0.5, 3.0
 """Seconds between two measurements of the load of the machine; the largest slowdown that is taken into account."""
 _LEAST_SHARE = 0.5
-"""Fraction of the budget that the steps get even if the warm-up takes long, as far as the following limits allow."""
+"""Fraction of the budget that the steps get even if the warm-up takes long, within the following limits."""
 _LATE_SHARE, _LATE_SECONDS, _LATE_COMPILED = 0.1, 3.0, 15.0
 """Time beyond the budget at which everything is finished: a fraction of it plus seconds, or the last number if kernels were compiled."""
 _PAGE_SECONDS = 1.0
@@ -111,7 +111,7 @@ def _warn_of_few_steps(run: Run) -> None:
 
 
 def few_steps(seconds: float, steps: int, most: int | None = None) -> str:
-    """Return a line with advice if a budget allows only so many steps, fewer than 20 and than `most`; else ""."""
+    """Return a line with advice if a budget allows fewer than 20 steps and fewer than `most`; else ""."""
     if steps >= min(_FEW_STEPS, most or _FEW_STEPS):
         return ""
     return (

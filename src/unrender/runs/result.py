@@ -134,7 +134,7 @@ class Result:
 
     @property
     def status(self) -> str:
-        """How the run ended: "finished", "interrupted" or "failed".
+        """End of the run: "finished", "interrupted" or "failed".
 
         A run that used up its budget may also be "worse than start" (the final image is worse than the initial one) or "memory disagrees"
         (a control variate differs from a new image).

@@ -39,7 +39,7 @@ class Executor(Protocol):
         ...
 
     def snapshot(self) -> Any:
-        """Return what the next steps depend on apart from the states, for checkpoints; None if nothing."""
+        """Return the data other than states on which the next steps depend, for checkpoints; None if there is none."""
         ...
 
     def restore(self, saved: Any) -> None:

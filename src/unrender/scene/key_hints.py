@@ -37,9 +37,9 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     able = [name for name, info in known.items() if info.differentiable or info.perturbable]
     owner, _, rest = key.partition(".")
     if rest and owner not in {name.partition(".")[0] for name in known}:
-        alike = [name for name in known if name.endswith("." + rest)]
-        nameless = [name for name in alike if _is_nameless(name)]
-        close = did_you_mean(owner, {name.partition(".")[0] for name in alike if not _is_nameless(name)})
+        similar = [name for name in known if name.endswith("." + rest)]
+        nameless = [name for name in similar if _is_nameless(name)]
+        close = did_you_mean(owner, {name.partition(".")[0] for name in similar if not _is_nameless(name)})
         if nameless and not close:
             others = "" if len(nameless) == 1 else f" ({len(nameless)} objects have none)"
             return f'; nothing has the id {owner}: give the object that holds {rest} id="{owner}"{others}'
@@ -50,9 +50,9 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
             if poses := _poses(near, known):
                 return f"; a pose is {poses} (--method smoothed)"
     # Mitsuba may name the owner after its shape, where a user expects the material: the rest of the key then decides.
-    alike = [name for name in able if name.endswith("." + rest) and not _is_nameless(name)] if rest else []
+    similar = [name for name in able if name.endswith("." + rest) and not _is_nameless(name)] if rest else []
     named = [name for name in able if not _is_nameless(name)]
-    if near := did_you_mean(key, alike, 0.0) or did_you_mean(key, named) or did_you_mean(key, known):
+    if near := did_you_mean(key, similar, 0.0) or did_you_mean(key, named) or did_you_mean(key, known):
         return near
     shown = named or able
     return f"; it has {', '.join(shown[:6])}{' and others' if len(shown) > 6 else ''}" if shown else ""

@@ -1,7 +1,7 @@
 """A problem as stored in a run folder: problem.toml with arrays in files, from which it can be recreated.
 
 A problem with an XML scene becomes a problem file with absolute paths and its arrays in the folder `problem`. A gallery problem becomes
-its name and options. Other problems, made in Python, are described as far as TOML permits.
+its name and options. Other problems, made in Python, are described without what TOML cannot express, such as functions.
 """
 
 from __future__ import annotations

@@ -43,5 +43,5 @@ class View:
 
     @property
     def own_world(self) -> bool:
-        """Whether it shows other values, another scene or another quantity than the problem's scene."""
+        """Return whether the view shows other values, another scene or another quantity than the problem's scene."""
         return self.known is not None or self.scene is not None or self.aov is not None

@@ -1,4 +1,4 @@
-"""Views that see other values or other scenes than the problem's: from what a user gives to sensors of a renderer."""
+"""Views that see other values or other scenes than the problem's, as sensors of one renderer."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from unrender.scene.view_checks import check_sensor
 
 
 def known_keys(views: Sequence[View]) -> list[str]:
-    """Return the keys that any view gives a value of its own."""
+    """Return the keys for which at least one view has its own value."""
     return list(dict.fromkeys(key for view in views if isinstance(view.known, Mapping) for key in view.known))
 
 

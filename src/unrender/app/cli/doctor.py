@@ -74,8 +74,8 @@ def doctor(console: Console | None = None) -> int:
 
 
 def gradient_error() -> float:
-    """Return the relative error of path replay backpropagation for the derivative of a Cornell box's mean brightness by the red wall's
-    albedo, summed over channels, against central differences on the same paths.
+    """Return the relative error of path replay against central differences on the same paths. The derivative is that of a Cornell box's
+    mean brightness by the red wall's albedo, summed over channels.
 
     A variant must be active. The brightness is a cubic polynomial of the albedo at this depth, so the error of the differences is about
     1e-4.

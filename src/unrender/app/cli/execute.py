@@ -69,7 +69,7 @@ def execution(
 ) -> Iterator[dict[str, Any]]:
     """Print the run that starts, and yield its arguments of `optimize`. Its live page ends with the block.
 
-    The run leaves a run folder; an interrupted one is saved as far as it came. `callbacks` listen besides.
+    The run writes a run folder, also if it is interrupted. `callbacks` are called in addition to those of the command.
     """
     plan = order.method.plan(problem, order.settings)
     for line in plan.lines:

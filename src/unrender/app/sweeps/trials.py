@@ -32,8 +32,8 @@ class Started:
 class Trials:
     """A schedule that starts trials in ascending order.
 
-    If trials depend on earlier ones (a search that learns, or pruning), trial i depends on trials 0 to i - window alone, whatever else
-    has ended by then, and starts after these have ended. Therefore the results of the sweep are the same for any number of workers.
+    If trials depend on earlier ones (a search that learns, or pruning), trial i depends on trials 0 to i - window only. It starts after
+    these have ended. Therefore the results of the sweep are the same for any number of workers.
 
     Attributes:
         search: the search that proposes settings.

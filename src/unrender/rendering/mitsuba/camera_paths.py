@@ -49,7 +49,7 @@ class CameraPaths:
         self.scene, self.tables, self.sampler, self.ray, self.weight = scene, tables, sampler, ray, weight
 
     def primal(self) -> Callable[[], tuple[Any, Any]]:
-        """Return the kernel, ready to trace the paths: `weighted` makes the sensor's radiance of what it returns."""
+        """Return the kernel with the arguments of these paths. `weighted` converts its result to the sensor's radiance."""
         return self._sample(dr.ADMode.Primal)
 
     def weighted(self, L: Any, Lₚ: Any) -> tuple[Any, Any]:
@@ -62,7 +62,7 @@ class CameraPaths:
         return dropped_together(L * self.weight, Lₚ * self.weight)
 
     def backward(self, *states: tuple[Any, Any]) -> Callable[[], Any]:
-        """Return the kernel, ready to replay the paths backward.
+        """Return the kernel with the arguments of the backward replay of these paths.
 
         Args:
             states: (derivative of the loss by the weighted radiance, weighted radiance of the primal pass) per lane, for the current
@@ -72,14 +72,15 @@ class CameraPaths:
         return self._sample(dr.ADMode.Backward, tuple(replay), is_finite(*(L for _, L in states)))
 
     def forward(self, radiance: Any) -> Callable[[], tuple[Any, Any]]:
-        """Return the kernel, ready to replay the paths forward. It returns the derivative along the tangents, yet to be weighted.
+        """Return the kernel with the arguments of the forward replay of these paths. It returns the derivative along the tangents, without
+        the sensor's weight.
 
         `radiance` is that of the primal pass.
         """
         return self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),), is_finite(radiance))
 
     def connections(self, radiance: Any, weights: Any, noise: Any, bounces: int) -> Callable[[], ConnectionRecord]:
-        """Return the kernel, ready to record each lane's connections to emitters. `radiance`: as for `forward`."""
+        """Return the kernel with the arguments that record each lane's connections to emitters. `radiance`: as for `forward`."""
         assert isinstance(self._kernel, PathPair)
         record = ConnectionRecord(weights * self.weight, noise * self.weight, bounces)
         replay = ReplayState(None, self._replayed(radiance))
@@ -87,7 +88,7 @@ class CameraPaths:
         return functools.partial(self._kernel.record_connections, *camera, replay, record, is_finite(radiance))
 
     def vertices(self) -> Callable[[], Any]:
-        """Return the kernel, ready to count the vertices of each lane's path."""
+        """Return the kernel with the arguments that count the vertices of each lane's path."""
         camera = self.scene, self.tables, self.sampler, self.ray
         return functools.partial(self._kernel.vertices, *camera, self._geometry)
 

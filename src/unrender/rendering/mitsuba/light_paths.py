@@ -1,4 +1,4 @@
-"""Depth, Russian roulette and emitter visibility of the light paths that a scene's integrator asks for."""
+"""Depth, Russian roulette and emitter visibility of light paths, from the settings of a scene's integrator."""
 
 from __future__ import annotations
 
