@@ -362,7 +362,7 @@ def table(record: Record) -> str:
         f"start. The loop is the best of {tuned} settings, the column `auto` has none set.",
         markdown.table(f"{head} | auto there | faster | tuned | compile", rows),
         f"Geometric mean over the {len(problems)} problems: **{mean:.2f}** times as fast, where `auto` never gets "
-        f"there as if it did at the end. Ahead at the end on {sum(e['auto'][-1] < e['loop'][-1] for e in entries)}."
+        f"there as if it did at the end. Lower final error on {sum(e['auto'][-1] < e['loop'][-1] for e in entries)}."
         + _of_tuning(entries, settings["seconds"]),
     )
 

@@ -100,5 +100,5 @@ def table(record: Record) -> str:
         errors = (" ".join(f"{error:.3f}" for error in entry[side]) for side in ("loop", "auto"))
         speed = f"**{entry['speed']:.2g}**" if entry["speed"] else "below 1"
         rows.append([markdown.fill(words, entry), *errors, speed, entry["seeds"]])
-    head = "problem | budget | the loop's setting | loop, at tenths | auto, at tenths | times as early | seeds"
+    head = "problem | budget | the loop's setting | loop, at tenths | auto, at tenths | speed-up | seeds"
     return markdown.table(head, rows)

@@ -299,7 +299,7 @@ def _check_llvm() -> None:
 
 
 def _describe_llvm(version: tuple[int, ...] | None, library: str | None) -> str:
-    """Describe the unusable LLVM: loaded as `version`, or configured by the path `given`."""
+    """Describe the unusable LLVM: loaded as `version`, or configured by the path `library`."""
     if library:
         path = Path(library)
         major = version[0] if version else llvm.identify(path).major

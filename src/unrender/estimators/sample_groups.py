@@ -81,13 +81,13 @@ class GradientRequest:
 
     Attributes:
         parameters: Current parameters.
-        image, state: Image estimator and its state. The state advances where whole views are rendered.
+        image, state: Image estimator and its state. The state advances where full views are rendered.
         spp: Samples per pixel of the image.
         key: Random numbers of the step.
         adjoint_spp: Samples per pixel of the adjoint if it has paths of its own; None for `spp` where there is one group.
         pair_request: Requests the gradient of the previous state, on the same paths and weighted by its own images. With its
             `difference_spp` both are on separate paths, weighted by the images of all groups, which are independent of them.
-        batch: Pixel mini-batch, rendered in one launch for all views; None for whole views.
+        batch: Pixel mini-batch, rendered in one launch for all views; None for full views.
         tolerance: See `PathGradient`.
         fresh: Whether to add the gradient from this step's samples alone.
         emitters: Selection probabilities of emitters; None for the scene's own.

@@ -29,7 +29,7 @@ def is_outside_allowed() -> bool:
 
 
 def allow(everything: bool) -> bool:
-    """Allow outside files for this process and its children if `wanted`. Returns `wanted`."""
+    """Allow outside files for this process and its children if `everything` is true. Returns `everything`."""
     if everything:
         os.environ[VARIABLE] = "1"
     return everything

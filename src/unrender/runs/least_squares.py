@@ -296,7 +296,7 @@ def _check(numbers: _Numbers, until: float) -> NumbersCheck:
 
 
 def _directions(differences: _Differences, limits: np.ndarray, change: float) -> np.ndarray:
-    """Return directions (n, n) along which the pictures change independently and by `wanted`, within the limits."""
+    """Return directions (n, n) along which the pictures change independently and by `change`, within the limits."""
     matrix = differences.matrix()
     units = np.sqrt(np.maximum(np.diag(matrix), 1e-12 * np.abs(matrix).max())) + 1e-300
     eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))

@@ -166,7 +166,7 @@ def use_variant(name: str, threads: int | None = None) -> str:
 
 
 def check_file(name: str) -> None:
-    """Raise `InputError` for a problem file that is not there, or whose fields are not as expected, before what takes long to import."""
+    """Raise `InputError` for a problem file that is not there, or whose fields are invalid, before the slow imports."""
     file = Path(name)
     if file.suffix.lower() != ".toml":
         return

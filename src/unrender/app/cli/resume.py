@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from unrender.app.cli import arguments, dealing, stages
+from unrender.app.cli import arguments, distribution, stages
 from unrender.app.cli.arguments import AllowOutside, Insecure, Threads, WorkersOption
-from unrender.app.cli.dealing import Compress
+from unrender.app.cli.distribution import Compress
 from unrender.app.cli.run import conclude
 from unrender.core import phases
 from unrender.core.errors import InputError
@@ -59,16 +59,16 @@ def resume(
             from unrender.runs.live import Live
             from unrender.runs.resume import load_run, resume_run
 
-            processes = dealing.check(workers, compress, insecure)
+            processes = distribution.check(workers, compress, insecure)
             stored = load_run(directory, steps, seconds)
             alone = 1 if stored.method.threads == 1 else None  # such a run is reproducible bit for bit
             running = arguments.use_variant(variant or stored.record.variant or "auto", threads or alone)
             problem = reopen.problem_of(directory)
         introduce(console, problem, running)
         live = Live(directory, problem.name, stored.record.method, stored.record.command)
-        theirs = dealing.variant_again(variant, stored.record)
-        with dealing.dealt(problem, processes, compress, theirs, threads or alone, console) as dealt:
+        theirs = distribution.variant_again(variant, stored.record)
+        with distribution.distributed(problem, processes, compress, theirs, threads or alone, console) as shared:
             listeners, spent = [progress, live], progress.seconds
-            result = resume_run(stored, dealt, force, listeners, earlier=spent, began=progress.budget_began)
+            result = resume_run(stored, shared, force, listeners, earlier=spent, began=progress.budget_began)
         live.clear()
         conclude(console, problem, result, directory, progress)

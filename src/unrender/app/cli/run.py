@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from unrender.app.cli import arguments, dealing, stages
+from unrender.app.cli import arguments, distribution, stages
 from unrender.app.cli.arguments import (
     AllowOutside,
     CheckpointEvery,
@@ -23,7 +23,7 @@ from unrender.app.cli.arguments import (
     Variant,
     WorkersOption,
 )
-from unrender.app.cli.dealing import Compress
+from unrender.app.cli.distribution import Compress
 from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
 from unrender.core import phases
 from unrender.core.errors import InputError
@@ -90,7 +90,7 @@ def run(
             from unrender.app.cli.execute import RunOrder, execution, introduce
             from unrender.runs.optimize import optimize
 
-            chosen, processes = _method(method_name), dealing.check(workers, compress, insecure)
+            chosen, processes = _method(method_name), distribution.check(workers, compress, insecure)
             if stages.is_stages(problem):
                 stages.refuse_settings(method_name, values, options, workers)
                 plan = (steps, seconds), seed, out, overwrite, variant, threads, command, checkpoint_every, final_spp
@@ -103,9 +103,9 @@ def run(
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
-            with dealing.dealt(opened, processes, compress, variant, threads, console) as dealt:
+            with distribution.distributed(opened, processes, compress, variant, threads, console) as shared:
                 task = RunOrder(chosen, values, steps, seconds, seed, final_spp, command, options, checkpoint_every)
-                with execution(dealt, task, folder, console, progress) as order:
+                with execution(shared, task, folder, console, progress) as order:
                     result = optimize(**order)
         finally:
             arguments.remove_if_empty(folder)

@@ -82,7 +82,7 @@ class RunTask:
 
 
 def discard_earlier(folder: Path, tasks: Sequence[RunTask]) -> None:
-    """Let no task take an earlier run in its folder for its own."""
+    """Delete earlier runs in the folders of tasks, so that no task continues one."""
     for task in tasks:
         (folder / task.name / RECORD).unlink(missing_ok=True)
 

@@ -99,7 +99,7 @@ class DistributedExecutor:
         name = type(estimator).__name__
         if not isinstance(estimator, (PathGradient, MetaEstimator)):
             raise InputError(
-                f"{name} renders all views of a problem itself, so they cannot be dealt to workers; "
+                f"{name} renders all views of a problem itself, so they cannot be distributed to workers; "
                 "methods plain, rcv, meta, coupled, adaptive and most choices of auto can"
             )
         if getattr(estimator, "differential_bsdf", False):
@@ -117,7 +117,7 @@ class DistributedExecutor:
             )
         if isinstance(estimator, MetaEstimator) and not (isinstance(estimator.pixels, All) or isinstance(image, Plain)):
             raise InputError(
-                f"{name}: a control variate of images and mini-batches of pixels at once cannot be dealt to workers; leave out one"
+                f"{name}: a control variate of images and mini-batches of pixels at once cannot be distributed to workers; leave out one"
             )
         for key in (key for key, unknown in self._problem.unknowns.items() if unknown.remeshing is not None):
             raise InputError(f"{key}: remeshing is not supported in distributed runs; leave it out")

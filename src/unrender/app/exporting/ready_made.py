@@ -46,7 +46,7 @@ class FilesOnly:
         self._placed: list[tuple[Any, str]] = []
 
     def dictionary(self, description: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[str, Any]:
-        """Return `given` with files in place of objects.
+        """Return the description with files in place of objects.
 
         Raises:
             InputError: an object has no description.

@@ -44,9 +44,9 @@ def image(traits: Traits, sampler: PixelSampler) -> tuple[ImageEstimator, str]:
     if requested == "plain":
         return Plain(), "as asked for"
     if requested is None and traits.meshes and linear:
-        return Plain(), "a mesh moves, and the loss is unbiased without a memory"
+        return Plain(), "a mesh moves, and the loss is unbiased without a control variate"
     if requested is None and not renders_half(traits.problem, sampler):
-        return Plain(), "control variates need whole views, half of them a step"
+        return Plain(), "control variates need full views, half of them a step"
     space, obstacle = _shared_space(traits.problem)
     if obstacle and requested is None:
         return Plain(), f"no control variates: {obstacle}"

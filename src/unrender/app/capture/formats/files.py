@@ -50,7 +50,7 @@ def find_picture(folder: Path, name: str) -> Path | None:
 def find_mask(folder: Path, photograph: Path, mask_folder: Path | None, named: str | None = None) -> Path | None:
     """Return the mask of a photograph, or None.
 
-    Search order: only the folder `given`, if there is one; the file that the format names; NAME_mask.png next to the photograph; a
+    Search order: only `mask_folder`, if it is set; the file that the format names; NAME_mask.png next to the photograph; a
     folder named after the photograph's, such as train_mask for train; masks or mask, in `folder` or next to the photograph's folder.
     There it has the photograph's name, with or without the original extension before its own. Longer relative paths of the photograph
     take precedence over its bare name.

@@ -47,7 +47,7 @@ def variant_again(typed: str | None, record: RunRecord) -> str:
 
 
 @contextlib.contextmanager
-def dealt(
+def distributed(
     problem: Problem, workers: Workers | None, compress: bool, variant: str, threads: int | None, console: Console
 ) -> Iterator[Problem]:
     """Yield the problem with its views distributed to workers; the problem itself for None. See `unrender.app.distribute`."""
@@ -63,5 +63,5 @@ def dealt(
 
     with contextlib.ExitStack() as stack:
         with phases.phase("workers"):
-            distributed = stack.enter_context(distribute(problem, workers, compress, variant, threads, tell))
-        yield distributed
+            inner = stack.enter_context(distribute(problem, workers, compress, variant, threads, tell))
+        yield inner
