@@ -170,4 +170,4 @@ def test_a_mini_batch_of_the_default_size_is_not_refused() -> None:
 def test_the_guide_tells_the_schedule_of_sigma_that_the_method_has() -> None:
     text = (GUIDE / "pose.md").read_text()
     default = SmoothedMethod.model_fields["sigma_schedule"].default
-    assert f"| `sigma_schedule` | factor of σ by step; `none` keeps σ | `{default}` |" in text
+    assert f"`sigma_schedule` is `{default}`" in text
