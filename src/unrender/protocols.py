@@ -15,6 +15,7 @@ from unrender.estimators.capabilities import (
     HessianProduct,
     LossFunction,
     PastWeight,
+    ScoreCovariance,
     Smoothing,
     Variance,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "Rendering",
     "SampleRequest",
     "Schedule",
+    "ScoreCovariance",
     "Smoothing",
     "StepTransform",
     "StepUpdate",

@@ -16,6 +16,7 @@ from unrender import images, losses, optimizers, pixels
 from unrender.core.errors import InputError
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
+from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.io import toml_lines
 from unrender.methods import auto as module
 from unrender.methods import method
@@ -181,7 +182,10 @@ def test_what_path_gradients_do_not_reach_is_smoothed(monkeypatch: pytest.Monkey
         raise InputError("no path gradients of map")
 
     monkeypatch.setattr(made.renderer, "prepare", prepare)
-    assert chosen(made) == method("smoothed").start()
+    plan = method("smoothed").plan(made)
+    assert chosen(made) == (plan.estimator, plan.optimizer)
+    assert isinstance(plan.estimator, SmoothedDerivatives)
+    assert plan.estimator.sigma == pytest.approx({"map": 0.2, "gain": 20.0})  # a gain of 50 without an upper bound
     (line,) = method("auto").plan(made).reasons
     assert line == "derivatives of a smoothed loss (method smoothed): no path gradients of map"
 
@@ -331,8 +335,9 @@ def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(m
     rigid = {key: dataclasses.replace(of, viewpoint=True, rigid=True) for key, of in known.items()}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: rigid)
     estimator, optimizer = chosen(problem())
-    assert estimator == GaussNewton(CONSTANTS.image_spp[1], CONSTANTS.image_spp[1] // CONSTANTS.per_derivative)
+    spp, largest = CONSTANTS.image_spp[1], dict.fromkeys(("map", "gain"), 0.2 * CONSTANTS.pose_reach)
+    assert estimator == GaussNewton(spp, spp // CONSTANTS.per_derivative, largest=largest)
     assert isinstance(optimizer, optimizers.AveragedNewton)
-    assert chosen(problem(losses.L1()), tolerance=3, spp=40)[0] == GaussNewton(40, 5, tolerance=3.0)
+    assert chosen(problem(losses.L1()), tolerance=3, spp=40)[0] == GaussNewton(40, 5, tolerance=3.0, largest=largest)
     for settings in ({"image": "plain"}, {"pixels": 8}):
         assert isinstance(chosen(problem(), **settings)[1], optimizers.Adam)

@@ -14,7 +14,7 @@ from unrender import optimizers
 from unrender.core import phases
 from unrender.estimators.path import PathGradient
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs import final_images
+from unrender.runs import final_images, least_squares
 from unrender.runs.callbacks import Callback
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
@@ -87,16 +87,22 @@ def test_final_pictures_take_a_twentieth_of_the_time(
     assert {view for view, _ in asked} == set(range(views))
 
 
-def test_a_machine_without_time_left_makes_the_least_pictures_and_looks_no_further(
+def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_for_half_a_second(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = problem()
-    monkeypatch.setattr(final_images, "sensitivity", lambda *_, **__: pytest.fail("there is no time for it"))
+    """A wrong number is told however late it is."""
+    made, allowed = problem(), []
+    monkeypatch.setattr(final_images, "slowdown", lambda: 1.0)
+    monkeypatch.setattr(final_images, "sensitivity", lambda *_, seconds, **__: allowed.append(seconds) or {})
+    monkeypatch.setattr(
+        final_images, "check_numbers", lambda *given: allowed.append(given[3]) or least_squares.NumbersCheck()
+    )
     values = {"wall": np.full(3, 0.4, np.float32)}
     found = final_images.render_final_images(made, Result(values, values, [{}], 30.0, 0.0, "steps"), left=lambda: -1.0)
     assert found.spp == 2 * final_images._pass_spp(made)
     assert set(found.errors) == {"view0/initial", "view0/result"}
     assert not found.sensitivity
+    assert sum(allowed) == pytest.approx(0.6)
 
 
 def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:

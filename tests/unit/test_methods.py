@@ -127,7 +127,7 @@ def test_none_is_none():
         ("plain", {"beta_1": "1"}, "option beta_1: expected a number of at least 0 and below 1, got '1'"),
         ("rcv", {"space": "paths"}, "method rcv: option space: expected path or primary, got 'paths'"),
         ("smoothed", {"sigma": "-1"}, "method smoothed: sigma: expected a number above 0, got '-1'"),
-        ("smoothed", {"sigma": -1}, "option sigma: expected a number above 0 or text, got -1"),
+        ("smoothed", {"sigma": -1}, "option sigma: expected a number above 0 or text or none, got -1"),
         ("smoothed", {"sigma": "a.b=1"}, "method smoothed: sigma: expected a number for the other parameters too"),
         ("smoothed", {"sigma": "0.1, a.b=wide"}, "method smoothed: sigma: expected a number above 0, got 'wide'"),
         ("smoothed", {"joint": "maybe"}, "option joint: expected true or false, got 'maybe'"),

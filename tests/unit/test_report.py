@@ -216,7 +216,7 @@ def test_numbers_have_their_standard_errors(tmp_path):
     text = Page(report.page(run)).words
     assert f"{formatting.number(-0.3)} ± 0.012, 0.4 ± 0.034" in text
     assert "1.25 ±" not in text
-    assert "one standard error of the noise" in text
+    assert "one standard error, from the noise" in text
 
 
 def test_a_texture_refined_on_the_way_is_shown_without_an_error(tmp_path):

@@ -340,6 +340,40 @@ def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, count: in
         assert result.status == "finished"
 
 
+SHORT = "has hardly improved since step"
+
+
+@pytest.mark.parametrize("steps", [40, pytest.param(60, marks=pytest.mark.slow)])
+def test_light_that_no_unknown_explains_is_told_in_short_runs(steps: int) -> None:
+    for seed in range(2):
+        parts = ur.GaussNewton(256, 16), ur.optimizers.AveragedNewton()
+        result = ur.optimize(smooth(0.5, seed), *parts, steps=steps, seed=seed)
+        assert any(SHORT in line for line in result.warnings), (seed, result.verification)
+        assert result.status == "finished"
+
+
+@pytest.mark.parametrize(
+    ("steps", "count"), [(10, 2), *(pytest.param(n, 20, marks=pytest.mark.slow) for n in (10, 24, 48))]
+)
+def test_short_runs_that_converge_or_are_under_way_have_nothing_unexplained(steps: int, count: int) -> None:
+    """Gauss-Newton steps arrive, and those of Adam are under way, also with references whose noise is a tenth of the picture."""
+    for seed in range(count):
+        problem = smooth(0.0, seed)
+        if seed % 2:
+            noise = 0.1 * np.random.default_rng(seed).standard_normal((WIDE, WIDE, 3))
+            problem = ur.Problem(
+                problem.renderer,
+                [ur.Parameter("x", initial=np.full(9, 0.5))],
+                [ur.View(np.asarray(problem.views[0].reference) + noise)],
+            )
+        for parts in (
+            (ur.GaussNewton(256, 16), ur.optimizers.AveragedNewton()),
+            (ur.PathGradient(spp=256), ur.optimizers.Adam(0.02)),
+        ):
+            result = ur.optimize(problem, *parts, steps=steps, seed=seed)
+            assert not any(SHORT in line or UNEXPLAINED in line for line in result.warnings), (seed, result.warnings)
+
+
 class Folded(AnalyticRenderer):
     """Linear in x³ - 3 x, which has two extrema."""
 

@@ -50,7 +50,13 @@ def duration(seconds: float | None) -> str:
     return f"{rounded // 3600} h {rounded % 3600 // 60:02d} min"
 
 
-def values(array: np.ndarray, standard_error: Sequence[float] | None = None) -> str:
+def deviation(standard_error: float | None) -> str:
+    """Format a standard error: 0.012; "not determined" for None and infinity."""
+    finite = standard_error is not None and math.isfinite(standard_error)
+    return number(standard_error) if finite else "not determined"
+
+
+def values(array: np.ndarray, standard_error: Sequence[float | None] | None = None) -> str:
     """Format an array's elements, few of them with their standard errors; of many the least and the largest."""
     if array.size == 0:
         return ""
@@ -58,7 +64,10 @@ def values(array: np.ndarray, standard_error: Sequence[float] | None = None) -> 
         return " … ".join(number(float(value)) for value in (array.min(), array.max()))
     texts = [number(float(value)) for value in array.reshape(-1)]
     if standard_error is not None and len(standard_error) == len(texts):
-        texts = [f"{text} ± {number(error)}" for text, error in zip(texts, standard_error, strict=True)]
+        texts = [
+            f"{text} ± {deviation(error)}" if deviation(error)[0].isdigit() else f"{text} ({deviation(error)})"
+            for text, error in zip(texts, standard_error, strict=True)
+        ]
     return ", ".join(texts)
 
 

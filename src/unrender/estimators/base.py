@@ -22,6 +22,7 @@ from unrender.estimators.capabilities import (
     HessianProduct,
     LossFunction,
     PastWeight,
+    ScoreCovariance,
     Smoothing,
     Variance,
 )
@@ -104,8 +105,8 @@ def as_numpy(estimate: Estimate) -> Estimate:
                 return FreshGradient(trees.numpy(values))
             case Hessian(matrix):
                 return Hessian(arrays.numpy(matrix))
-            case HessianNoise(matrix):
-                return HessianNoise(arrays.numpy(matrix))
+            case HessianNoise(matrix) | ScoreCovariance(matrix):
+                return replace(capability, matrix=arrays.numpy(matrix))
         return capability
 
     converted = tuple(convert(capability) for capability in estimate.capabilities)

@@ -94,6 +94,18 @@ class HessianNoise(Capability):
 
 
 @dataclass(frozen=True)
+class ScoreCovariance(Capability):
+    """Covariance of the loss gradient from the references' noise, as the residual shows it.
+
+    Attributes:
+        matrix: (n, n), see `statistics.scores.covariance`; noise may give it negative eigenvalues.
+    """
+
+    name: ClassVar[str] = "score_covariance"
+    matrix: Array
+
+
+@dataclass(frozen=True)
 class HessianProduct(Capability):
     """Products of the Hessian of the loss with vectors.
 

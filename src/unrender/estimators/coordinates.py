@@ -18,6 +18,7 @@ from unrender.estimators.capabilities import (
     HessianNoise,
     HessianProduct,
     LossFunction,
+    ScoreCovariance,
     Smoothing,
     Variance,
 )
@@ -72,9 +73,9 @@ def _second_order(
             J, term = _flat(slopes, parameters), _curvature_term(gradient, problem, parameters)
             full = J[:, None] * arrays.numpy(matrix).astype(np.float64) * J + np.diag(term)
             return Hessian(full)
-        case HessianNoise(matrix):
+        case HessianNoise(matrix) | ScoreCovariance(matrix):
             J = _flat(slopes, parameters)
-            return HessianNoise(J[:, None] * arrays.numpy(matrix).astype(np.float64) * J)
+            return replace(capability, matrix=J[:, None] * arrays.numpy(matrix).astype(np.float64) * J)
         case HessianProduct(apply):
             curvatures = problem.coordinates.curvatures(parameters)
 

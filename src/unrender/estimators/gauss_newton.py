@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -15,7 +15,15 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise, Smoothing
+from unrender.estimators.capabilities import (
+    Capabilities,
+    Gradient,
+    Hessian,
+    HessianNoise,
+    ScoreCovariance,
+    Smoothing,
+)
+from unrender.estimators.derivative_images import LossWeights, noise_weights, products, running_mean, squared_slope
 from unrender.estimators.gradient_sum import damping, smoothed_variance
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
@@ -23,14 +31,10 @@ from unrender.scene.upsampling import Upsampler
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
-_VALUES = 1 << 22
-"""Maximum number of image values that are converted to double precision at once."""
 _SETTLED = 0.5
 """Maximum step, in units of the widths, after which the shift is halved."""
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
 """Stream of `explained`, and relative eigenvalue below which its matrix counts as singular."""
-_MEMORY = 0.3
-"""Weight of the latest image in the running mean of the variance."""
 _IMAGE = 2
 """Stream of a view's key for the image. Lower streams are for the two halves of the derivative images."""
 
@@ -65,7 +69,8 @@ class GaussNewton:
     J is the central difference of renders with the same random numbers, at ± a width. The width of each parameter is chosen so that
     both renders differ from the image as much as a shift by `shift` pixels would. It is also the unit of trust regions (`Smoothing`).
     Images and derivative images have independent samples. H is the symmetrised product of two independent halves of the derivative
-    images, so no product contains squared noise. Their difference estimates what noise would add (`HessianNoise`).
+    images, so no product contains squared noise. Their difference estimates what noise would add (`HessianNoise`). The residuals of two
+    halves of the image give the gradient's covariance from the references' noise (`ScoreCovariance`).
 
     Bias: J is the derivative averaged over ± the width, so g and H are those of nearby parameters. The expected gradient vanishes where
     the expected image equals the reference, for a loss whose derivative is linear in the image. H neglects the curvature of the image,
@@ -115,8 +120,8 @@ class GaussNewton:
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient, a Hessian and its noise."""
-        return Capabilities(Gradient, Hessian, HessianNoise)
+        """A gradient and its covariance, a Hessian and its noise."""
+        return Capabilities(Gradient, Hessian, HessianNoise, ScoreCovariance)
 
     def init(self, problem: Problem, parameters: Tree) -> GaussNewtonState:
         """Return the state before the first step. Raise `InputError` for a parameter that cannot be perturbed or has a preconditioner,
@@ -145,7 +150,12 @@ class GaussNewton:
         estimate = Estimate(
             system.loss,
             trees.unravel(system.gradient, parameters),
-            (Hessian(system.hessian), HessianNoise(system.noise), Smoothing(dict(state.widths))),
+            (
+                Hessian(system.hessian),
+                HessianNoise(system.noise),
+                ScoreCovariance(system.scores),
+                Smoothing(dict(state.widths)),
+            ),
             {"samples": point.samples, "images": system.images},
         )
         return estimate, self._next(state, system, parameters, _CHANGE)
@@ -194,8 +204,10 @@ def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
     units = np.sqrt(np.abs(np.diag(hessian)))
     if loss <= 0.0 or not np.isfinite(hessian).all() or not units.all():
         return 0.0
-    inverse = np.linalg.pinv(hessian / np.outer(units, units), rcond=_LEAST_EIGENVALUE, hermitian=True)
-    return float(0.5 * (one / units) @ inverse @ (other / units) / loss)
+    eigenvalues, directions = np.linalg.eigh(hessian / np.outer(units, units))
+    used = eigenvalues > _LEAST_EIGENVALUE * eigenvalues[-1]  # noise makes small ones negative
+    along = [directions[:, used].T @ (gradient / units) for gradient in (one, other)]
+    return float(0.5 * np.sum(along[0] * along[1] / eigenvalues[used]) / loss)
 
 
 @dataclass
@@ -204,7 +216,7 @@ class _System:
 
     Attributes:
         loss: loss at the parameters.
-        gradient, hessian, noise: (n,), (n, n), (n, n).
+        gradient, hessian, noise, scores: (n,), (n, n), (n, n), (n, n).
         squares: squared derivative images, summed over their pixels, (n,).
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
         images: images by view.
@@ -215,6 +227,7 @@ class _System:
     gradient: np.ndarray
     hessian: np.ndarray
     noise: np.ndarray
+    scores: np.ndarray
     squares: np.ndarray
     slopes: np.ndarray
     images: dict[int, Array]
@@ -222,7 +235,18 @@ class _System:
 
     @classmethod
     def zero(cls, n: int) -> _System:
-        return cls(0.0, np.zeros(n), np.zeros((n, n)), np.zeros((n, n)), np.zeros(n), np.zeros(n), {})
+        hessian, noise, scores = (np.zeros((n, n)) for _ in range(3))
+        return cls(0.0, np.zeros(n), hessian, noise, scores, np.zeros(n), np.zeros(n), {})
+
+
+@dataclass(frozen=True)
+class _Images:
+    """The image of a view, the variance of its noise, and its two independent halves, (H, W, 3) each."""
+
+    mean: Array
+    variance: Array
+    one: Array
+    other: Array
 
 
 class _Point:
@@ -249,28 +273,27 @@ class _Point:
         for view, sensor_view in enumerate(self.problem.views):
             elements = np.flatnonzero((self._sensors == -1) | (self._sensors == sensor_view.sensor))
             own = key.fold(view)
-            image, variance = self._image(view, own) if derivatives else (None, None)
-            if derivatives:
-                total.images[view] = image
+            images = self._images(view, own) if derivatives else None
+            if images:
+                total.images[view] = images.mean
                 if self.options.noise_limit is not None:
-                    total.variances.append(_running(state.variances, view, arrays.numpy(variance)))
-                total.loss += arrays.number(self.problem.loss_value(view, image))
+                    total.variances.append(running_mean(state.variances, view, arrays.numpy(images.variance)))
+                total.loss += arrays.number(self.problem.loss_value(view, images.mean))
             if not elements.size:
                 continue
             points, distances = self._points(elements, steps)
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
-            slope = _slope(halves)
-            weights = None if image is None else self._weights(view, image, variance)
+            weights = self._weights(view, images) if images else None
             if weights is not None and total.variances:
                 # After the first step, the variances come from earlier images too, so they hardly correlate with the noise of this one.
-                factor = noise_weights(total.variances[view], self.options.noise_limit or math.inf)
-                weights = weights[0] * factor, weights[1] * factor
-            gradient, hessian, noise, squares = _products(halves, distances, weights, int(state.shift))
-            total.gradient[elements] += gradient
-            total.hessian[np.ix_(elements, elements)] += hessian
-            total.noise[np.ix_(elements, elements)] += noise
-            total.squares[elements] += squares
-            total.slopes[elements] += slope
+                weights = weights.times(noise_weights(total.variances[view], self.options.noise_limit or math.inf))
+            found, pairs = products(halves, distances, weights, int(state.shift)), np.ix_(elements, elements)
+            total.gradient[elements] += found.gradient
+            total.hessian[pairs] += found.hessian
+            total.noise[pairs] += found.noise
+            total.scores[pairs] += found.scores
+            total.squares[elements] += found.squares
+            total.slopes[elements] += squared_slope(halves)
         return total
 
     def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -297,99 +320,22 @@ class _Point:
         self.samples += images.shape[0] * images.shape[1] * images.shape[2] * request.spp
         return images
 
-    def _image(self, view: int, key: Key) -> tuple[Array, Array]:
-        """Return the image, and its variance from two halves."""
+    def _images(self, view: int, key: Key) -> _Images:
+        """Return the image and its two halves."""
         halves = [self._states(self.theta[None], view, key.fold(_IMAGE + half), self.options.spp)[0] for half in (0, 1)]
-        mean = 0.5 * (halves[0] + halves[1])
-        return self.problem.renderer.array(mean), self.problem.renderer.array(0.25 * np.square(halves[0] - halves[1]))
+        array = self.problem.renderer.array
+        mean, variance = 0.5 * (halves[0] + halves[1]), 0.25 * np.square(halves[0] - halves[1])
+        return _Images(array(mean), array(variance), array(halves[0]), array(halves[1]))
 
-    def _weights(self, view: int, image: Array, variance: Array) -> tuple[np.ndarray, np.ndarray]:
-        """Return ℓ' and ℓ'' at the image, (H, W, 3) each."""
-        problem = self.problem
+    def _weights(self, view: int, images: _Images) -> LossWeights:
+        """Return ℓ' and ℓ'' at the image, and ℓ' at its halves, (H, W, 3) each."""
+        problem, image = self.problem, images.mean
         derivative = problem.loss_derivative(view, image)
         if problem.loss.linear:
-            return arrays.numpy(derivative), arrays.numpy(problem.loss_derivative(view, image + 1.0) - derivative)
+            second = problem.loss_derivative(view, image + 1.0) - derivative
+            halves = (problem.loss_derivative(view, half) for half in (images.one, images.other))
+            return LossWeights(*map(arrays.numpy, (derivative, second, *halves)))
         residual = image - problem.reference(view)
-        derivative = derivative * damping(residual, smoothed_variance(variance), self.options.tolerance)
-        secant = derivative * residual / (residual * residual + 1e-12)
-        return arrays.numpy(derivative), arrays.numpy(secant)
-
-
-def noise_weights(variance: np.ndarray, limit: float) -> np.ndarray:
-    """Return the weight 1 / (1 + σ² / (c m)) of each pixel, with c = `limit` and the median m of the variances σ² above 0.
-
-    It is 1 where no pixel has noise.
-    """
-    noisy = variance[variance > 0.0]
-    return 1.0 / (1.0 + variance / (limit * float(np.median(noisy)))) if noisy.size else np.ones_like(variance)
-
-
-def _running(before: tuple[np.ndarray, ...], view: int, variance: np.ndarray) -> np.ndarray:
-    """Return the running mean of a view's variance (H, W, 1), from those of all views and the new one (H, W, 3)."""
-    new = variance.astype(np.float64).mean(axis=-1, keepdims=True)
-    return before[view] + _MEMORY * (new - before[view]) if before else new
-
-
-def _slope(halves: list[np.ndarray]) -> float:
-    """Return the sum of squared differences of neighbouring pixels of the mean image, averaged over both directions. It is unbiased by
-    noise, since it uses two independent halves (B, H, W, 3)."""
-    one, other = (half.mean(axis=0, dtype=np.float64) for half in halves)
-    return 0.5 * sum(float((np.diff(one, axis=axis) * np.diff(other, axis=axis)).sum()) for axis in (0, 1))
-
-
-def _products(
-    halves: list[np.ndarray], distances: np.ndarray, weights: tuple[np.ndarray, np.ndarray] | None, block: int = 1
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return Σ J ℓ', Σ J ℓ'' Jᵀ, Σ N ℓ'' Nᵀ with the noise N of the mean of the halves, and the diagonal of Σ J Jᵀ over pixels, from
-    two independent halves of J.
-
-    Args:
-        halves: images (2 m, H, W, 3), first those of increased, then those of decreased parameters.
-        distances: distance of the two parameters of each difference, (m,); an element with 0 has no derivative.
-        weights: ℓ' and ℓ''; None if only the last result is needed.
-        block: side of the blocks of pixels over which all but the last result are summed.
-    """
-    m = distances.size
-    gradient, hessian, noise, squares = np.zeros(m), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m)
-    over = np.divide(1.0, distances, out=np.zeros(m), where=distances != 0.0)[:, None]
-    for rows in _rows(halves[0], max(block, 1)):
-        parts = [_difference(half[:, rows]) for half in halves]
-        one, other = (part.reshape(m, -1) * over for part in parts)
-        squares += (one * other).sum(axis=1)
-        if weights is None:
-            continue
-        first, second = (x[rows].astype(np.float64) for x in weights)
-        if block > 1:
-            one, other = (_pooled(part, block).reshape(m, -1) * over for part in parts)
-            first, second = _pooled(first, block), _pooled(second, block) / _pooled(np.ones_like(second), block)
-        first, second = first.reshape(-1), second.reshape(-1)
-        gradient += 0.5 * ((one + other) @ first)
-        hessian += (one * second) @ other.T
-        noise_of_halves = 0.5 * (one - other)
-        noise += (noise_of_halves * second) @ noise_of_halves.T
-    return gradient, 0.5 * (hessian + hessian.T), noise, squares
-
-
-def _pooled(images: np.ndarray, block: int) -> np.ndarray:
-    """Return sums over blocks of pixels, divided by the square root of their size, of images (..., H, W, 3)."""
-    for axis in (-3, -2):
-        starts = np.arange(0, images.shape[axis], block)
-        sizes = np.diff(np.append(starts, images.shape[axis]))
-        shape = [1] * images.ndim
-        shape[axis] = -1
-        images = np.add.reduceat(images, starts, axis=axis) / np.sqrt(sizes).reshape(shape)
-    return images
-
-
-def _difference(images: np.ndarray) -> np.ndarray:
-    """Return the first half of the images minus the second, (m, H, W, 3), in double precision."""
-    count = len(images) // 2
-    return images[:count].astype(np.float64) - images[count:]
-
-
-def _rows(images: np.ndarray, block: int) -> Iterator[slice]:
-    """Yield slices of full blocks of rows, with at most `_VALUES` values of all images if possible."""
-    height = images.shape[1]
-    step = max(_VALUES // max(images[:, :1].size * block, 1), 1) * block
-    for start in range(0, height, step):
-        yield slice(start, start + step)
+        damped = derivative * damping(residual, smoothed_variance(images.variance), self.options.tolerance)
+        secant = damped * residual / (residual * residual + 1e-12)
+        return LossWeights(*map(arrays.numpy, (damped, secant, damped, damped)))

@@ -17,6 +17,7 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules import RULES
 from unrender.methods.rules.constants import CONSTANTS
 from unrender.methods.rules.traits import Traits
+from unrender.methods.smoothed import SIGMA_HELP
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.schedule_free import ScheduleFree
 from unrender.scene.problem import Problem
@@ -64,10 +65,7 @@ class AutoMethod(Options):
         True,
         description="whether positive numbers, colours and textures without an upper bound are optimised as logarithms",
     )
-    sigma: PositiveFloat | str = Field(
-        CONSTANTS.sigma,
-        description="smoothing width of parameters without path gradients, in their units: 0.2, mug.rotation.y=0.6",
-    )
+    sigma: PositiveFloat | str | None = Field(None, description=f"for parameters without path gradients: {SIGMA_HELP}")
     smooth: bool = Field(True, description="whether textures, grids and values at vertices use Sobolev gradients")
     correlation: PositiveFloat = Field(
         CONSTANTS.correlation,

@@ -21,7 +21,7 @@ from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.adam_options import AdamOptions
 from unrender.methods.base import parse_schedule
 from unrender.methods.plan import Plan
-from unrender.methods.smoothed import parse_widths, widths_of
+from unrender.methods.smoothed import SIGMA_HELP, WIDTH, parse_widths, widths_of
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.meta_adam import MetaAdam
@@ -47,10 +47,7 @@ class HybridMethod(AdamOptions):
         None, description="what two steps share: paths, or random numbers; none for paths if all parameters allow it"
     )
     pixels: NonNegativeInt = Field(0, description="pixels per step, sampled by the gradient's variance; 0 for all")
-    sigma: PositiveFloat | str = Field(
-        0.2,
-        description="initial smoothing width in units of the parameters, optionally per parameter: 0.2, mug.rotation.y=0.6",
-    )
+    sigma: PositiveFloat | str | None = Field(None, description=f"initial {SIGMA_HELP}")
     sigma_schedule: str | None = Field(
         "exponential(25, 0.1)", description="factor of sigma by step, such as cosine(300)"
     )
@@ -64,24 +61,27 @@ class HybridMethod(AdamOptions):
 
     def build(self) -> tuple[Estimator, Optimizer]:
         """Return both parts without learning rates of perturbed parameters, which depend on the problem."""
-        return self._parts("path" if self.space is None else self.space, {})
+        widths = parse_widths(WIDTH if self.sigma is None else self.sigma)
+        return self._parts("path" if self.space is None else self.space, widths, {})
 
     def plan(self, problem: Problem) -> Plan:
         known, keys = problem.renderer.parameters(), list(problem.shapes())
         own = beyond_paths(known, keys) if self._keys is None else self._keys
         space = self.space or ("path" if all(known[key].shares_paths for key in keys) else "primary")
-        widths = widths_of(self.sigma, [key for key in own if key in keys])
+        widths = widths_of(self.sigma, problem, [key for key in own if key in keys])
         rates = {key: self.step * width for key, width in widths.items()}
         reason = f"perturbed renders of {', '.join(own)}; path gradients of all others"
-        return Plan(problem, *self._parts(space, rates), reasons=(reason,) if own else ())
+        wanted = parse_widths(self.sigma, problem, tuple(widths))
+        return Plan(problem, *self._parts(space, wanted, rates), reasons=(reason,) if own else ())
 
     @property
     def _keys(self) -> tuple[str, ...] | None:
         return None if self.perturbed is None else tuple(key.strip() for key in self.perturbed.split(","))
 
-    def _parts(self, space: Literal["path", "primary"], rates: Tree) -> tuple[Estimator, Optimizer]:
+    def _parts(
+        self, space: Literal["path", "primary"], widths: float | dict[str, float], rates: Tree
+    ) -> tuple[Estimator, Optimizer]:
         image = Plain() if self.image == "plain" else RecursiveControlVariate(space, max_weight=_IMAGE_MEMORY)
-        widths = parse_widths(self.sigma)
         smoothing = SmoothedDerivatives(
             widths,
             self.samples,

@@ -11,10 +11,11 @@ from unrender.core import arrays, checks, trees
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise
+from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise, ScoreCovariance
 from unrender.optimizers import rates
 from unrender.optimizers.directions import coordinate_scales
 from unrender.optimizers.newton import trust_region_step
+from unrender.statistics.scores import positive_part
 
 _FEWEST_MODELS = 8.0
 """Number of models from which their scatter gives a standard error."""
@@ -22,7 +23,10 @@ _USED, _SHRINK, _GROW = 0.5, 0.7, 1 / 0.7
 """Share of the radius from which a step counts as one that used the region, and the factors of the radius after such steps. Their product
 is 1, so noise alone neither closes the region nor opens it."""
 _WEAK_SHARE = 0.01
-"""Squared share of an element in damped directions above which it has no standard error."""
+"""Squared share of an element in damped directions above which its standard error is infinite."""
+_LEAST_WEIGHT, _SCORE_ERRORS = 0.05, 2.0
+"""Least weight of the latest covariance of scores, because earlier residuals include the distance to the solution; standard errors by which
+the covariance must exceed 0."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,8 @@ class AveragedNewtonState:
             the model's gradient and that of the previous mean.
         radii: radius of the trust region of each element, (n,), in its units.
         step: last step, in units of the parameters, (n,).
+        scores: mean covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; 0 if there is none.
+        score_variances: variance of the diagonal of `scores`, (n,).
     """
 
     learning_rates: dict[str, float]
@@ -53,6 +59,8 @@ class AveragedNewtonState:
     scatter: np.ndarray
     radii: np.ndarray
     step: np.ndarray
+    scores: np.ndarray
+    score_variances: np.ndarray
 
 
 @register
@@ -108,7 +116,7 @@ class AveragedNewton:
         n = trees.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
         radii = np.full(n, np.inf if self.trust_radius is None else self.trust_radius)
-        return AveragedNewtonState(own, square, row, square, row, row, row, square, radii, row)
+        return AveragedNewtonState(own, square, row, square, row, row, row, square, radii, row, square, row)
 
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
@@ -125,10 +133,13 @@ class AveragedNewton:
         )
         if not np.isfinite(added).all():
             added = np.zeros_like(hessian)
+        references = estimate.get(ScoreCovariance)
+        fresh = np.zeros_like(hessian) if references is None else np.nan_to_num(arrays.numpy(references.matrix))
         scale = coordinate_scales(estimate, state, parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
         noise, shares, counts = state.noise.copy(), state.shares.copy(), state.counts.copy()
         lengths, scatter, radii = np.zeros_like(x), state.scatter.copy(), state.radii.copy()
+        scores, score_variances = state.scores.copy(), state.score_variances.copy()
         for block in _blocks((matrix != 0.0) | (hessian != 0.0)):
             both = np.ix_(block, block)
             weight = self._weight(counts[block].min(), state.lengths[block].max())
@@ -139,6 +150,10 @@ class AveragedNewton:
             counts[block] = (1.0 + self.averaging) * (1.0 / weight - 1.0) + 1.0
             matrix[both] += weight * (hessian[both] - matrix[both])
             noise[both] += weight * (added[both] - noise[both])
+            recent = max(weight, _LEAST_WEIGHT)
+            change = np.diag(fresh)[block] - np.diag(scores)[block]
+            score_variances[block] = (1.0 - recent) ** 2 * score_variances[block] + (recent * change) ** 2
+            scores[both] += recent * (fresh[both] - scores[both])
             shares[block] = (1.0 - weight) ** 2 * shares[block] + weight**2
             target[block] += weight * (hessian[both] @ x[block] - gradient[block] - target[block])
             own = scale[block]
@@ -150,7 +165,18 @@ class AveragedNewton:
             lengths[block] = np.linalg.norm(moved)
             step[block] = own * moved
         return trees.unravel(step, parameters), AveragedNewtonState(
-            state.learning_rates, matrix, target, noise, shares, counts, lengths, scatter, radii, step
+            state.learning_rates,
+            matrix,
+            target,
+            noise,
+            shares,
+            counts,
+            lengths,
+            scatter,
+            radii,
+            step,
+            scores,
+            score_variances,
         )
 
     def averages(self, keys: Iterable[str]) -> frozenset[str]:
@@ -160,10 +186,11 @@ class AveragedNewton:
     def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:
         """Return the standard errors of A⁻¹ b, from the scatter of the models' gradients about those of the mean.
 
-        They cover the run's own noise, not that of the references, nor the bias of finite differences. They need about ten models.
-        Parameters with a share in a damped direction have none, because their step to A⁻¹ b is incomplete.
+        They cover the run's own noise and that of the references, not the bias of finite differences. They need about ten models. They
+        are infinite for elements that change no image, or that have a share in a damped direction, which the images hardly determine.
+        Parameters whose models have no noise at all have none.
         """
-        errors = np.full(len(state.matrix), np.nan)
+        errors = np.full(len(state.matrix), np.inf)
         for block in _blocks(state.matrix != 0.0):
             both = np.ix_(block, block)
             units = np.sqrt(np.abs(np.diag(state.matrix[both])))
@@ -172,15 +199,13 @@ class AveragedNewton:
             eigenvalues, directions = np.linalg.eigh(state.matrix[both] / np.outer(units, units))
             weak = eigenvalues <= self.damping * eigenvalues.max()
             inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / np.outer(units, units)
-            error = np.sqrt(np.abs(np.diag(inverse @ state.scatter[both] @ inverse)))
-            errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.nan, error)
+            middle = state.scatter[both] + _significant(state.scores[both], state.score_variances[block], units**2)
+            error = np.sqrt(np.abs(np.diag(inverse @ middle @ inverse)))
+            errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.inf, error)
         split = trees.parts(errors[None], parameters)
-        counts = trees.parts(state.counts[None], parameters)
-        return {
-            key: x[0]
-            for key, x in split.items()
-            if counts[key].min() >= _FEWEST_MODELS and np.isfinite(x).all() and x.all()
-        }
+        known = state.matrix.any(axis=1)  # the others are in no model
+        counts = trees.parts(np.where(known, state.counts, np.inf if known.any() else 0.0)[None], parameters)
+        return {key: x[0] for key, x in split.items() if counts[key].min() >= _FEWEST_MODELS and x.all()}
 
     def _weight(self, count: float, length: float) -> float:
         """Return the weight of a model after `count` others and a step of this length."""
@@ -211,6 +236,19 @@ class AveragedNewton:
         return eigenvectors @ trust_region_step(
             np.maximum(curvatures, 0.0), eigenvectors.T @ gradient, None if np.isinf(radius) else radius
         )
+
+
+def _significant(scores: np.ndarray, variances: np.ndarray, units: np.ndarray) -> np.ndarray:
+    """Return the covariance of scores (n, n) reduced by its own noise: 0 for exact references, and nearly all of a large one.
+
+    Args:
+        scores: mean covariance.
+        variances: of its diagonal, (n,).
+        units: by which the diagonal is divided, (n,).
+    """
+    size, variance = float(np.sum(np.diag(scores) / units)), float(np.sum(variances / units**2))
+    share = 1.0 - _SCORE_ERRORS**2 * variance / size**2 if size > 0.0 else 0.0
+    return max(share, 0.0) * positive_part(scores)
 
 
 def _blocks(connected: np.ndarray) -> list[np.ndarray]:

@@ -75,14 +75,14 @@ class CMAES:
         population: λ, points per generation, >= 4; None for 4 + ⌊3 log n⌋. Noise needs more.
         seed: seed of the sampled points, >= 0.
         diagonal: whether only variances are adapted, not covariances; for more than a few hundred parameters.
-        learning_rate: η, in units of the parameter, > 0, for the parameters without their own.
+        learning_rate: η, in units of the parameter, > 0, for the parameters without their own; or {key: η, "*": η of the others}.
     """
 
     sigma0: float = 0.3
     population: int | None = None
     seed: int = 0
     diagonal: bool = False
-    learning_rate: float = 1.0
+    learning_rate: float | Mapping[str, float] = 1.0
 
     def __post_init__(self):
         rates.check("CMAES", self.learning_rate, None)

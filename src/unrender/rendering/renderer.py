@@ -33,15 +33,13 @@ class ParameterInfo:
     Attributes:
         shape: shape of its array.
         differentiable: whether `adjoint` can return its gradient.
-        shares_paths: whether two values of it can share one set of paths (path space). Paths of a moving mesh are related, not equal.
+        shares_paths: whether two values of it can share one set of paths (path space); paths of a moving mesh are related, not equal.
         reason: reason why it is not differentiable or cannot share paths; else "".
         lowest, highest: physical limits of the values, or None.
         singular: value between these limits where images are singular, such as an index of refraction of 1; it is never crossed.
-        perturbable: whether it can be rendered at other values, as `image_batch` requires.
-        compiled: whether it is a plain number that is compiled into kernels: neither differentiable nor perturbable.
+        perturbable, compiled: whether `image_batch` can render other values; whether it is a plain number compiled into kernels.
         rigid, light: whether it moves a shape, light or sensor rigidly, with many minima of the loss; whether that is a light.
-        viewpoint: whether it is a sensor's pose or lens parameter.
-        sensor: index of the only sensor whose images it changes; None if it may change others'.
+        viewpoint, sensor: whether it is a sensor's pose or lens parameter; index of the only sensor that it changes, or None.
         mesh: for values (n V,) at the V vertices of a mesh, function that returns its loaded positions (V, 3) and faces (F, 3); else None.
         welded: whether the values are vertex positions, shared by vertices at the same position.
         resizable: whether it may be rendered at resolutions other than its own, (H, W, C) or (Z, Y, X, C).
@@ -49,6 +47,7 @@ class ParameterInfo:
         role: meaning of the values: numbers, normals or directions. The errors of the last two are angles.
         brightness: quantity that the picture is proportional to: "light" of an emitter, "reflectance" of a surface; else "".
         nonlinear: whether it changes the form of the picture, not its brightness: positions, lenses, skies, indices of refraction.
+        length: order of magnitude of lengths at the object that it moves, a power of ten; 1 for other values.
         lobe: whether it decides the probability of a lobe, which is never sampled if all values are at an end of the range.
     """
 
@@ -73,6 +72,7 @@ class ParameterInfo:
     brightness: Literal["", "light", "reflectance"] = ""
     nonlinear: bool = False
     lobe: bool = False
+    length: float = 1.0
 
     @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:

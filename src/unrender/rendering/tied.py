@@ -90,6 +90,7 @@ class Tie:
             viewpoint=any(info.viewpoint for info in infos),
             sensor=sensors.pop() if len(sensors) == 1 else None,
             nonlinear=any(info.nonlinear for info in infos),
+            length=max(info.length for info in infos),
         )
 
     def _limits(self, infos: Iterable[ParameterInfo]) -> tuple[float | None, float | None]:

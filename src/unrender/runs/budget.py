@@ -21,7 +21,7 @@ _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning is given, and number of steps that are timed for it."""
 _END_SHARE, _END_SECONDS = 0.1, 1.0
 """Time reserved for verification and final images: a fraction of the budget, plus seconds."""
-_LOOK_SECONDS, _MOST_SLOWDOWN = 0.5, 3.0
+_LOOK_SECONDS, MOST_SLOWDOWN = 0.5, 3.0
 """Seconds between two measurements of the load of the machine; the largest slowdown that is taken into account."""
 _LEAST_SHARE = 0.5
 """Fraction of the budget that the steps get even if the warm-up takes long, within the following limits."""
@@ -50,7 +50,7 @@ class Budget(Callback):
         self._least = time.perf_counter() + _LEAST_SHARE * max((run.seconds or 0.0) - run.clock, 0.0)
         if run.deadline is not None and run.seconds is not None:
             late = _LATE_COMPILED if run.compiled else _LATE_SHARE * run.seconds + _LATE_SECONDS
-            rest = (_END_SHARE * run.seconds + _END_SECONDS + _PAGE_SECONDS) * min(slowdown(), _MOST_SLOWDOWN)
+            rest = (_END_SHARE * run.seconds + _END_SECONDS + _PAGE_SECONDS) * min(slowdown(), MOST_SLOWDOWN)
             self._least = min(self._least, run.deadline + late - rest)
         self._check(run)
 
@@ -81,7 +81,7 @@ class Budget(Callback):
         if run.deadline is None or run.seconds is None or now - self._looked < _LOOK_SECONDS:
             return
         self._looked = now
-        end = min((_END_SHARE * run.seconds + _END_SECONDS) * min(slowdown(), _MOST_SLOWDOWN), 0.5 * run.seconds)
+        end = min((_END_SHARE * run.seconds + _END_SECONDS) * min(slowdown(), MOST_SLOWDOWN), 0.5 * run.seconds)
         run.last_step = max(run.deadline - end, self._least)
 
 

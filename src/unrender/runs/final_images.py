@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from unrender.core import phases
 from unrender.io.resampling import resize_nearest
+from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
 from unrender.runs.image_sensitivity import sensitivity
 from unrender.runs.least_squares import check_numbers, compile_check
@@ -27,6 +28,8 @@ _SENSITIVITY_SHARE = 0.5
 """Additional time limit of the sensitivity relative to that; it takes at least one probe."""
 _LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
 """Time limit of each of two tests of undetermined parameters relative to the time of the steps, and its minimum in seconds."""
+_LEAST_TESTS = 0.6
+"""Seconds on an idle machine that the tests of undetermined parameters have together even if the budget is over."""
 _NUMBERS_SHARE = 0.05
 """Time limit of least squares of few numbers relative to the time of the steps; at least one second."""
 _TRIAL_PATHS = 1 << 18
@@ -53,6 +56,7 @@ class FinalImages:
         sensitivity: see `Result.sensitivity`.
         undetermined: see `Result.undetermined`.
         warnings: one line for each unknown that had not settled at the end.
+        standard_error: see `Result.standard_error`.
     """
 
     pictures: dict[str, np.ndarray]
@@ -61,6 +65,7 @@ class FinalImages:
     sensitivity: dict[str, np.ndarray]
     undetermined: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
@@ -97,7 +102,7 @@ def render_final_images(
         spp: samples per pixel. None takes a power of two, at least 2, that fits into a twentieth of the time of the run's steps, or one
             second if that is longer, and into about four million paths per image. That time excludes compiling.
         left: function that returns the remaining seconds. If few remain, images have fewer samples, and tests of undetermined parameters
-            are omitted.
+            take about half a second.
         tested: whether to estimate sensitivities and to test what the images determine.
     """
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
@@ -121,35 +126,40 @@ def render_final_images(
             if index in probabilities:
                 density = np.asarray(probabilities[index], np.float32)
                 pictures[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
-        seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * left())
-        everything = tested and len(chosen) == len(problem.views) and seconds > 0.0
+        tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
+        seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
+        everything = tested and len(chosen) == len(problem.views)
         sensitivities = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
-        lines, warnings = _undetermined(problem, result, sensitivities, 0.25 * left()) if everything else ([], ())
-    return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), tuple(warnings))
+        lines, warnings, deviations = [], (), dict(result.standard_error)
+        if everything:
+            lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests)
+    return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations)
 
 
 def _undetermined(
     problem: Problem, result: Result, sensitivities: Mapping[str, np.ndarray], most: float
-) -> tuple[list[str], tuple[str, ...]]:
-    """Return lines about what the images do not determine, and about numbers that have not settled; none without steps.
+) -> tuple[list[str], tuple[str, ...], dict[str, np.ndarray]]:
+    """Return lines about what the images do not determine and about numbers that have not settled, and standard errors; none without steps.
 
     Each test takes at most about `most` seconds.
     """
     if not result.steps:
-        return [], ()
-    lines = undetermined_cells(sensitivities)
+        return [], (), {}
+    lines, deviations = undetermined_cells(sensitivities), dict(result.standard_error)
     spp, seconds = _trial_spp(problem), min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
-    if seconds <= 0.0:
-        return lines, ()
     per_pass = _pass_spp(problem)
     lines += common_factor(problem, result.parameters, spp, seconds, per_pass)
     lines += undetermined(problem, result.parameters, spp, seconds, per_pass)
     allowed = min(max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
-    numbers = check_numbers(problem, result.parameters, result.initial, allowed)
+    numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
     text = "\n".join(lines)
     lines += [line for key, line in numbers.undetermined.items() if key not in text]
+    for key, error in numbers.errors.items():  # a block's own errors take other unknowns as known
+        shape = result.parameters[key].shape
+        deviations[key] = np.maximum(error.reshape(shape), deviations.get(key, 0.0)).astype(np.float32)
     failed = result.status == "failed"  # such a run did not end by its budget
-    return lines, () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
+    unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
+    return lines, unfinished, deviations
 
 
 def _chosen(problem: Problem) -> list[int]:

@@ -18,7 +18,8 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, view_request
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
-_MAP_AXES = 3
+MAP_AXES = 3
+"""Number of axes from which a parameter is a texture or grid."""
 _HARDLY = 0.05
 """Sensitivity relative to the median below which an element hardly affects the images."""
 
@@ -52,25 +53,24 @@ def sensitivity(
         views: number of views to render, the first ones, >= 1; None for all.
 
     Returns:
-        {key: array} of the parameters' shapes, float32; {} if a parameter has no path gradient.
+        {key: array} of the parameters' shapes, float32, for the parameters with path gradients.
 
     Raises:
         InputError: `values` have other keys or shapes than the problem's; `probes` or `spp` is below 1.
     """
     checks.integer("sensitivity", "probes", probes, at_least=1)
     if spp is None:
-        spp = min(max(_PATHS // problem.pixels, 1), _MOST_SPP)
+        spp = adjoint_spp(problem)
     checks.integer("sensitivity", "spp", spp, at_least=1)
-    try:
-        session = problem.renderer.prepare(list(problem.shapes()), None)
-    except InputError:
+    session, keys = derivative_session(problem)
+    if session is None:
         return {}
     parameters = off_ends(as_tree(problem, values), problem.renderer.parameters())
-    squares = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
+    squares = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
     made, until = 0, time.perf_counter() + seconds
     while made == 0 or (made < probes and time.perf_counter() < until):
         one, other = (
-            _projections(problem, session, parameters, spp, Key(seed, made), half, views) for half in range(2)
+            _projections(problem, session, parameters, keys, spp, Key(seed, made), half, views) for half in range(2)
         )
         for key, square in squares.items():
             square += one[key] * other[key]
@@ -113,18 +113,43 @@ def seen_cells(values: np.ndarray) -> np.ndarray | None:
     Args:
         values: result of `sensitivity`, (..., channels).
     """
-    return ~hardly_seen(values) if values.ndim >= _MAP_AXES and values.size else None
+    return ~hardly_seen(values) if values.ndim >= MAP_AXES and values.size else None
+
+
+def adjoint_spp(problem: Problem) -> int:
+    """Return the samples per pixel of an adjoint: 4, or fewer if the views have more than 2¹⁸ pixels in total."""
+    return min(max(_PATHS // problem.pixels, 1), _MOST_SPP)
+
+
+def derivative_session(problem: Problem) -> tuple[RenderSession | None, frozenset[str]]:
+    """Return a session with derivatives, and their keys: all, or all that are differentiable and no poses."""
+    known, keys = problem.renderer.parameters(), list(problem.shapes())
+    for chosen in (keys, [key for key in keys if known[key].differentiable and not known[key].rigid]):
+        if chosen:
+            try:
+                return problem.renderer.prepare(keys, None, derivatives=frozenset(chosen)), frozenset(chosen)
+            except InputError:
+                continue
+    return None, frozenset()
 
 
 def _projections(
-    problem: Problem, session: RenderSession, parameters: Tree, spp: int, key: Key, half: int, views: int | None
+    problem: Problem,
+    session: RenderSession,
+    parameters: Tree,
+    keys: frozenset[str],
+    spp: int,
+    key: Key,
+    half: int,
+    views: int | None,
 ) -> dict[str, np.ndarray]:
     """Return {key: Jᵀs} for the signs s of a probe, on one of its two sets of paths."""
-    sums = {key: np.zeros(shape) for key, shape in problem.shapes().items()}
+    sums = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
     signs = np.random.default_rng(key.uint32())
     for view in range(len(problem.views))[:views]:
         rendering = session.image(parameters, view_request(problem, view, spp, key.fold(2 * view + half).uint32()))
         weights = signs.choice(np.array([-1, 1], np.float32), size=arrays.shape(rendering.images))
-        for name, value in session.adjoint(parameters, rendering.paths, problem.renderer.array(weights)).items():
-            sums[name] += arrays.numpy(value).reshape(sums[name].shape)
+        gradient = session.adjoint(parameters, rendering.paths, problem.renderer.array(weights))
+        for name, total in sums.items():
+            total += arrays.numpy(gradient[name]).reshape(total.shape)
     return sums

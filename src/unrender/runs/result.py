@@ -53,10 +53,10 @@ class Result:
             "error" of a control variate, and of the "picture").
         image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the reference
             and the image's expectation, without rendering noise; see `statistics.debiased`.
-        standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings,
-            without the noise of the references and errors of other unknowns. Available for numbers optimised by `AveragedNewton`, after
-            its last step, except for those with a share in a direction that the images hardly determine; and for numbers that are means
-            over enough steps.
+        standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings
+            and of the references, infinite where the images do not determine it. Runs with a run folder have it for all numbers, also
+            beside textures and grids, see `runs.least_squares`. Other runs have it for numbers optimised by `AveragedNewton`, without
+            errors of unknowns outside its block, and for numbers that are means over enough steps, without the references' noise.
         phases: {phase: seconds} in order: "compiling", "steps", "checkpoints and callbacks", "final pictures", and, on the command line,
             earlier phases. For a resumed run, those of the last session.
         sensitivity: {key: array} of the parameters' shapes: change of the images per unit of each element, as root sum of squares over

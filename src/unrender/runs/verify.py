@@ -52,6 +52,11 @@ _FIRST_CANDIDATE = 64
 """Step after which the first candidate is taken; the interval doubles each time."""
 _EARLIER, _STILL = 0.75, 0.85
 """Fraction of the steps up to which an earlier image counts; ratio of the last loss to its loss above which a run no longer improves."""
+_FIRST_EARLIER, _COST = 4, 0.02
+"""Step from which images of earlier steps are taken for short runs, if their paths are at most this fraction of the steps' paths."""
+_EARLIER_SHORT, _STILL_SHORT, _SURE, _OF_PICTURE_SHORT = 0.5, 0.9, 2.0, 0.05
+"""The same limits as above for runs whose earlier image is of a step before 64: fraction of the steps; ratio of the losses, with the number
+of standard errors by which it must be exceeded; smallest size of the residual relative to the image."""
 _CANDIDATES, _END = 1, 2
 """Indices of the sets of random numbers."""
 
@@ -100,16 +105,20 @@ class Verify(Callback):
             FreshPictures(run.problem, run.seed, 0, _END).images(run.full())
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """Render a candidate at steps 64, 128, 256, …"""
+        """Render a candidate at steps 64, 128, 256, …, and images for the residual of short runs at steps 4, 8, 16 and 32."""
         del record
-        ratio = run.step / _FIRST_CANDIDATE
-        if ratio < 1 or run.step % _FIRST_CANDIDATE or math.log2(ratio) % 1 or _other_meshes(run.problem):
+        if run.step < _FIRST_EARLIER or run.step & (run.step - 1) or _other_meshes(run.problem):
             return
         if self._pictures is None:
             self._pictures = FreshPictures(run.problem, run.seed, 0, _CANDIDATES)
+        short = run.step < _FIRST_CANDIDATE
+        if short and self._pictures.paths > _COST * run.state.samples:
+            return
         values = run.full()
         earlier = _Earlier.of(run.step, self._pictures, values)
         self._earlier = [*self._earlier[-1:], earlier]
+        if short:
+            return
         loss = earlier.loss
         known = run.state.candidate
         if known is None or loss < known.loss:
@@ -175,11 +184,11 @@ class Verify(Callback):
             result: result of the run.
             end: the last image, with random numbers independent of those of earlier steps.
         """
-        earlier = next((one for one in reversed(self._earlier) if one.step <= _EARLIER * result.steps), None)
+        earlier = next((one for one in reversed(self._earlier) if one.is_compared(result.steps)), None)
         if self._pictures is None or earlier is None:
             return []
         last = _Earlier.of(result.steps, self._pictures, result.parameters)
-        if not _STILL * earlier.loss < last.loss < math.inf:
+        if not last.is_still(earlier):
             return []
         weights, references = self._pictures.weights, self._pictures.references
         residual = last.residual
@@ -189,7 +198,7 @@ class Verify(Callback):
         total = max(float(weights.sum()) * 3, 1e-300)
         size = math.sqrt(float((weights[:, None] * references**2).sum()) / total)
         error = math.sqrt(max(shared.mean_square, 0.0))
-        if not shared.score > _SCORE or error <= _OF_PICTURE * size:
+        if not shared.score > _SCORE or error <= (_OF_PICTURE_SHORT if earlier.is_short else _OF_PICTURE) * size:
             if np.count_nonzero(weights) >= _FEW_PIXELS:
                 return []
             others = np.concatenate(end.images, axis=1) - references
@@ -206,9 +215,13 @@ class Verify(Callback):
         if any(unknown.prior is not None for unknown in problem.unknowns.values()):
             cause = f"a prior may be too strong, or {cause}"
         times = f", {error / noise:.1f} times its noise" if noise > 0 else ""
+        still = "no longer improves"
+        if earlier.is_short:
+            still = f"has hardly improved since step {earlier.step} of {result.steps}"
+            cause = f"it may need more steps, or {cause}"
         return [
             f"the final picture differs from the references by {formatting.number(error)} ({error / size:.0%} of the picture{times}), and "
-            f"no longer improves: {cause}"
+            f"{still}: {cause}"
         ]
 
 
@@ -218,13 +231,30 @@ class _Earlier:
 
     Attributes:
         step: number of completed steps.
-        loss: loss without noise.
+        loss, loss_error: loss without noise, and its standard error.
         residuals: independent images minus the references, (K, N, 3).
     """
 
     step: int
     loss: float
+    loss_error: float
     residuals: np.ndarray
+
+    @property
+    def is_short(self) -> bool:
+        """Return whether it is of one of the first steps."""
+        return self.step < _FIRST_CANDIDATE
+
+    def is_compared(self, steps: int) -> bool:
+        """Return whether it is early enough for a comparison with the end of a run of that many steps."""
+        return self.step <= (_EARLIER_SHORT if self.is_short else _EARLIER) * steps
+
+    def is_still(self, earlier: _Earlier) -> bool:
+        """Return whether the loss has hardly fallen since an earlier step."""
+        if not earlier.is_short:
+            return _STILL * earlier.loss < self.loss < math.inf
+        noise = math.hypot(self.loss_error, _STILL_SHORT * earlier.loss_error)
+        return _STILL_SHORT * earlier.loss + _SURE * noise < self.loss < math.inf
 
     @property
     def residual(self) -> np.ndarray:
@@ -235,7 +265,7 @@ class _Earlier:
     def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> _Earlier:
         """Render the parameters of a step."""
         picture = pictures.picture(values)
-        return cls(step, picture.loss[0], np.concatenate(picture.images, axis=1) - pictures.references)
+        return cls(step, *picture.loss, np.concatenate(picture.images, axis=1) - pictures.references)
 
 
 def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Picture]:

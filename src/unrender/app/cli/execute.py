@@ -173,7 +173,7 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     for key, error in result.standard_error.items():
         table.add_row(
             f"± {escape(key)}",
-            f"{', '.join(map(formatting.number, np.ravel(error)))} (standard error of the run's noise)",
+            f"{', '.join(map(formatting.deviation, np.ravel(error)))} (standard error)",
         )
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")

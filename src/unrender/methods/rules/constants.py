@@ -84,8 +84,6 @@ class Constants:
     most_views: int = 8
     """Largest number of views of such a step. Source: `shapes.pixel_batches`."""
 
-    sigma: float = 0.2
-    """Smoothing width of perturbed parameters, in their units. Source: `shapes.poses`."""
     perturbed_share: float = 0.5
     """First learning rate of perturbed parameters relative to their width. Source: `shapes.poses`."""
     perturbed: int = 16
@@ -96,7 +94,7 @@ class Constants:
     """Half-life in steps and floor of the width. Source: `shapes.poses`."""
 
     camera_share: float = 0.1
-    """First steps of cameras by path gradients, in units of the world and radians, over `learning_rate`. Source: by hand (776f95c)."""
+    """First steps of cameras by path gradients, in lengths at the camera and radians, over `learning_rate`. Source: by hand (776f95c)."""
     most_elements: int = 1 << 10
     """Number of elements of camera poses up to which the matrix is formed. Source: its cost, by hand (47c5292)."""
     image_paths: int = 1 << 21
@@ -131,7 +129,7 @@ class Constants:
     pose_shift: float = 1.0 / 12.0
     """First shift of the differences of poses relative to the smallest image's side. Source: a block in a room .25 away."""
     pose_reach: float = 2.0
-    """Largest width of the differences of poses relative to `sigma`. Source: as for `pose_shift`."""
+    """Largest width of the differences of poses relative to the smoothing width. Source: as for `pose_shift`."""
     light_reach: float = 0.5
     """The same ratio for poses of lights alone. Source: `stage-lights`, error of seven numbers after 60 steps."""
     noise_limit: float = 3.0

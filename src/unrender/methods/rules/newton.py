@@ -35,7 +35,9 @@ def cameras(traits: Traits) -> Plan | None:
         f"Gauss-Newton steps of cameras by perturbed renders, {spp} samples per pixel of the image, {derivative_spp} of those; "
         "the mean of all steps' models"
     )
-    estimator = GaussNewton(spp, derivative_spp, tolerance=_damping(traits))
+    widths = widths_of(traits.options.sigma, problem, traits.poses)
+    largest = {key: constants.pose_reach * width for key, width in widths.items()}
+    estimator = GaussNewton(spp, derivative_spp, tolerance=_damping(traits), largest=largest)
     return Plan(problem, estimator, AveragedNewton(), reasons=(reason,))
 
 
@@ -48,7 +50,8 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
     rate = traits.constants.camera_share * traits.options.learning_rate
     image = RecursiveControlVariate("primary") if traits.options.image == "rcv" else Plain()
     reason = f"path gradients of cameras, {spp} samples per pixel, Adam, first rate {rate:.3g}, halved every 30 steps"
-    descent = Adam(rate, beta_2=0.99, schedule=Exponential(30, 0.01))
+    rates = {"*": rate} | {key: rate * info.length for key, info in traits.infos.items() if info.length != 1.0}
+    descent = Adam(rates if len(rates) > 1 else rate, beta_2=0.99, schedule=Exponential(30, 0.01))
     return Plan(
         traits.problem,
         PathGradient(image, sampler, spp),
@@ -72,7 +75,7 @@ def few_numbers(traits: Traits) -> Plan | None:
     estimator = _estimator(traits, keys, constants.pose_images)
     if traits.poses:
         trial = replace(estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None)
-        trial = replace(trial, largest=widths_of(traits.options.sigma, traits.poses))
+        trial = replace(trial, largest=widths_of(traits.options.sigma, problem, traits.poses))
         least = constants.explained if shapes else constants.explained_light
         if not problem.loss.linear or not explained(problem, trial) > least:
             return None
@@ -136,7 +139,7 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
         differences,
         tolerance=_damping(traits),
         coarse=max(constants.pose_shift * side, 1.0) if poses else None,
-        largest={key: reach * width for key, width in widths_of(traits.options.sigma, moved).items()},
+        largest={key: reach * width for key, width in widths_of(traits.options.sigma, problem, moved).items()},
         noise_limit=constants.noise_limit,
     )
 

@@ -37,10 +37,10 @@ def paths_and_perturbed(traits: Traits) -> Plan | None:
         return None
     if plan := with_separate_block(traits, tuple(keys), paths(replace(traits, problem=others, block=tuple(keys)))):
         return plan
-    rates = {key: constants.perturbed_share * width for key, width in widths_of(sigma, keys).items()}
+    rates = {key: constants.perturbed_share * width for key, width in widths_of(sigma, problem, keys).items()}
     plan = paths(replace(traits, problem=others, rates=rates))
     smoothing = SmoothedDerivatives(
-        parse_widths(sigma),
+        parse_widths(sigma, problem, keys),
         constants.perturbed,
         spp=constants.perturbed_spp,
         schedule=Exponential(*constants.annealing),
@@ -56,7 +56,8 @@ def perturbed(traits: Traits) -> Plan | None:
     if not traits.unreachable:
         return None
     reason = f"derivatives of a smoothed loss (method smoothed): {traits.unreachable}"
-    return Plan(traits.problem, *method("smoothed").start({"sigma": traits.options.sigma}), reasons=(reason,))
+    plan = method("smoothed").plan(traits.problem, {"sigma": traits.options.sigma})
+    return replace(plan, reasons=(reason,))
 
 
 def paths(traits: Traits) -> Plan:

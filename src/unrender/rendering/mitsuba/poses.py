@@ -115,13 +115,14 @@ def is_bare(scene: Any, target: str) -> bool:
     return any(emitter.id() == target and emitter.get_shape() is None for emitter in scene.emitters())
 
 
-def info(key: PoseKey, obstacle: str, sensor: int | None) -> ParameterInfo:
+def info(key: PoseKey, obstacle: str, sensor: int | None, length: float = 1.0) -> ParameterInfo:
     """Return the description of a pose parameter.
 
     Args:
         key: meaning of its key.
         obstacle: reason why path gradients do not support it; "" if they do.
         sensor: index of the sensor that it moves; None if it does not move a sensor.
+        length: order of magnitude of lengths at the object, see `rigid_motions.lengths`.
     """
     viewpoint = sensor is not None
     kind = "light" if key.light else "sensor" if viewpoint else "shape"
@@ -139,6 +140,7 @@ def info(key: PoseKey, obstacle: str, sensor: int | None) -> ParameterInfo:
         light=key.light,
         viewpoint=viewpoint,
         sensor=sensor,
+        length=length if key.part == "translation" else 1.0,
     )
 
 

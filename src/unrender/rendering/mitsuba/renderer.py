@@ -23,6 +23,7 @@ from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
+from unrender.rendering.mitsuba.rigid_motions import lengths
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -78,8 +79,14 @@ class MitsubaRenderer:
         self._info: dict[str, ParameterInfo] = {**self.pair.info(), **lens_parameters(self.pair)}
         sensors = {sensor.id(): index for index, sensor in enumerate(self.pair.current.sensors())}
         obstacles_of = self._obstacles({pose.target for pose in self._poses.values()})
+        lengths_by_id = lengths(self.pair.current)
         self._info |= {
-            key: poses.info(pose, obstacles_of[pose.target] or self._translates(pose), sensors.get(pose.target))
+            key: poses.info(
+                pose,
+                obstacles_of[pose.target] or self._translates(pose),
+                sensors.get(pose.target),
+                lengths_by_id.get(pose.target, 1.0),
+            )
             for key, pose in self._poses.items()
         }
         self._sampler: mi.Sampler = mi.load_dict({"type": "independent"})

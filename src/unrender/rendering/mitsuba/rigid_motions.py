@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.mesh_layout import NORMALS, POSITIONS
 from unrender.rendering.mitsuba.poses import Pose, PoseKey
 
-__all__ = ["RigidMotions"]
+__all__ = ["RigidMotions", "lengths"]
 
 
 class RigidMotions:
@@ -116,3 +118,22 @@ class RigidMotions:
 def _copy(transform: Any) -> Any:
     """Return a copy: a sensor returns a reference to the matrix that it uses."""
     return type(transform)(transform)
+
+
+def lengths(scene: Any) -> dict[str, float]:
+    """Return the order of magnitude of lengths at each shape, sensor and emitter with a pose, a power of ten, by id.
+
+    It is the diagonal of a shape's bounding box, at most twice its distance from the nearest sensor. For sensors and emitters it is a
+    third of the median distance from shapes.
+    """
+    boxes = {shape.id(): shape.bbox() for shape in scene.shapes() if not shape.is_sensor() and shape.bbox().valid()}
+    sensors = {sensor.id() for sensor in scene.sensors() if sensor.get_shape() is None}
+    lamps = {lamp.id() for lamp in scene.emitters() if lamp.get_shape() is None and poses.is_posable(lamp)}
+    places = {name: np.array(at) for name, at in poses.centres(scene, {*boxes, *sensors, *lamps}).items()}
+    sizes = {}
+    for name, box in boxes.items():
+        distances = [2.0 * float(np.linalg.norm(places[name] - places[sensor])) for sensor in sensors]
+        sizes[name] = min([float(np.linalg.norm(np.array(box.extents(), float))), *(d for d in distances if d > 0.0)])
+    for name in lamps | sensors:
+        sizes[name] = float(np.median([np.linalg.norm(places[name] - places[other]) for other in boxes] or [0.0])) / 3.0
+    return {name: 10.0 ** round(math.log10(size)) if 0.0 < size < math.inf else 1.0 for name, size in sizes.items()}

@@ -106,7 +106,8 @@ def record(result: Result, status: str, error: str = "") -> dict[str, Any]:
         "image_errors": {name: list(error) for name, error in result.image_errors.items() if np.isfinite(error).all()},
         "undetermined": list(result.undetermined),
         "standard_error": {
-            key: [float(f"{value:.6g}") for value in np.ravel(error)] for key, error in result.standard_error.items()
+            key: [float(f"{value:.6g}") if np.isfinite(value) else None for value in np.ravel(error)]
+            for key, error in result.standard_error.items()
         },
         "verification": dict(result.verification),
         "phases": {name: round(seconds, 3) for name, seconds in result.phases.items()},

@@ -124,7 +124,7 @@ class RunRecord(BaseModel):
         problem: description of the problem.
         resumed: steps at which it was resumed.
         image_errors, undetermined, phases: see `Result`.
-        standard_error: standard errors of each number, {key: one value per element}; see `Result`.
+        standard_error: standard errors of each number, {key: one value per element}, None for infinite; see `Result`.
         verification: see `Result`; empty for runs that were not verified.
         error: exception by which the run failed; "" for none.
     """
@@ -152,7 +152,7 @@ class RunRecord(BaseModel):
     resumed: list[_Count] = []
     image_errors: dict[StrictStr, tuple[_Seconds, _Seconds]] = {}
     undetermined: list[StrictStr] = []
-    standard_error: dict[StrictStr, list[_Seconds]] = {}
+    standard_error: dict[StrictStr, list[_Seconds | None]] = {}
     verification: dict[StrictStr, Any] = {}
     phases: dict[StrictStr, _Seconds] = {}
     error: StrictStr = ""

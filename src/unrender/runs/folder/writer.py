@@ -184,6 +184,7 @@ class RunWriter(Callback):
                 image_errors=images.errors,
                 sensitivity=images.sensitivity,
                 undetermined=images.undetermined,
+                standard_error=images.standard_error,
                 warnings=[*result.warnings, *images.warnings],
             )
             result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)

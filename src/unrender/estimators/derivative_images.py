@@ -1,0 +1,137 @@
+"""Products of derivative images over pixels, from two independent halves, for Gauss-Newton matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.statistics import scores
+
+__all__ = ["LossWeights", "Products", "noise_weights", "products", "running_mean", "squared_slope"]
+
+_VALUES = 1 << 22
+"""Maximum number of image values that are converted to double precision at once."""
+_MEMORY = 0.3
+"""Weight of the latest image in the running mean of the variance."""
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Derivatives of the loss by the pixels, (H, W, 3) each.
+
+    Attributes:
+        first, second: ℓ' and ℓ'' at the image.
+        one, other: ℓ' at two independent halves of the image.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    one: np.ndarray
+    other: np.ndarray
+
+    def times(self, factor: np.ndarray) -> LossWeights:
+        """Return the weights times a factor per pixel, (H, W, 1)."""
+        return LossWeights(self.first * factor, self.second * factor, self.one * factor, self.other * factor)
+
+
+@dataclass
+class Products:
+    """Sums over pixels and channels, for m elements.
+
+    Attributes:
+        gradient: Σ J ℓ', (m,).
+        hessian: Σ J ℓ'' Jᵀ, (m, m).
+        noise: Σ N ℓ'' Nᵀ with the noise N of the mean of the halves, (m, m).
+        scores: covariance of Σ J ℓ' from the references' noise, (m, m), see `statistics.scores`.
+        squares: diagonal of Σ J Jᵀ, (m,).
+    """
+
+    gradient: np.ndarray
+    hessian: np.ndarray
+    noise: np.ndarray
+    scores: np.ndarray
+    squares: np.ndarray
+
+
+def noise_weights(variance: np.ndarray, limit: float) -> np.ndarray:
+    """Return the weight 1 / (1 + σ² / (c m)) of each pixel, with c = `limit` and the median m of the variances σ² above 0.
+
+    It is 1 where no pixel has noise.
+    """
+    noisy = variance[variance > 0.0]
+    return 1.0 / (1.0 + variance / (limit * float(np.median(noisy)))) if noisy.size else np.ones_like(variance)
+
+
+def running_mean(before: tuple[np.ndarray, ...], view: int, variance: np.ndarray) -> np.ndarray:
+    """Return the running mean of a view's variance (H, W, 1), from those of all views and the new one (H, W, 3)."""
+    new = variance.astype(np.float64).mean(axis=-1, keepdims=True)
+    return before[view] + _MEMORY * (new - before[view]) if before else new
+
+
+def squared_slope(halves: list[np.ndarray]) -> float:
+    """Return the sum of squared differences of neighbouring pixels of the mean image, averaged over both directions. It is unbiased by
+    noise, since it uses two independent halves (B, H, W, 3)."""
+    one, other = (half.mean(axis=0, dtype=np.float64) for half in halves)
+    return 0.5 * sum(float((np.diff(one, axis=axis) * np.diff(other, axis=axis)).sum()) for axis in (0, 1))
+
+
+def products(halves: list[np.ndarray], distances: np.ndarray, weights: LossWeights | None, block: int = 1) -> Products:
+    """Return the products of two independent halves of J.
+
+    Args:
+        halves: images (2 m, H, W, 3), first those of increased, then those of decreased parameters.
+        distances: distance of the two parameters of each difference, (m,); an element with 0 has no derivative.
+        weights: derivatives of the loss; None if only `squares` is needed.
+        block: side of the blocks of pixels over which all but `squares` are summed.
+    """
+    m = distances.size
+    total = Products(np.zeros(m), np.zeros((m, m)), np.zeros((m, m)), np.zeros((m, m)), np.zeros(m))
+    over = np.divide(1.0, distances, out=np.zeros(m), where=distances != 0.0)[:, None, None, None]
+    for rows in _rows(halves[0], max(block, 1)):
+        parts = [_difference(half[:, rows]) for half in halves]
+        one, other = (part * over for part in parts)
+        total.squares += (one * other).sum(axis=(1, 2, 3))
+        if weights is None:
+            continue
+        first, second, at_one, at_other = (
+            x[rows].astype(np.float64) for x in (weights.first, weights.second, weights.one, weights.other)
+        )
+        if block > 1:
+            one, other = (_pooled(part, block) * over for part in parts)
+            first, at_one, at_other = (_pooled(x, block) for x in (first, at_one, at_other))
+            second = _pooled(second, block) / _pooled(np.ones_like(second), block)
+        total.scores += scores.covariance((one * at_one).sum(axis=3), (other * at_other).sum(axis=3))
+        one, other, first, second = one.reshape(m, -1), other.reshape(m, -1), first.reshape(-1), second.reshape(-1)
+        total.gradient += 0.5 * ((one + other) @ first)
+        total.hessian += (one * second) @ other.T
+        noise_of_halves = 0.5 * (one - other)
+        total.noise += (noise_of_halves * second) @ noise_of_halves.T
+    total.hessian = 0.5 * (total.hessian + total.hessian.T)
+    return total
+
+
+def _pooled(images: np.ndarray, block: int) -> np.ndarray:
+    """Return sums over blocks of pixels, divided by the square root of their size, of images (..., H, W, 3)."""
+    for axis in (-3, -2):
+        starts = np.arange(0, images.shape[axis], block)
+        sizes = np.diff(np.append(starts, images.shape[axis]))
+        shape = [1] * images.ndim
+        shape[axis] = -1
+        images = np.add.reduceat(images, starts, axis=axis) / np.sqrt(sizes).reshape(shape)
+    return images
+
+
+def _difference(images: np.ndarray) -> np.ndarray:
+    """Return the first half of the images minus the second, (m, H, W, 3), in double precision."""
+    count = len(images) // 2
+    return images[:count].astype(np.float64) - images[count:]
+
+
+def _rows(images: np.ndarray, block: int) -> Iterator[slice]:
+    """Yield slices of full blocks of rows, with at most `_VALUES` values of all images if possible."""
+    height = images.shape[1]
+    step = max(_VALUES // max(images[:, :1].size * block, 1), 1) * block
+    for start in range(0, height, step):
+        yield slice(start, start + step)

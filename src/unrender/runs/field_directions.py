@@ -1,0 +1,207 @@
+"""Directions of textures and grids that change the pictures as given pictures do, by adjoints."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.rendering.renderer import RenderSession
+from unrender.runs.image_sensitivity import MAP_AXES, adjoint_spp, around, derivative_session
+from unrender.runs.numbers import Differences, Numbers
+from unrender.scene.bounds import off_ends
+from unrender.scene.problem import Problem
+from unrender.scene.render import as_tree, view_request
+
+__all__ = ["beside_fields", "fields_of"]
+
+_MOST_VALUES = 1 << 25
+"""Values of all states of textures and grids up to which they are tested."""
+_PATHS, _MOST_LAUNCHES = 1 << 16, 4
+"""Path budget and most launches of one direction."""
+_ROUNDS, _FIRST, _CHANGE = 8, 0.25, 64.0
+"""Most rounds of directions; the first factor of a direction, and by how much it may fall."""
+_INDEPENDENT = 1e-3
+"""Eigenvalue relative to the largest below which a direction changes the pictures as the others do."""
+_SHRINKS = 0.9
+"""Ratio of a number's squared remainder to that of the round before, up to which there is another round."""
+_RIDGE = 0.3
+"""Sensitivity relative to the median below which cells hardly take part."""
+
+
+def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Return the keys of textures, grids and lists beside the numbers.
+
+    Those without a sensitivity or with a prior, and meshes, count as fixed. There are none if their states would need too much memory.
+    """
+    known = numbers.problem.renderer.parameters()
+    chosen = [
+        key
+        for key, values in sensitivities.items()
+        if key not in numbers.keys
+        and known[key].perturbable
+        and not known[key].welded
+        and numbers.problem.unknowns[key].prior is None
+        and values.any()
+    ]
+    states = 2 * _ROUNDS * (1 + numbers.count)
+    return tuple(chosen) if states * sum(sensitivities[key].size for key in chosen) <= _MOST_VALUES else ()
+
+
+def beside_fields(
+    numbers: Numbers,
+    differences: Differences,
+    sensitivities: Mapping[str, np.ndarray],
+    change: float,
+    key: Key,
+    until: float,
+) -> tuple[Numbers, Differences] | None:
+    """Return numbers with directions of textures and grids that trade off against them, and the differences along both.
+
+    The first directions change the pictures as the numbers and the residual do, as far as one adjoint tells. The next ones change them
+    as the remainder does. There are none if the time is over, or no texture or grid changes the pictures.
+
+    Args:
+        numbers: the numbers alone.
+        differences: differences along each number.
+        sensitivities: see `unrender.sensitivity`.
+        change: root mean square of a difference.
+        key: key of the random numbers.
+        until: time after which nothing is started.
+    """
+    keys = fields_of(numbers, sensitivities)
+    if not keys:
+        return None
+    adjoints = _Adjoints(numbers, keys, sensitivities, key)
+    active, squares = np.arange(numbers.count), differences.squares()[0]
+    residual = numbers.pictures(numbers.point[None], key.fold(2)) - numbers.references()
+    targets, made = np.concatenate([differences.average(), residual]), numbers
+    parts: list[Differences] = []
+    longest = 0.0
+    for index in range(_ROUNDS):
+        started = time.perf_counter()
+        if not len(targets) or started + longest > until:
+            break
+        made = made.beside(adjoints.of(targets))
+        columns = np.eye(len(made.point))[:, -len(targets) :]
+        first = made.differences(_FIRST * columns, key.fold(3 + 2 * index))
+        changes = np.sqrt(np.maximum(*first.squares()) / first.one[0].size)
+        factors = np.clip(change / np.maximum(changes, 1e-30), 1.0 / _CHANGE, 1.0 / _FIRST)
+        last = made.differences(_FIRST * columns * factors, key.fold(4 + 2 * index))
+        parts = [_longer(one, len(made.point)) for one in (*parts, last)]
+        remainder = _remainder(differences, _joined(parts))
+        before, squares = squares, remainder.squares()[0]
+        active = active[squares[active] < _SHRINKS * before[active]]
+        targets = remainder.average()[active]
+        longest = max(longest, time.perf_counter() - started)
+    return _independent(made, differences, _joined(parts)) if parts else None
+
+
+def _longer(differences: Differences, rows: int) -> Differences:
+    """Return the differences with zeros for further factors."""
+    missing = rows - len(differences.directions)
+    directions = np.pad(differences.directions, ((0, missing), (0, 0)))
+    return Differences(directions, differences.one, differences.other)
+
+
+def _joined(parts: Sequence[Differences]) -> Differences:
+    directions = np.concatenate([part.directions for part in parts], axis=1)
+    one, other = (np.concatenate([getattr(part, half) for part in parts]) for half in ("one", "other"))
+    return Differences(directions, one, other)
+
+
+def _remainder(numbers: Differences, of: Differences) -> Differences:
+    """Return the numbers' differences less what a sum of the others explains."""
+    halves = [x.reshape(len(x), -1) for x in (of.one, of.other, numbers.one, numbers.other)]
+    products = 0.5 * (halves[0] @ halves[3].T + halves[1] @ halves[2].T)
+    factors = (np.linalg.pinv(of.matrix(), rcond=_INDEPENDENT, hermitian=True) @ products).T
+    one, other = (x - np.tensordot(factors, y, axes=1) for x, y in ((numbers.one, of.one), (numbers.other, of.other)))
+    return Differences(numbers.directions, one, other)
+
+
+def _independent(
+    numbers: Numbers, differences: Differences, of_fields: Differences
+) -> tuple[Numbers, Differences] | None:
+    """Return the numbers with those sums of directions that change the pictures independently, and all differences."""
+    matrix = of_fields.matrix()
+    if not np.isfinite(matrix).all():
+        return None
+    eigenvalues, vectors = np.linalg.eigh(matrix)
+    used = eigenvalues > max(_INDEPENDENT * eigenvalues[-1], 0.0)
+    if not used.any():
+        return None
+    sums = vectors[:, used] * np.sqrt(matrix.trace() / len(matrix) / eigenvalues[used])
+    factors = (of_fields.directions @ sums)[numbers.count :]
+    longest = np.maximum(np.abs(factors).max(axis=0), 1.0)
+    fields = {key: np.tensordot((factors / longest).T, x, axes=1) for key, x in numbers.fields.items()}
+    alone = numbers.alone()
+    count = int(used.sum())
+    made, one, other = (
+        alone.beside(fields),
+        *(np.tensordot((sums / longest).T, x, axes=1) for x in (of_fields.one, of_fields.other)),
+    )
+    own = np.zeros((len(made.point), count))
+    own[alone.count :] = np.eye(count)
+    return made, _joined([_longer(differences, len(made.point)), Differences(own, one, other)])
+
+
+class _Adjoints:
+    """Approximate solutions w of J w = d, with the derivative J of the pictures by textures and grids.
+
+    They are Jᵀ d divided by the diagonal of JᵀJ, the first iterate of Jacobi's method.
+
+    Args:
+        numbers: point and views.
+        keys: keys of the textures and grids.
+        sensitivities: {key: √diag(JᵀJ)}, see `unrender.sensitivity`.
+        key: key of the random numbers.
+    """
+
+    def __init__(self, numbers: Numbers, keys: Sequence[str], sensitivities: Mapping[str, np.ndarray], key: Key):
+        self._numbers, self._problem, self._key = numbers, numbers.problem, key
+        self._diagonals = {k: _diagonal(sensitivities[k]) for k in keys}
+        self._reach = {k: _reach(self._problem, k, numbers.values[k]) for k in keys}
+        tree = as_tree(self._problem, numbers.values)
+        self._tree = off_ends(tree, self._problem.renderer.parameters())
+        session, _ = derivative_session(self._problem)  # that of the sensitivities, whose kernels are compiled
+        assert session is not None
+        self._session: RenderSession = session
+        pixels = sum(height * width for height, width in (self._problem.sizes[view] for view in numbers.views))
+        self._spp = adjoint_spp(self._problem)
+        self._launches = min(max(_PATHS // (self._spp * pixels), 1), _MOST_LAUNCHES)
+
+    def of(self, pictures: np.ndarray) -> dict[str, np.ndarray]:
+        """Return {key: (k, *shape)} for pictures (k, P, 3) with the roots of the pixels' weights. Their largest change is that allowed."""
+        sums = {key: np.zeros((len(pictures), *x.shape)) for key, x in self._diagonals.items()}
+        for launch in range(self._launches):
+            for view, parts in zip(self._numbers.views, self._numbers.by_view(pictures), strict=True):
+                seed = self._key.fold(launch).fold(view).uint32()
+                rendering = self._session.image(self._tree, view_request(self._problem, view, self._spp, seed))
+                shape, roots = arrays.shape(rendering.images), self._numbers.roots(view)
+                for index, part in enumerate(parts):
+                    weights = (part.reshape(-1, 3) * roots).reshape(shape)
+                    gradient = self._session.adjoint(self._tree, rendering.paths, self._problem.renderer.array(weights))
+                    for key in sums:
+                        sums[key][index] += arrays.numpy(gradient[key]).reshape(sums[key][index].shape)
+        directions = {key: x / self._diagonals[key] for key, x in sums.items()}
+        lengths = [np.abs(x).reshape(len(x), -1).max(axis=1) / self._reach[key] for key, x in directions.items()]
+        longest = np.maximum(np.max(lengths, axis=0), 1e-300)
+        return {key: x / longest.reshape(-1, *(1,) * (x.ndim - 1)) for key, x in directions.items()}
+
+
+def _diagonal(sensitivity: np.ndarray) -> np.ndarray:
+    """Return the smoothed squares of a sensitivity, without cells that are hardly seen."""
+    own = around(sensitivity)[..., None] if sensitivity.ndim >= MAP_AXES else np.abs(sensitivity)
+    squares = np.square(own, dtype=np.float64)
+    return np.broadcast_to(squares + _RIDGE**2 * np.median(squares[squares > 0.0]), sensitivity.shape)
+
+
+def _reach(problem: Problem, key: str, values: np.ndarray) -> float:
+    """Return the largest change of an element: half the largest value, or a quarter of the range."""
+    low, high = problem.unknowns[key].bounds
+    if low is not None and high is not None:
+        return 0.25 * (high - low)
+    return 0.5 * (float(np.abs(values).max()) or 1.0)

@@ -1,0 +1,216 @@
+"""A problem's numbers at a point, with directions of its textures and grids, and differences of pictures along them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.core.random import Key
+from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.scene.problem import Problem
+from unrender.scene.render import power_of_two
+
+__all__ = ["Differences", "Numbers"]
+
+_MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
+"""Elements of all numbers and of one, up to which they are tested."""
+_MOST_VALUES = 1 << 25
+"""Values of the pictures of one pass, up to which there is a check."""
+_MOST_VIEWS = 4
+_PATHS, _SPP = 1 << 18, (4, 32)
+"""Path budget of the pictures of one pass, and limits of their samples per pixel."""
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Differences of pictures along K directions.
+
+    Attributes:
+        directions: half of the differences of parameters, (n, K).
+        one, other: halves of the pictures' differences, independent of each other, (K, P, 3) with roots of the pixels' weights.
+    """
+
+    directions: np.ndarray
+    one: np.ndarray
+    other: np.ndarray
+
+    def squares(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sums of squares over pixels and channels without noise, and their standard errors, (K,) each."""
+        products = (self.one * self.other).sum(axis=2)
+        return products.sum(axis=1), products.std(axis=1) * math.sqrt(products.shape[1])
+
+    def average(self) -> np.ndarray:
+        """Return the mean of both halves, (K, P, 3)."""
+        return 0.5 * (self.one + self.other)
+
+    def matrix(self) -> np.ndarray:
+        """Return the products of all pairs of differences without noise, (K, K)."""
+        product = self.one.reshape(len(self.one), -1) @ self.other.reshape(len(self.other), -1).T
+        return 0.5 * (product + product.T)
+
+    def mean(self, other: Differences, number: int) -> Differences:
+        """Return the mean of these `number` differences and one more along the same directions."""
+        share = 1.0 / (number + 1.0)
+        one, two = (a + share * (b - a) for a, b in ((self.one, other.one), (self.other, other.other)))
+        return Differences(self.directions, one, two)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The n numbers of a problem at a point, and the factors of k directions of its textures and grids.
+
+    Attributes:
+        problem: problem with views and scene.
+        values: {key: array} of all unknowns.
+        keys: keys of the numbers.
+        views: indices of the rendered views.
+        point: numbers, then the factors, which are 0, (n + k,).
+        sizes: sizes of the numbers, by which changes are judged, (n,); 0 where nothing is known.
+        limits: longest difference of each, (n + k,).
+        rigid: whether a number is of a pose, (n,).
+        spp: samples per pixel of a picture.
+        fields: {key: (k, *shape)}, directions of textures and grids.
+    """
+
+    problem: Problem
+    values: Mapping[str, np.ndarray]
+    keys: tuple[str, ...]
+    views: tuple[int, ...]
+    point: np.ndarray
+    sizes: np.ndarray
+    limits: np.ndarray
+    rigid: np.ndarray
+    spp: int
+    fields: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> Numbers | None:
+        known, count = problem.renderer.parameters(), len(problem.views)
+        views = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
+        sensors = {problem.views[view].sensor for view in views}
+        keys = [
+            key
+            for key, x in values.items()
+            if x.ndim <= 1
+            and x.size <= _MOST_OF_ONE
+            and known[key].perturbable
+            and problem.unknowns[key].prior is None
+            and (known[key].sensor is None or known[key].sensor in sensors)
+        ]
+        elements = sum(values[key].size for key in keys)
+        pixels = sum(math.prod(problem.sizes[view]) for view in views)
+        if not keys or elements > _MOST_ELEMENTS or 6 * elements * pixels > _MOST_VALUES:
+            return None
+        sizes, limits = [], []
+        for key in keys:
+            low, high = problem.unknowns[key].bounds
+            size = max(float(np.abs(x[key]).max()) for x in (values, start))
+            limit = 0.5 * (size or known[key].length)
+            if known[key].rigid:
+                limit = max(0.5 * known[key].length, limit)
+            elif low is not None and high is not None:
+                size, limit = min(size, high - low), 0.25 * (high - low)
+            elif low is not None:  # positive without an end: what counts is the ratio
+                size = float(np.abs(values[key]).max()) or size
+                limit = 0.5 * size
+            sizes += [size] * values[key].size
+            limits += [limit] * values[key].size
+        rigid = np.concatenate([np.full(values[key].size, known[key].rigid) for key in keys])
+        spp = min(max(_PATHS // (2 * elements * pixels), _SPP[0]), _SPP[1])
+        point = np.concatenate([np.ravel(values[key]).astype(np.float64) for key in keys])
+        return cls(
+            problem, values, tuple(keys), tuple(views), point, np.array(sizes), np.array(limits), rigid,
+            power_of_two(spp),
+        )  # fmt: skip
+
+    @property
+    def count(self) -> int:
+        """Number of elements of the numbers, n."""
+        return len(self.sizes)
+
+    def alone(self) -> Numbers:
+        """Return the numbers without directions of other unknowns."""
+        return replace(self, fields={}, point=self.point[: self.count], limits=self.limits[: self.count])
+
+    def beside(self, fields: Mapping[str, np.ndarray]) -> Numbers:
+        """Return the numbers with directions {key: (k, *shape)} of other unknowns in addition to their own."""
+        added = len(next(iter(fields.values())))
+        own = {key: np.concatenate([self.fields[key], w]) if key in self.fields else w for key, w in fields.items()}
+        point, limits = (np.append(x, np.full(added, of)) for x, of in ((self.point, 0.0), (self.limits, 1.0)))
+        return replace(self, fields=own, point=point, limits=limits)
+
+    def parts(self, points: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the unknowns that points (B, n + k) change, {key: (B, *shape)}, within their bounds."""
+        count, factors = len(points), points[:, self.count :]
+        parts = {k: points[:, of].reshape(count, *self.values[k].shape) for k, of in self.places().items()}
+        if factors.any():
+            for key, directions in self.fields.items():
+                parts[key] = self.values[key] + np.tensordot(factors, directions, axes=1)
+        return {key: np.asarray(self.problem.unknowns[key].project(x), np.float32) for key, x in parts.items()}
+
+    def places(self) -> dict[str, slice]:
+        """Return where the numbers of each key are."""
+        ends = np.cumsum([self.values[key].size for key in self.keys])
+        return {
+            key: slice(int(end) - self.values[key].size, int(end)) for key, end in zip(self.keys, ends, strict=True)
+        }
+
+    def inside(self, points: np.ndarray) -> np.ndarray:
+        """Return the points (B, n + k) with the numbers within their bounds."""
+        own = np.zeros_like(points)
+        own[:, : self.count] = points[:, : self.count]
+        parts = [x.reshape(len(points), -1) for x in self.parts(own).values()]
+        return np.concatenate([*parts, points[:, self.count :].astype(np.float32)], axis=1)
+
+    def pictures(self, points: np.ndarray, key: Key) -> np.ndarray:
+        """Return the pictures (B, P, 3) of all views at points (B, n + k), from the same random numbers."""
+        count = len(points)
+        batch = {k: np.broadcast_to(x, (count, *x.shape)) for k, x in self.values.items()} | self.parts(points)
+        session: RenderSession = self.problem.renderer.prepare(list(batch), None, derivatives=False)
+        parts = []
+        for view in self.views:
+            request = SampleRequest(self.problem.views[view].sensor, self.spp, key.fold(view).uint32())
+            images = arrays.numpy(session.image_batch(batch, request)).astype(np.float64)
+            parts.append(images.reshape(count, -1, 3) * self.roots(view))
+        return np.concatenate(parts, axis=1)
+
+    def by_view(self, pictures: np.ndarray) -> list[np.ndarray]:
+        """Return pictures (k, P, 3) of all views as (k, H, W, 3) of each view."""
+        sizes = [self.problem.sizes[view] for view in self.views]
+        ends = np.cumsum([height * width for height, width in sizes])[:-1]
+        parts = np.split(pictures, ends, axis=1)
+        return [part.reshape(len(pictures), *size, 3) for part, size in zip(parts, sizes, strict=True)]
+
+    def references(self) -> np.ndarray:
+        """Return the references (P, 3) with the roots of the pixels' weights."""
+        of = [self.problem.views[view].reference for view in self.views]
+        flat = [np.asarray(x, np.float64).reshape(-1, 3) * self.roots(v) for x, v in zip(of, self.views, strict=True)]
+        return np.concatenate(flat)
+
+    def roots(self, view: int) -> np.ndarray:
+        """Return the roots of the weights of a view's pixels, (P, 1)."""
+        mask, (height, width) = self.problem.views[view].mask, self.problem.sizes[view]
+        weights = np.ones(height * width) if mask is None else np.asarray(mask, np.float64).reshape(-1)
+        return np.sqrt(weights * self.problem.views[view].weight)[:, None]
+
+    def differences(self, directions: np.ndarray, key: Key) -> Differences:
+        """Return the differences along directions (n, K) of some length."""
+        count = directions.shape[1]
+        ends = self.inside(np.concatenate([self.point + directions.T, self.point - directions.T]))
+        halves = [self.pictures(ends, key.fold(half)) for half in (0, 1)]
+        one, other = (0.5 * (half[:count] - half[count:]) for half in halves)
+        return Differences(0.5 * (ends[:count] - ends[count:]).T.astype(np.float64), one, other)
+
+    def slope(self) -> float:
+        """Return the root mean square of the references' differences of neighbouring pixels, or 1 % of the references."""
+        squares, total = 0.0, 0
+        for view in self.views:
+            image = np.asarray(self.problem.views[view].reference, np.float64)
+            squares += 0.5 * sum(float(np.square(np.diff(image, axis=axis)).sum()) for axis in (0, 1))
+            total += image.size
+        least = 0.01 * math.sqrt(float(np.mean(np.square(self.references()))))
+        return max(math.sqrt(squares / total), least, 1e-30)
