@@ -6,7 +6,6 @@ python -m benchmarks results               write a page per benchmark, with figu
 python -m benchmarks coverage [options]    every plugin of Mitsuba; the site has a page of the record
 python -m benchmarks gpu                   the plan for a GPU, in slices; `--help` tells its options
 python -m benchmarks golden                compare short descents with their record; `--record` writes it
-python -m benchmarks alarms [options]      statuses and warnings of `auto` over the suite's rows
 """
 
 from __future__ import annotations
@@ -47,10 +46,6 @@ def main(arguments: Sequence[str]) -> int:
         from benchmarks.golden.cli import main as golden
 
         return golden(arguments[1:])
-    if arguments[0] == "alarms":
-        from benchmarks.alarms.cli import main as alarms
-
-        return alarms(arguments[1:])
     if arguments[0] == "coverage":
         from benchmarks.coverage.cli import main as coverage
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unrender.app.exporting import blender, formats, gltf, textures, usd
+from unrender.app.exporting import formats, gltf, textures, usd
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.app.exporting.materials import Material
 
@@ -115,7 +115,7 @@ def test_charts_of_both_kinds_are_told_apart() -> None:
 def test_blender_looks_the_light_up_where_mitsuba_does() -> None:
     """Both programs' formulas of the picture's coordinates, for a light that is turned."""
     turned = np.array(mi.ScalarTransform4f().rotate([0.48, 0.8, 0.36], 70).matrix, float)[:3, :3]
-    found = blender.settings(asset(quad(), environment=np.ones((2, 4, 3)), environment_to_world=turned))
+    found = gltf.blender_settings(asset(quad(), environment=np.ones((2, 4, 3)), environment_to_world=turned))
     directions = np.random.default_rng(0).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     x, y, z = np.linalg.inv(turned) @ directions.T
@@ -132,7 +132,7 @@ def test_blenders_cameras_see_what_mitsubas_do() -> None:
     sensor = mi.load_dict({"type": "perspective", "fov": 38, "fov_axis": "x", "to_world": pose, "film": film,
                            "principal_point_offset_x": offset[0], "principal_point_offset_y": offset[1]})  # fmt: skip
     camera = Camera("c", np.array(pose.matrix, float), 38.0, offset, size, (0.1, 10.0))
-    (found,) = blender.settings(asset(quad(), cameras=(camera,)))["cameras"]
+    (found,) = gltf.blender_settings(asset(quad(), cameras=(camera,)))["cameras"]
     places = np.random.default_rng(1).uniform(size=(20, 2))
     ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(*places.T.astype(np.float32)), mi.Point2f(0.5))
     # Blender: a sensor as wide as 1, shifted in widths; right, up, backwards.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unrender.app.exporting import blender, gltf, ready_made, textures, usd
+from unrender.app.exporting import gltf, ready_made, textures, usd
 from unrender.app.exporting.asset import Asset, Part
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
@@ -132,7 +132,7 @@ FORMATS = {
     "obj": Format(_in_folder("obj", write_obj), ("obj",)),
     "ply": Format(_in_folder("ply", write_ply), ("ply",)),
     "environment": Format(_write_environment, ("environment.exr", "environment.hdr")),
-    "blender": Format(blender.write, (blender.SCRIPT,), ("glb", "environment"), gltf.check_installed),
+    "blender": Format(gltf.write_blender_script, (gltf.BLENDER_SCRIPT,), ("glb", "environment"), gltf.check_installed),
     "usd": Format(usd.write, (usd.FILE,), check_installed=usd.check_installed),
 }
 """The formats except that of Mitsuba."""

@@ -1,4 +1,4 @@
-"""glTF 2.0 binary: one file with meshes, materials and maps.
+"""glTF 2.0 binary: one file with meshes, materials and maps; and a script that opens it in Blender as Mitsuba renders it.
 
 Khronos Group, "glTF 2.0 specification". Texture coordinates and winding are Mitsuba's own, +Y is up, roughness is perceptual
 (α = roughness²). Base colour is sRGB; roughness and metallic are the green and blue channels of one map.
@@ -7,13 +7,17 @@ Khronos Group, "glTF 2.0 specification". Texture coordinates and winding are Mit
 from __future__ import annotations
 
 import importlib.util
+import json
+from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from unrender.app.exporting import textures
-from unrender.app.exporting.asset import Asset, Part
+from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.core.errors import InputError
+from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 
 if TYPE_CHECKING:
     import pygltflib
@@ -144,3 +148,44 @@ class _Writer:
         material.extensions = {name: value}
         if name not in self._gltf.extensionsUsed:
             self._gltf.extensionsUsed.append(name)
+
+
+BLENDER_SCRIPT = "open_in_blender.py"
+_TEMPLATE, _PLACE = "open_in_blender.py.txt", '"SETTINGS"'
+# The y axis points up in glTF and Mitsuba, the z axis in Blender: its importer maps (x, y, z) to (x, -z, y).
+_TO_BLENDER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+# The map coordinate of a direction (x, y, z) is u = atan2(x, -z) / 2π in Mitsuba, and that of (x, -z, y) is u = 1/2 - atan2(-z, x) / 2π
+# in Blender: a quarter more.
+_QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+def write_blender_script(asset: Asset, folder: Path) -> None:
+    """Write the script to the folder of asset.glb and environment.exr."""
+    template = resources.files("unrender.app.exporting").joinpath(_TEMPLATE).read_text(encoding="utf-8")
+    text = json.dumps(blender_settings(asset), indent=1, allow_nan=False)
+    (folder / BLENDER_SCRIPT).write_text(template.replace(_PLACE, f"json.loads({text!r})"), encoding="utf-8")
+
+
+def blender_settings(asset: Asset) -> dict[str, Any]:
+    """Return the settings of the script: cameras, with the matrices of Blender and lens shifts in units of the sensor width, and the
+    rotation of directions before the look-up in the environment map."""
+    to_light = _QUARTER @ _TO_BLENDER @ np.linalg.inv(asset.environment_to_world) @ _TO_BLENDER.T
+    return {
+        "environment": None if asset.environment is None else "environment.exr",
+        "environment_rotation": to_light.tolist(),
+        "cameras": [_blender_camera(camera) for camera in asset.cameras],
+    }
+
+
+def _blender_camera(camera: Camera) -> dict[str, Any]:
+    turned = np.eye(4)
+    turned[:3, :3] = _TO_BLENDER
+    width, height = camera.size
+    return {
+        "name": camera.name,
+        "matrix": (turned @ camera.to_world @ MITSUBA_TO_OPENGL).tolist(),
+        "angle_x": float(np.radians(camera.x_fov)),
+        "shift": [camera.offset[0], -camera.offset[1] * height / width],
+        "size": [width, height],
+        "clip": list(camera.clip),
+    }
