@@ -22,12 +22,15 @@ from unrender.optimizers.transforms import (
     DecayingSum,
     FittedSobolev,
     GradientMean,
+    LastingAgreement,
     PerParameter,
     ScaleByDeviation,
     ScaleByRms,
     ScheduleFreeAverage,
     WienerShrinkage,
 )
+from unrender.optimizers.transforms.agreement_rate import Agreement
+from unrender.optimizers.transforms.lasting_agreement import GradientBlocks
 from unrender.preconditioners import Sobolev
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack
 from unrender.scene.upsampling import restarted
@@ -41,6 +44,7 @@ CHAINS: dict[str, Callable[[], tuple[Any, ...]]] = {
     "DecayingSum": lambda: (DecayingSum(0.5),),
     "FittedSobolev": lambda: (SMOOTH,),
     "GradientMean": lambda: (GradientMean(),),
+    "LastingAgreement": lambda: (SMOOTH, LastingAgreement(2), AgreementRate()),
     "PerParameter": lambda: (
         PerParameter(("map",), (GradientMean(), ScaleByRms()), (ScaleByRms(), ScheduleFreeAverage())),
     ),
@@ -138,6 +142,7 @@ def test_schedule_free_is_its_chain() -> None:
     recipe = ScheduleFree(0.1, preconditioner=smooth, preconditioned=("map",))
     parts = (
         FittedSobolev(smooth, ("map",)),
+        LastingAgreement(),
         AgreementRate(),
         ScaleByRms(0.95, 1e-12, long_memory=True),
         ApplyPreconditioner(),
@@ -145,6 +150,51 @@ def test_schedule_free_is_its_chain() -> None:
         ScheduleFreeAverage(),
     )
     same(take(Chain(parts, 0.1), estimates(8))[2], take(recipe, estimates(8))[2])
+
+
+def reused(memory: float, signal: float, steps: int, parts: tuple[Any, ...]) -> Any:
+    """Return the state of a chain after gradients of a constant signal and of noise that fades by `memory` a step."""
+    rng, noise = np.random.default_rng(1), np.zeros((16, 16, 1), np.float32)
+    start = {"map": noise}
+    chain = Chain(parts, 1e-3)
+    state = chain.init(start)
+    for _ in range(steps):
+        noise = memory * noise + np.sqrt(1 - memory**2) * rng.normal(0.0, 1.0, noise.shape).astype(np.float32)
+        _, state = chain.update(Estimate(0.0, {"map": signal + noise}), state, start)
+    return state
+
+
+def lasting(signal: float, memory: float) -> float:
+    parts = (FittedSobolev(), LastingAgreement(64))
+    return reused(memory, signal, 400, parts).of(GradientBlocks).fractions["map"]
+
+
+def test_noise_that_gradients_reuse_does_not_last() -> None:
+    assert abs(lasting(0.0, 0.9)) < 0.1
+    assert lasting(3.0, 0.9) == pytest.approx(9.0 / 9.9, abs=0.05)
+    assert lasting(0.5, 0.9) == pytest.approx(0.25 / 1.15, abs=0.1)
+    assert lasting(0.0, 0.999) > 0.5, "noise that lasts as long as blocks cannot be told from a signal"
+
+
+def test_the_rate_decays_although_gradients_reuse_noise() -> None:
+    with_it, without = (
+        reused(0.95, 0.0, 900, parts).of(Agreement).log_rate["map"]
+        for parts in ((FittedSobolev(), LastingAgreement(), AgreementRate()), (FittedSobolev(), AgreementRate()))
+    )
+    assert with_it < without - 0.5
+    steps = (FittedSobolev(), LastingAgreement(), AgreementRate())
+    assert reused(0.95, 3.0, 900, steps).of(Agreement).log_rate["map"] > 0.9, "a signal that lasts"
+
+
+def test_it_is_told_what_lasts() -> None:
+    chain = Chain((FittedSobolev(), LastingAgreement(2)), 1e-3)
+    state = chain.init(START)
+    assert chain.choices(state) == ()
+    for step in range(30):
+        gradient = {"map": START["map"], "number": np.full(1, (-1) ** (step // 6), np.float32)}
+        _, state = chain.update(Estimate(0.0, gradient), state, START)
+    (line,) = chain.choices(state)
+    assert line.startswith("agreement of gradients that lasts: number ")
 
 
 def test_groups_of_parameters_move_as_if_alone() -> None:

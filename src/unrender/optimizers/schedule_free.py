@@ -14,6 +14,7 @@ from unrender.optimizers.chain import ChainState, Recipe
 from unrender.optimizers.transforms.agreement_rate import AgreementRate
 from unrender.optimizers.transforms.base import StepTransform, checked_keys
 from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, FittedSobolev
+from unrender.optimizers.transforms.lasting_agreement import LastingAgreement
 from unrender.optimizers.transforms.scale import ScaleByRms
 from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
 from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
@@ -31,9 +32,10 @@ class ScheduleFree(Recipe):
         z ← z − η_t w g / (√v̂ + ε),   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
 
     The result of a run is y, which is near x. An average has less noise than an iterate, and slowly moving parameters suit estimators
-    that reuse earlier samples. The chain has six transforms, whose docstrings contain their formulas:
+    that reuse earlier samples. The chain has seven transforms, whose docstrings contain their formulas:
 
     - `FittedSobolev` smooths the gradients of `preconditioned` by S, whose strength it fits to them.
+    - `LastingAgreement` estimates how much of the agreement of gradients is reused noise.
     - `AgreementRate` sets η_t. The rate needs no horizon; it decays with the gradient's noise.
     - `ScaleByRms` divides by √v̂ + ε. All gradients have equal weight in v̂ from step 1 / (1 − β₂) on.
     - `ApplyPreconditioner` applies S again, to the direction.
@@ -105,6 +107,7 @@ class ScheduleFree(Recipe):
         shrunk = self.preconditioned if self.wiener and self.preconditioner is not None else ()
         return (
             self._smoothing,
+            LastingAgreement(),
             AgreementRate(self.growth, self.decay, self.reparameterised),
             ScaleByRms(self.beta_2, self.epsilon, long_memory=True),
             ApplyPreconditioner(),

@@ -2,6 +2,7 @@
 
 from unrender.optimizers.transforms.agreement_rate import AgreementRate
 from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, FittedSobolev
+from unrender.optimizers.transforms.lasting_agreement import LastingAgreement
 from unrender.optimizers.transforms.momentum import DecayingSum, GradientMean
 from unrender.optimizers.transforms.per_parameter import PerParameter
 from unrender.optimizers.transforms.scale import ClipDirection, ScaleByDeviation, ScaleByRms
@@ -15,6 +16,7 @@ __all__ = [
     "DecayingSum",
     "FittedSobolev",
     "GradientMean",
+    "LastingAgreement",
     "PerParameter",
     "ScaleByDeviation",
     "ScaleByRms",

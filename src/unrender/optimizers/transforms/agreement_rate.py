@@ -22,6 +22,8 @@ from unrender.optimizers.transforms.base import (
 
 _DELAY = 10.0
 """τ of the docstring, in steps."""
+_EARLY = 160.0
+"""T of the docstring, in steps."""
 _STEEPEST = 0.6
 """Largest power of 1/t in the decay: between 1/2 and 1 for averaged iterates, as in Polyak and Juditsky 1992."""
 _MEMORY = 0.8
@@ -54,12 +56,15 @@ class Agreement(TransformState):
 class AgreementRate(StepTransform):
     """Adapt each parameter's learning rate to the mean correlation ρ of its successive gradients.
 
-        log η_{t+1} = log η_t + q max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − max(0, ρ)), 0.6) / (t + τ)
+        log η_{t+1} = log η_t + q_t max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − max(0, ρ)), 0.6) / (t + τ)
 
-    with τ = 10. The rate grows while gradients agree, shrinks where they oppose each other, as after too long steps, and decays as t^-0.6
-    once they are noise. s = 1/(3 √n) is the standard error of ρ for random gradients of n elements. The rate is at most 3 times the
-    first, times the growth of the parameter. At a step that reduces smoothing it is at most 0.3 times the first. Needs a `FittedSobolev`
-    before it, which stores the last gradient.
+    with q_t = q min(1, T / t), T = 160 and τ = 10. The rate grows while gradients agree, shrinks where they oppose each other, as after too
+    long steps, and decays as t^-0.6 once they are noise. After T steps it grows at most as a power of t. ρ is multiplied by the fraction
+    of the agreement that is not reused noise (`SmoothingChange.confirmed` and `lasting`). s = 1/(3 √n) is the standard error of ρ for
+    random gradients of n elements.
+
+    The rate is at most 3 times the first, times the growth of the parameter. At a step that reduces smoothing it is at most 0.3 times the
+    first. Needs a `FittedSobolev` before it, which stores the last gradient.
 
     Args:
         growth: q, >= 0; 0 for a rate that never grows.
@@ -91,7 +96,7 @@ class AgreementRate(StepTransform):
             for key, (cosine, size) in _measured(update.gradient, previous, update.parameters).items():
                 rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
                 fit, shape = update.smoothing.get(key, SMOOTHING_UNCHANGED), arrays.shape(update.gradient[key])
-                change = self._change(min(rho, rho * fit.confirmed), shape, update.made)
+                change = self._change(min(rho, rho * min(fit.confirmed, fit.lasting)), shape, update.made)
                 grown = 1.0 if key in self.unsized else max(1.0, size / state.sizes[key])
                 most = math.log(_MOST_GROWTH * grown if fit.gain == 1.0 else _REFINED if fit.gain > 1.0 else 1.0)
                 log_rate[key] = min(state.log_rate[key] + change, most)
@@ -108,7 +113,8 @@ class AgreementRate(StepTransform):
         """Return the change of the rate's logarithm in one step."""
         power = min(self.decay * (1.0 - max(0.0, correlation)), _STEEPEST)
         error = 1.0 / math.sqrt(_PAIRS * max(1, math.prod(shape)))
-        change = self.growth * (max(0.0, 2.0 * (correlation - error) - 1.0) - 2.0 * max(0.0, -correlation - error))
+        rise = max(0.0, 2.0 * (correlation - error) - 1.0) * min(1.0, _EARLY / made)
+        change = self.growth * (rise - 2.0 * max(0.0, -correlation - error))
         return change - power / (made + _DELAY)
 
 

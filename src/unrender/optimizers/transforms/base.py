@@ -24,6 +24,7 @@ class SmoothingChange:
         gain: |S g|² relative to the smoothing of the last step; 1 if it is unchanged.
         level: |S g|² if the smoothing has changed; 0 otherwise.
         confirmed: Fraction of the agreement of successive gradients that independent samples confirm, in (0, 1].
+        lasting: Fraction of that agreement that gradients of much later steps confirm, in (0, 1].
         vertices: Number of mesh vertices that carry the parameter; 0 for textures, grids and numbers.
     """
 
@@ -31,6 +32,7 @@ class SmoothingChange:
     gain: float = 1.0
     level: float = 0.0
     confirmed: float = 1.0
+    lasting: float = 1.0
     vertices: int = 0
 
 

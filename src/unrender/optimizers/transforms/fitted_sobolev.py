@@ -355,7 +355,7 @@ class FittedSobolev(StepTransform):
         if fit is None:
             return SmoothingChange(smooth, vertices=vertices)
         scaled = smooth.scaled(fit.share) if isinstance(smooth, Sobolev) else smooth
-        return SmoothingChange(scaled, fit.gain, fit.level, fit.confirmed, vertices)
+        return SmoothingChange(scaled, fit.gain, fit.level, fit.confirmed, vertices=vertices)
 
     def _smooth(self, key: str) -> Preconditioner:
         """Return the preconditioner of a parameter in `preconditioned`, at full strength."""

@@ -1,0 +1,128 @@
+"""The fraction of the agreement of successive gradients that gradients of much later steps confirm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from unrender.core import arrays, checks, trees
+from unrender.core.arrays import Array
+from unrender.core.memory import inner_products
+from unrender.core.registry import register
+from unrender.core.text import listed
+from unrender.core.trees import Tree
+from unrender.optimizers.transforms.base import (
+    GRADIENTS,
+    SMOOTHING_UNCHANGED,
+    StepTransform,
+    StepUpdate,
+    TransformState,
+)
+from unrender.scene.upsampling import Upsampler
+
+_PARTS = 6
+"""Ratio of the number of steps so far to the length of a block."""
+_LEAST = 0.02
+"""Smallest lasting fraction."""
+
+
+@dataclass(frozen=True)
+class GradientBlocks(TransformState):
+    """State of `LastingAgreement`.
+
+    Attributes:
+        total: Sum of the gradients of the current block.
+        last: Mean gradient of the last complete block.
+        earlier: Mean gradient of the block before that.
+        agreement: {key: Σ g_t · g_{t-1} over the current block, a scalar}.
+        count: Number of gradients of the current block.
+        blocks: Number of complete blocks.
+        fractions: {key: lasting fraction, unclamped; 1 before it is known}.
+    """
+
+    total: Tree = field(metadata=GRADIENTS)
+    last: Tree = field(metadata=GRADIENTS)
+    earlier: Tree = field(metadata=GRADIENTS)
+    agreement: dict[str, Array]
+    count: int
+    blocks: int
+    fractions: dict[str, float]
+
+    def upsampled(self, upsampler: Upsampler) -> GradientBlocks:
+        """Interpolate the gradients, and restart the blocks, whose products have another unit."""
+        return replace(super().upsampled(upsampler), count=0, blocks=0)
+
+
+@register
+@dataclass(frozen=True)
+class LastingAgreement(StepTransform):
+    """Estimate how much of the agreement of successive gradients is signal, for estimators that reuse samples.
+
+    Successive gradients share reused noise, which looks like agreement. Gradients that are further apart than the memory of the estimator
+    share the signal alone. Steps are divided into blocks, each a sixth of the steps so far, and at least `shortest`. With the mean
+    gradient m_k of block k, the lasting fraction is
+
+        m_k · m_{k-2} / ⟨g_t · g_{t-1}⟩,
+
+    where the mean ⟨·⟩ is over block k. The average over blocks, with decay 1/2, becomes `SmoothingChange.lasting`, by which
+    `AgreementRate` multiplies the agreement. It is 1 in the first three blocks. Blocks restart when the smoothing of a gradient changes.
+    Gradients are unchanged. Needs a `FittedSobolev` before it, which stores the last gradient.
+
+    Args:
+        shortest: Number of steps of the shortest block, >= 1.
+    """
+
+    shortest: int = 96
+
+    def __post_init__(self):
+        checks.integer("LastingAgreement", "shortest", self.shortest, at_least=1)
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> GradientBlocks:
+        del learning_rates
+        zeros = [trees.zeros_like(parameters) for _ in range(3)]
+        agreement = {key: arrays.total(x) for key, x in zeros[0].items()}
+        return GradientBlocks(*zeros, agreement, 0, 0, dict.fromkeys(parameters, 1.0))
+
+    def update(self, update: StepUpdate, state: GradientBlocks) -> tuple[StepUpdate, GradientBlocks]:
+        """Set the lasting fractions. Waits for the device at the end of a block."""
+        gradient, previous = update.gradient, update.require_previous("LastingAgreement")
+        if any(change.gain != 1.0 for change in update.smoothing.values()):
+            state = replace(state, count=0, blocks=0)
+        if update.made > 0:
+            products = inner_products([(g, previous[key]) for key, g in gradient.items()])
+            agreement = dict(zip(gradient, products, strict=True))
+            if state.count:
+                gradient, agreement = trees.add(state.total, gradient), trees.add(state.agreement, agreement)
+            state = replace(state, total=gradient, agreement=agreement, count=state.count + 1)
+        if state.count >= max(self.shortest, update.made // _PARTS):
+            state = _completed(state)
+        smoothing = dict(update.smoothing)
+        for key, fraction in state.fractions.items():
+            smoothing[key] = replace(smoothing.get(key, SMOOTHING_UNCHANGED), lasting=max(fraction, _LEAST))
+        return replace(update, smoothing=smoothing), state
+
+    def choices(self, state: GradientBlocks, made: int) -> tuple[str, ...]:
+        """Return the fractions that are below 1."""
+        del made
+        low = [f"{key} {max(fraction, _LEAST):.2g}" for key, fraction in state.fractions.items() if fraction < 1.0]
+        return (f"agreement of gradients that lasts: {listed(low)}",) if low else ()
+
+
+def _completed(state: GradientBlocks) -> GradientBlocks:
+    """Return the state after the end of a block."""
+    mean = trees.map(lambda x: x * arrays.scalar(1.0 / state.count, x), state.total)
+    arrays.evaluate(mean, state.agreement)
+    fractions = state.fractions
+    if state.blocks >= 2:
+        products = inner_products([(m, state.earlier[key]) for key, m in mean.items()])
+        arrays.evaluate(products)
+        fractions = {}
+        for (key, old), product in zip(state.fractions.items(), products, strict=True):
+            new = _fraction(arrays.number(product), arrays.number(state.agreement[key]) / state.count)
+            fractions[key] = new if state.blocks == 2 else 0.5 * (old + new)
+    return replace(state, last=mean, earlier=state.last, count=0, blocks=state.blocks + 1, fractions=fractions)
+
+
+def _fraction(lasting: float, agreement: float) -> float:
+    """Return their ratio within [-1, 1]; 1 if successive gradients do not agree, because nothing can last."""
+    return min(max(lasting / agreement, -1.0), 1.0) if agreement > 0.0 else 1.0
