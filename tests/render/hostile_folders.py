@@ -94,6 +94,7 @@ def _many() -> dict[str, int]:
 _STEP = f"{checkpoint.FOLDER}/00000004"
 _MANIFEST, _STATE = f"{_STEP}/{checkpoint.MANIFEST}", f"{_STEP}/{checkpoint.STATE}"
 _TWICE = "{" + "".join(f'"{number:x}": 1, ' for number in range(_MANY)) + '"0": 1}'
+_ARCHIVES = ("parameters", "initial", "truth", "pictures", "sensitivity", "standard_error", "data_share")
 _KINDS = {"a pipe": _pipe, "a device": _device}
 
 FOLDERS: dict[str, Hostile] = {
@@ -107,7 +108,7 @@ FOLDERS: dict[str, Hostile] = {
     **{
         f"report: {kind} as {name}": _spoilt(make(name), _page)
         for kind, make in _KINDS.items()
-        for name in ("run.json", "history.jsonl", "parameters.npz", "initial.npz", "truth.npz", "pictures.npz", "sensitivity.npz")
+        for name in ("run.json", "history.jsonl", *(f"{of}.npz" for of in _ARCHIVES))
     },
     "resume: a pipe as the controls": _spoilt(_pipe("control.json"), _resume),
     "resume: a pipe as the lock": _spoilt(_pipe("lock"), _resume),

@@ -16,6 +16,7 @@ from unrender.estimators.path import PathGradient
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import final_images, least_squares
 from unrender.runs.callbacks import Callback
+from unrender.runs.image_sensitivity import Curvature
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
 from unrender.runs.phase_times import RUN_PHASES
@@ -93,7 +94,8 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
     """A wrong number is told however late it is."""
     made, allowed = problem(), []
     monkeypatch.setattr(final_images, "slowdown", lambda: 1.0)
-    monkeypatch.setattr(final_images, "sensitivity", lambda *_, seconds, **__: allowed.append(seconds) or {})
+    none = Curvature({}, {}, 0)
+    monkeypatch.setattr(final_images, "curvature", lambda *_, seconds, **__: allowed.append(seconds) or none)
     monkeypatch.setattr(
         final_images, "check_numbers", lambda *given: allowed.append(given[3]) or least_squares.NumbersCheck()
     )

@@ -260,3 +260,17 @@ def test_many_views_are_counted_not_all_pictured(tmp_path):
     page = Page(report.page(write_run(tmp_path / "run", views=views)))
     assert "3 of them not pictured" in page.words
     assert [f"View {i}" in page.words for i in (0, 7, 8)] == [True, True, False]
+
+
+def test_a_map_has_its_standard_error_and_what_the_references_decided(tmp_path):
+    folder = write_run(tmp_path / "run")
+    shape = read(folder).parameters[KEY].shape
+    share = np.zeros(shape, np.float32)
+    share[:2] = 0.9
+    np.savez(folder / "standard_error.npz", **{KEY: np.full(shape, 0.02, np.float32), "other": np.zeros(3)})
+    np.savez(folder / "data_share.npz", **{KEY: share})
+    run = read(folder)
+    assert set(run.standard_error) == set(run.data_share) == {KEY}
+    captions = {item.caption: item for stack in panels.map_of_run(run, KEY).stacks for item in stack}
+    assert captions["Standard error"].note == "mean 0.02"
+    assert captions["Decided by the references"].note.startswith(f"{2 / shape[0]:.0%} decided by the references")

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from unrender.runs.callbacks import TensorBoard
     from unrender.runs.image_sensitivity import sensitivity
     from unrender.runs.live import Live
+    from unrender.runs.map_uncertainty import uncertainty
 
 __getattr__, _ = lazy.attach(
     __name__,
@@ -15,10 +16,12 @@ __getattr__, _ = lazy.attach(
         "Live": "live",
         "TensorBoard": "callbacks",
         "sensitivity": "image_sensitivity",
+        "uncertainty": "map_uncertainty",
     },
 )
 __all__ = [
     "Live",
     "TensorBoard",
     "sensitivity",
+    "uncertainty",
 ]

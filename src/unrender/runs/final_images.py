@@ -13,8 +13,9 @@ from unrender.core import phases
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
-from unrender.runs.image_sensitivity import sensitivity
+from unrender.runs.image_sensitivity import Curvature, curvature
 from unrender.runs.least_squares import check_numbers, compile_check
+from unrender.runs.map_uncertainty import Uncertainty, of_residuals
 from unrender.runs.result import Result
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
@@ -57,6 +58,7 @@ class FinalImages:
         undetermined: see `Result.undetermined`.
         warnings: one line for each unknown that had not settled at the end.
         standard_error: see `Result.standard_error`.
+        data_share: see `Result.data_share`.
     """
 
     pictures: dict[str, np.ndarray]
@@ -66,6 +68,7 @@ class FinalImages:
     undetermined: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
+    data_share: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
@@ -80,7 +83,7 @@ def warm_up(problem: Problem, values: Mapping[str, np.ndarray], tested: bool = T
     for view in range(own):
         render(problem, values, view, pass_spp, per_pass=pass_spp)
     if tested and len(_chosen(problem)) == count:
-        sensitivity(problem, values, probes=1, views=own)
+        curvature(problem, values, probes=1, views=own)
         compile_check(problem, values)
 
 
@@ -108,6 +111,7 @@ def render_final_images(
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
     pictures: dict[str, np.ndarray] = {}
     errors: dict[str, tuple[float, float]] = {}
+    ends: list[tuple[np.ndarray, ...]] = []
     with phases.phase("final pictures") as advance:
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
         chosen = _chosen(problem)
@@ -117,7 +121,10 @@ def render_final_images(
             for done, (which, values) in enumerate((("initial", result.initial), ("result", result.parameters))):
                 name = image_name(index, which)
                 of = problem.remeshed_from or problem if which == "initial" else problem
-                pictures[name], error = _picture(of, values, index, samples, _SEEDS[which])
+                halves, error = _picture(of, values, index, samples, _SEEDS[which])
+                pictures[name] = sum(halves[1:], halves[0]) / len(halves)
+                if which == "result":
+                    ends.append(halves)
                 if error is not None:
                     errors[name] = error
                 advance((2 * place + done + 1) / (2 * len(chosen)))
@@ -129,11 +136,15 @@ def render_final_images(
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
         everything = tested and len(chosen) == len(problem.views)
-        sensitivities = sensitivity(problem, result.parameters, seconds=seconds) if everything else {}
+        known = curvature(problem, result.parameters, seconds=seconds) if everything else Curvature({}, {}, 0)
+        sensitivities, maps = known.sensitivity(), Uncertainty()
         lines, warnings, deviations = [], (), dict(result.standard_error)
         if everything:
             lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests)
-    return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations)
+            if result.steps and len(ends[0]) == 2 and left() > 0.0:
+                maps = of_residuals(problem, result.parameters, list(zip(*ends, strict=True)), known)
+    deviations |= maps.standard_error
+    return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share)
 
 
 def _undetermined(
@@ -179,11 +190,11 @@ def image_name(view: int, which: str) -> str:
 
 def _picture(
     problem: Problem, values: Mapping[str, np.ndarray], view: int, spp: int, seed: int
-) -> tuple[np.ndarray, tuple[float, float] | None]:
-    """Return a view's image, and its error with the standard error; None for a single sample, which has no halves."""
+) -> tuple[tuple[np.ndarray, ...], tuple[float, float] | None]:
+    """Return the halves of a view's image, and its error with the standard error; the image and None for a single sample."""
     first = spp // 2
     if first == 0:
-        return render(problem, values, view, spp, seed), None
+        return (render(problem, values, view, spp, seed),), None
     pass_spp = _pass_spp(problem)
     per_pass = pass_spp if first % pass_spp == 0 else None
     one, other = (
@@ -191,7 +202,7 @@ def _picture(
     )
     own = problem.views[view]
     mask = None if own.mask is None else np.asarray(own.mask)
-    return (one + other) / 2, debiased.rmse(one, other, np.asarray(own.reference), mask)
+    return (one, other), debiased.rmse(one, other, np.asarray(own.reference), mask)
 
 
 def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:

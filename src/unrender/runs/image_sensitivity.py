@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,8 +21,29 @@ from unrender.scene.render import as_tree, view_request
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 MAP_AXES = 3
 """Number of axes from which a parameter is a texture or grid."""
+_KEPT = 1 << 25
+"""Numbers of the probes' projections that are kept for the overlap."""
 _HARDLY = 0.05
 """Sensitivity relative to the median below which an element hardly affects the images."""
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """Diagonal of the Gauss-Newton matrix JᵀJ, where J is the derivative of all views' pixels by the parameters.
+
+    Attributes:
+        squares: {key: diagonal elements} of the parameters' shapes. Estimates below 0 are 0.
+        overlap: {key: Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²}, at least 1, of textures and grids: 1 if no pixel depends on two elements.
+        probes: number of probes of the estimate.
+    """
+
+    squares: Mapping[str, np.ndarray]
+    overlap: Mapping[str, float]
+    probes: int
+
+    def sensitivity(self) -> dict[str, np.ndarray]:
+        """Return the roots of the diagonal elements, float32."""
+        return {key: np.sqrt(square).astype(np.float32) for key, square in self.squares.items()}
 
 
 @exclusive("sensitivity")
@@ -36,9 +58,10 @@ def sensitivity(
 ) -> dict[str, np.ndarray]:
     """Estimate √diag(JᵀJ), where J is the derivative of all views' pixels with respect to the parameters.
 
-    It is the change of the images per unit of each element, as root sum of squares over pixels and channels. Where it is small, the
-    images do not determine an element, and the recovered value is noise or smoothing. JᵀJ is the Gauss-Newton Hessian of L2. With noise σ
-    in each pixel of the references, no estimate of the element alone has a standard deviation below σ divided by this.
+    It is the change of the images per unit of each element, as root sum of squares over pixels and channels, weighted by the views' masks.
+    Where it is small, the images do not determine an element, and the recovered value is noise or smoothing. JᵀJ is the Gauss-Newton
+    Hessian of L2. With noise σ in each pixel of the references, no estimate of the element alone has a standard deviation below σ divided
+    by this.
 
     diag(JᵀJ) is the expectation of (Jᵀs)² over images s of independent signs. The two factors are adjoints on separate paths, so the
     product is unbiased. The root, and the clamping of negative estimates to 0, are not.
@@ -58,15 +81,34 @@ def sensitivity(
     Raises:
         InputError: `values` have other keys or shapes than the problem's; `probes` or `spp` is below 1.
     """
+    return curvature(problem, values, probes, spp, seconds, seed, views).sensitivity()
+
+
+def curvature(
+    problem: Problem,
+    values: Mapping[str, np.ndarray] | None = None,
+    probes: int = _PROBES,
+    spp: int | None = None,
+    seconds: float = np.inf,
+    seed: int = 0,
+    views: int | None = None,
+) -> Curvature:
+    """Return the curvature of `sensitivity`, with the same arguments.
+
+    The overlap is the mean of (Jᵀs · Jᵀs')² over pairs of probes, whose expectation is Σ_ij (JᵀJ)_ij², with separate paths of its factors.
+    """
     checks.integer("sensitivity", "probes", probes, at_least=1)
     if spp is None:
         spp = adjoint_spp(problem)
     checks.integer("sensitivity", "spp", spp, at_least=1)
     session, keys = derivative_session(problem)
     if session is None:
-        return {}
+        return Curvature({}, {}, 0)
     parameters = off_ends(as_tree(problem, values), problem.renderer.parameters())
     squares = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
+    maps = [key for key, square in squares.items() if square.ndim >= MAP_AXES]
+    kept: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {key: [] for key in maps}
+    most = min(_PROBES, _KEPT // max(1, sum(squares[key].size for key in maps)))
     made, until = 0, time.perf_counter() + seconds
     while made == 0 or (made < probes and time.perf_counter() < until):
         one, other = (
@@ -74,9 +116,41 @@ def sensitivity(
         )
         for key, square in squares.items():
             square += one[key] * other[key]
+            if key in kept and made < most:
+                kept[key].append((one[key].astype(np.float32), other[key].astype(np.float32)))
         made += 1
-    roots = {key: np.sqrt(np.maximum(square / made, 0.0)).astype(np.float32) for key, square in squares.items()}
-    return {key: periodic.repeat(root, problem.unknowns[key].measure.repeated) for key, root in roots.items()}
+    overlap = {key: _overlap(squares[key] / made, made, of) for key, of in kept.items()}
+    means = {
+        key: periodic.repeat(np.maximum(square / made, 0.0), problem.unknowns[key].measure.repeated)
+        for key, square in squares.items()
+    }
+    return Curvature(means, overlap, made)
+
+
+def _overlap(squares: np.ndarray, probes: int, kept: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Return Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii² from diagonal elements, whose noise it removes, and the projections of probes."""
+    pairs = [float(np.vdot(a[0], b[0])) * float(np.vdot(a[1], b[1])) for n, a in enumerate(kept) for b in kept[n + 1 :]]
+    diagonal = float(np.sum(np.square(squares))) / (1.0 + 2.0 / probes)
+    return max(1.0, sum(pairs) / len(pairs) / diagonal) if pairs and diagonal > 0.0 else 1.0
+
+
+def mask_roots(problem: Problem, view: int) -> np.ndarray:
+    """Return the roots of the weights of a view's pixels by its mask, (H, W, 1)."""
+    mask, size = problem.views[view].mask, problem.sizes[view]
+    return np.ones((*size, 1)) if mask is None else np.sqrt(np.asarray(mask, np.float64))[..., None]
+
+
+def transposed(
+    problem: Problem, values: Mapping[str, np.ndarray], pictures: Sequence[np.ndarray], passes: int, key: Key
+) -> dict[str, np.ndarray]:
+    """Return {key: mean of `passes` estimates of Jᵀx}, unbiased, for a picture x (H, W, 3) of each view."""
+    session, keys = derivative_session(problem)
+    if session is None:
+        return {}
+    parameters, spp = off_ends(as_tree(problem, values), problem.renderer.parameters()), adjoint_spp(problem)
+    seeds = [[key.fold(number * len(pictures) + view) for view in range(len(pictures))] for number in range(passes)]
+    parts = [_adjoint(problem, session, parameters, keys, spp, of, pictures) for of in seeds]
+    return {name: np.mean([part[name] for part in parts], axis=0) for name in keys}
 
 
 def around(values: np.ndarray) -> np.ndarray:
@@ -144,12 +218,31 @@ def _projections(
     views: int | None,
 ) -> dict[str, np.ndarray]:
     """Return {key: Jᵀs} for the signs s of a probe, on one of its two sets of paths."""
-    sums = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
     signs = np.random.default_rng(key.uint32())
-    for view in range(len(problem.views))[:views]:
-        rendering = session.image(parameters, view_request(problem, view, spp, key.fold(2 * view + half).uint32()))
-        weights = signs.choice(np.array([-1, 1], np.float32), size=arrays.shape(rendering.images))
-        gradient = session.adjoint(parameters, rendering.paths, problem.renderer.array(weights))
+    pictures = [
+        signs.choice(np.array([-1, 1], np.float32), size=(*problem.sizes[view], 3)) * mask_roots(problem, view)
+        for view in range(len(problem.views))[:views]
+    ]
+    return _adjoint(
+        problem, session, parameters, keys, spp, [key.fold(2 * n + half) for n in range(len(pictures))], pictures
+    )
+
+
+def _adjoint(
+    problem: Problem,
+    session: RenderSession,
+    parameters: Tree,
+    keys: frozenset[str],
+    spp: int,
+    seeds: Sequence[Key],
+    pictures: Sequence[np.ndarray],
+) -> dict[str, np.ndarray]:
+    """Return {key: Jᵀ times the pictures (H, W, 3) of the first views}."""
+    sums = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
+    for view, (seed, picture) in enumerate(zip(seeds, pictures, strict=True)):
+        rendering = session.image(parameters, view_request(problem, view, spp, seed.uint32()))
+        weights = problem.renderer.array(picture.astype(np.float32).reshape(arrays.shape(rendering.images)))
+        gradient = session.adjoint(parameters, rendering.paths, weights)
         for name, total in sums.items():
             total += arrays.numpy(gradient[name]).reshape(total.shape)
     return sums

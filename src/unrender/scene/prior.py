@@ -120,6 +120,13 @@ class Prior:
         _, pull = self._pairs(cells, along)
         return self.weight * unknown.spread(product + pull, x)
 
+    def diagonal(self, x: np.ndarray) -> np.ndarray:
+        """Return the diagonal elements of M of a texture or grid, of the shape of `x`. M of `product` couples neighbouring cells only."""
+        odd = np.indices(x.shape[:-1]).sum(axis=0)[..., None] % 2 == 1
+        return np.where(
+            odd, *(self.product(x, np.where(odd == of, 1.0, 0.0) * np.ones(x.shape)) for of in (True, False))
+        )
+
     def describe(self) -> str:
         """Return the terms in one line."""
         return ", ".join(

@@ -128,6 +128,15 @@ def _error_line(problem: Problem, result: Result, key: str, before: float, after
     return line if error is None else f"{line}, {measure.text(error)} where seen ({where.mean():.0%} of it)"
 
 
+def _map_line(error: np.ndarray, share: np.ndarray) -> str:
+    """Return the standard error of a texture or grid where the references decided it, and how much of it that is."""
+    decided = share >= 0.5
+    if not decided.any():
+        return "decided by the start, by smoothing or by a prior, not by the references"
+    median = formatting.number(float(np.median(error[decided])))
+    return f"{median} (median standard error of the {decided.mean():.0%} that the references decided)"
+
+
 def verified(result: Result) -> str:
     """Return the verification by fresh pictures as text: status, losses, and the selected parameters."""
     verification = result.verification
@@ -171,6 +180,9 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     for key, error in (last | problem.parameter_error(result.parameters)).items():
         table.add_row(escape(key), _error_line(problem, result, key, start[key], error))
     for key, error in result.standard_error.items():
+        if key in result.data_share:
+            table.add_row(f"± {escape(key)}", _map_line(error, result.data_share[key]))
+            continue
         table.add_row(
             f"± {escape(key)}",
             f"{', '.join(map(formatting.deviation, np.ravel(error)))} (standard error)",

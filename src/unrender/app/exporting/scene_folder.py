@@ -47,6 +47,8 @@ _OWN = {textures.RECORD, textures.TABLE, textures.FOLDER, *_OF_SCENE, *OWN}
 _SPP = 256
 _POSITIONS = mesh_layout.POSITIONS
 _ROUNDING = 1e-4
+_Maps = Mapping[str, Mapping[str, np.ndarray]]
+"""{name: {key: array}}, see `textures.write`."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def export(
     variant.ensure()
     out, formats_ = Path(out), check_formats(formats)
     files.check_replaceable(out, _OWN, textures.RECORD, overwrite, f"export to {out}", "an earlier export")
-    problem, parameters = _opened(what)
+    problem, parameters, beside = _opened(what)
     renderer = scene_renderer(problem.renderer)
     if not isinstance(renderer, MitsubaRenderer):
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
@@ -114,7 +116,7 @@ def export(
     values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
     try:
         notices, renamed = files.write_folder(
-            out, lambda folder: _write(folder, problem, renderer, values, formats_, spp)
+            out, lambda folder: _write(folder, problem, renderer, values, formats_, spp, beside)
         )
     except OSError as error:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
@@ -124,14 +126,15 @@ def export(
 
 def _opened(
     what: str | Path | tuple[Problem, Mapping[str, np.ndarray]],
-) -> tuple[Problem, Mapping[str, np.ndarray]]:
+) -> tuple[Problem, Mapping[str, np.ndarray], _Maps]:
     if not isinstance(what, (str, Path)):
-        return what
+        return what[0], what[1], {}
     if Path(what).suffix.lower() == ".toml":
         problem = Problem.from_file(what)
-        return problem, problem.initial_values()
+        return problem, problem.initial_values(), {}
     run = folders.read(what)
-    return reopen.with_meshes(reopen.problem_of(what), run), run.parameters
+    maps = {"standard_error": run.standard_error, "data_share": run.data_share}
+    return reopen.with_meshes(reopen.problem_of(what), run), run.parameters, maps
 
 
 def _write(
@@ -141,10 +144,14 @@ def _write(
     values: dict[str, np.ndarray],
     formats: Sequence[str],
     spp: int,
+    beside: _Maps,
 ) -> tuple[list[str], dict[str, str]]:
     """Write the recovered values and the requested formats; return the notices and `Exported.renamed`."""
     repeated = problem.coordinates.repeated
-    notices = textures.write({k: periodic.interior(x, repeated.get(k, 0)) for k, x in values.items()}, folder)
+    inner, *maps = (
+        {k: periodic.interior(x, repeated.get(k, 0)) for k, x in of.items()} for of in (values, *beside.values())
+    )
+    notices = textures.write(inner, folder, dict(zip(beside, maps, strict=True)))
     others = [name for name in formats if name != MITSUBA]
     if renderer.pair.emissive:
         if others:

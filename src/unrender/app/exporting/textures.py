@@ -23,11 +23,18 @@ _LARGEST = 64
 """Limit of the numbers of a parameter that are written as text."""
 
 
-def write(parameters: Mapping[str, np.ndarray], folder: Path) -> list[str]:
+def write(
+    parameters: Mapping[str, np.ndarray], folder: Path, beside: Mapping[str, Mapping[str, np.ndarray]] | None = None
+) -> list[str]:
     """Write `parameters` to `folder`: parameters.json with all of them, parameters.csv with the small ones, maps/ with the large.
 
     Maps (H, W, C) become an EXR file with the values as they are, and a PNG file for the eye; volumes a .vol file; other large arrays
     a .npy file. Returns one line for each thing that a file does not show.
+
+    Args:
+        parameters: {key: array}.
+        folder: folder of the export.
+        beside: {name: {key: array}}, maps that belong to large parameters, such as standard errors: maps/<key>.<name>.exr, .vol or .npy.
     """
     notices: list[str] = []
     record: dict[str, Any] = {}
@@ -43,6 +50,9 @@ def write(parameters: Mapping[str, np.ndarray], folder: Path) -> list[str]:
                 table.writerow([key, " ".join(map(str, index)), float(value[index])])
         else:
             entry |= _large(key, value, folder)
+            for name, of in (beside or {}).items():
+                if key in of:
+                    entry[name] = _values(f"{_base(key)}.{name}", np.asarray(of[key], np.float32), folder)
             if entry.get("clipped"):
                 notices.append(f"{key}: {entry['clipped']} values outside [0, 1] are clipped in {entry['files'][-1]}")
         record[key] = entry
@@ -53,21 +63,33 @@ def write(parameters: Mapping[str, np.ndarray], folder: Path) -> list[str]:
 
 def _large(key: str, value: np.ndarray, folder: Path) -> dict[str, Any]:
     (folder / FOLDER).mkdir(exist_ok=True)
-    base = f"{FOLDER}/{file_name(key.removesuffix('.data'))}"
+    base = _base(key)
+    file = _values(base, value, folder)
     if value.ndim == 3 and value.shape[2] in (1, 3, 4):
-        write_bitmap(as_bitmap(value), folder / f"{base}.exr")
         colour = value.shape[2] >= 3 and "normalmap" not in key
         shown = np.ascontiguousarray(value[..., :3] if value.shape[2] >= 3 else value[..., 0])
         levels = np.clip(srgb(shown) if colour else shown, 0, 1)
         Image.fromarray(np.round(255 * levels).astype(np.uint8)).save(folder / f"{base}.png")
         kind = "sRGB of values clipped to [0, 1]" if colour else "values clipped to [0, 1], linear"
         clipped = int(np.sum((shown < 0) | (shown > 1)))
-        return {"files": [f"{base}.exr", f"{base}.png"], "png": kind, "clipped": clipped}
+        return {"files": [file, f"{base}.png"], "png": kind, "clipped": clipped}
+    return {"files": [file]}
+
+
+def _base(key: str) -> str:
+    return f"{FOLDER}/{file_name(key.removesuffix('.data'))}"
+
+
+def _values(base: str, value: np.ndarray, folder: Path) -> str:
+    """Write an array as it is, and return the file's name."""
+    if value.ndim == 3 and value.shape[2] in (1, 3, 4):
+        write_bitmap(as_bitmap(value), folder / f"{base}.exr")
+        return f"{base}.exr"
     if value.ndim == 4:
         write_grid(folder / f"{base}.vol", value)
-        return {"files": [f"{base}.vol"]}
+        return f"{base}.vol"
     np.save(folder / f"{base}.npy", value, allow_pickle=False)
-    return {"files": [f"{base}.npy"]}
+    return f"{base}.npy"
 
 
 def png(pixels: np.ndarray) -> bytes:

@@ -157,9 +157,10 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
 
     The result is compared with the truth, or with the start where the truth is unknown.
     """
-    known = (of.get(key) for of in (run.parameters, run.initial, run.truth, run.sensitivity))
+    maps = (run.parameters, run.initial, run.truth, run.sensitivity, run.standard_error, run.data_share)
+    known = (of.get(key) for of in maps)
     columns = run.measure(key).repeated
-    result, initial, truth, sensitivity = (
+    result, initial, truth, sensitivity, deviation, share = (
         x if x is None or not is_map(x) else periodic.interior(x, columns) for x in known
     )
     assert result is not None
@@ -188,6 +189,10 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
         if sensitivity is not None and (changes := pictures.planes(sensitivity).get(label)) is not None:
             column.append(
                 _sensitivity(encoder, changes, float(np.max(around(sensitivity))), f"{key} {label}: sensitivity")
+            )
+        if deviation is not None and share is not None:
+            column += _uncertainty(
+                encoder, pictures.planes(deviation)[label], pictures.planes(share)[label], f"{key} {label}"
             )
         if len(planes) == 1:
             stacks += [(item,) for item in column]
@@ -290,6 +295,19 @@ def _sensitivity(encoder: PictureEncoder, sensitivity: np.ndarray, greatest: flo
     )
     note = f"{hardly_seen(sensitivity).mean():.0%} of the texels hardly change the images"
     return Figure(encoder.false_colour(tens, _TENS, 0.0, tone_mapping.VALUE_COLORMAP, alt), "Sensitivity", note, bar)
+
+
+def _uncertainty(encoder: PictureEncoder, deviation: np.ndarray, share: np.ndarray, alt: str) -> list[Slider | Figure]:
+    """Return the figures of the standard error of each texel, and of the weight of the references in its value."""
+    decided = np.mean(share, axis=-1)
+    high = tone_mapping.colour_limit(np.mean(deviation, axis=-1))
+    bar = tone_mapping.colour_bar(0.0, 1.0, tone_mapping.VALUE_COLORMAP, "Weight of the references")
+    note = f"{np.mean(decided >= 0.5):.0%} decided by the references; the rest by the start, smoothing or a prior"
+    picture = encoder.false_colour(decided, 0.0, 1.0, tone_mapping.VALUE_COLORMAP, f"{alt}: weight of the references")
+    return [
+        _error(encoder, np.mean(deviation, axis=-1), high, "Standard error", f"{alt}: standard error"),
+        Figure(picture, "Decided by the references", note, bar),
+    ]
 
 
 def _finite_mean(values: np.ndarray) -> float:

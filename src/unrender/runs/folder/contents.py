@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import plain
 from unrender.io import files
 from unrender.runs.folder import history, schema
+from unrender.runs.image_sensitivity import MAP_AXES
 
 if TYPE_CHECKING:
     from unrender.runs.result import Result
@@ -37,6 +38,8 @@ def write_arrays(folder: Path, result: Result, names: Sequence[str] = ()) -> Non
         schema.TRUTH: result.truth,
         schema.PICTURES: result.pictures,
         schema.SENSITIVITY: result.sensitivity,
+        schema.STANDARD_ERROR: {key: x for key, x in result.standard_error.items() if np.ndim(x) >= MAP_AXES},
+        schema.DATA_SHARE: result.data_share,
         schema.MESHES: result.meshes,
         schema.LAST: {} if result.last is result.parameters else result.last,
     }
@@ -108,6 +111,7 @@ def record(result: Result, status: str, error: str = "") -> dict[str, Any]:
         "standard_error": {
             key: [float(f"{value:.6g}") if np.isfinite(value) else None for value in np.ravel(error)]
             for key, error in result.standard_error.items()
+            if np.ndim(error) < MAP_AXES
         },
         "verification": dict(result.verification),
         "phases": {name: round(seconds, 3) for name, seconds in result.phases.items()},

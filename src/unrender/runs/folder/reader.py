@@ -48,6 +48,7 @@ class RunFolder:
         views: {view index: images}, ascending; empty if the run saved none.
         error_before, error_after: {key: error} at the start and at the end, if known; see `measure`.
         sensitivity: see `Result.sensitivity`; {} if the run saved none.
+        standard_error, data_share: maps of `Result`; {} if the run saved none.
         meshes: {key: `meshes.RunMesh`} of the parameters that are vertex positions.
         shapes: {key: shape} of parameters whose arrays here are smaller than in the run.
     """
@@ -64,6 +65,8 @@ class RunFolder:
     shapes: dict[str, tuple[int, ...]] = field(default_factory=dict)
     sensitivity: dict[str, np.ndarray] = field(default_factory=dict)
     meshes: dict[str, RunMesh] = field(default_factory=dict)
+    standard_error: dict[str, np.ndarray] = field(default_factory=dict)
+    data_share: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -110,12 +113,12 @@ def read(directory: str | Path) -> RunFolder:
             if (error := _surface_error(values[key], faces, mesh.truth)) is not None:
                 errors[key] = error
     views = pictures_by_view(_optional(path / schema.PICTURES, path), path / schema.PICTURES)
-    sensitivity = {
-        k: x
-        for k, x in _optional(path / schema.SENSITIVITY, path).items()
-        if k in parameters and x.shape == parameters[k].shape
-    }
-    return RunFolder(path, record, history, parameters, initial, known, views, before, after, {}, sensitivity, meshes)
+    sensitivity, standard_error, data_share = (
+        {k: x for k, x in _optional(path / name, path).items() if k in parameters and x.shape == parameters[k].shape}
+        for name in (schema.SENSITIVITY, schema.STANDARD_ERROR, schema.DATA_SHARE)
+    )
+    maps = sensitivity, meshes, standard_error, data_share
+    return RunFolder(path, record, history, parameters, initial, known, views, before, after, {}, *maps)
 
 
 def read_run_record(folder: Path) -> RunRecord:

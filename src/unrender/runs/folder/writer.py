@@ -31,6 +31,7 @@ from unrender.runs.folder.meshes import FOLDER as MESH_FILES
 from unrender.runs.folder.meshes import write_files
 from unrender.runs.folder.schema import (
     CONTROL,
+    DATA_SHARE,
     ENDED,
     HISTORY,
     INITIAL,
@@ -43,6 +44,7 @@ from unrender.runs.folder.schema import (
     RECORD,
     REPORT,
     SENSITIVITY,
+    STANDARD_ERROR,
     TRUTH,
 )
 from unrender.runs.folder.state import not_finite, pack
@@ -55,7 +57,7 @@ if TYPE_CHECKING:
 
 _FILES = (
     *(RECORD, HISTORY, METHOD, serialization.FILE, PARAMETERS, INITIAL, TRUTH, PICTURES, SENSITIVITY, MESHES, LAST),
-    *(REPORT, CONTROL),
+    *(REPORT, CONTROL, STANDARD_ERROR, DATA_SHARE),
 )
 _STEPS, _MOST_SECONDS = 50, 60.0
 _SHARE = 1 / 100
@@ -183,6 +185,7 @@ class RunWriter(Callback):
                 pictures=images.pictures,
                 image_errors=images.errors,
                 sensitivity=images.sensitivity,
+                data_share=images.data_share,
                 undetermined=images.undetermined,
                 standard_error=images.standard_error,
                 warnings=[*result.warnings, *images.warnings],

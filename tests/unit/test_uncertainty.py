@@ -1,0 +1,172 @@
+"""Standard errors of textures: against the spread of linear estimates with noise, the share of the data, and planted faults."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unrender as ur
+from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs import final_images
+from unrender.runs import map_uncertainty as module
+from unrender.runs.folder import reader as folders
+from unrender.runs.image_sensitivity import curvature
+from unrender.runs.map_uncertainty import of_residuals, uncertainty
+from unrender.scene.parameter import Parameter
+from unrender.scene.prior import Prior
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
+
+SIZE, TEXELS = 12, 6
+NOISE = 0.02
+
+
+def matrix() -> np.ndarray:
+    """Pixels that see one texel each, four per texel, darker to the right; the last column is not seen."""
+    made = np.zeros((SIZE, SIZE, 3, TEXELS, TEXELS, 3))
+    for row in range(SIZE):
+        for column in range(SIZE - 2):
+            for channel in range(3):
+                made[row, column, channel, row // 2, column // 2, channel] = 1.0 - 0.06 * column
+    return made.reshape(3 * SIZE**2, 3 * TEXELS**2)
+
+
+def problem(seed: int = 0, mask: np.ndarray | None = None, prior: dict[str, float] | None = None) -> Problem:
+    rng = np.random.default_rng(seed)
+    truth = {"wall": rng.uniform(0.2, 0.8, (TEXELS, TEXELS, 3))}
+    renderer = AnalyticRenderer(truth, matrix(), 0.0, 0.0, shape=(SIZE, SIZE), sensors=1)
+    picture = renderer.exact(truth) + NOISE * rng.normal(size=(SIZE, SIZE, 3))
+    if mask is not None:
+        picture = np.where(mask[..., None] > 0, picture, 7.0)
+    parameter = Parameter("wall", initial=0.5, bounds=(0, 1), prior=prior)
+    return Problem(renderer, [parameter], [View(picture, mask=mask)], truth=truth)
+
+
+def estimate(made: Problem, converged: float = 1.0) -> dict[str, np.ndarray]:
+    """Least squares where a pixel sees something, as far as a descent that removed this share of the first residual."""
+    a = matrix()
+    picture = np.asarray(made.views[0].reference, np.float64).reshape(-1)
+    weights = 1.0 if made.views[0].mask is None else np.repeat(np.asarray(made.views[0].mask).reshape(-1), 3)
+    diagonal = (weights * a.T).T.T @ a
+    seen = np.diag(diagonal) > 0
+    start = np.full(a.shape[1], 0.5)
+    step = np.zeros(a.shape[1])
+    step[seen] = ((weights * a.T) @ (picture - a @ start))[seen] / np.diag(diagonal)[seen]
+    return {"wall": (start + converged * step).reshape(TEXELS, TEXELS, 3).astype(np.float32)}
+
+
+def scores(converged: float, mask: np.ndarray | None = None) -> np.ndarray:
+    found = []
+    for seed in range(4):
+        made = problem(seed, mask)
+        values = estimate(made, converged)
+        of = uncertainty(made, values)
+        where = of.data_share["wall"] > 0.5
+        found.append(((values["wall"] - made.truth["wall"]) / of.standard_error["wall"])[where])
+    return np.concatenate(found)
+
+
+@pytest.mark.parametrize("converged", [0.6, 0.9, 1.0])
+def test_errors_have_the_stated_spread(converged: float) -> None:
+    """Of early ends, whose error is what is left, and of the end, whose error is the noise."""
+    assert scores(converged).std() == pytest.approx(1.0, abs=0.25)
+
+
+def test_without_the_references_noise_the_end_would_seem_exact(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_noise", lambda residuals: module._Mean(1e-12, 0.0))
+    assert scores(1.0).std() > 3
+
+
+def test_what_no_pixel_sees_has_the_spread_of_the_seen_and_no_share_of_the_data() -> None:
+    made = problem()
+    found = uncertainty(made, estimate(made))
+    share, error = found.data_share["wall"], found.standard_error["wall"]
+    assert share.dtype == error.dtype == np.float32
+    assert share[:, -1].max() < 0.02
+    assert share[:, :-1].min() > 0.8
+    assert error[:, -1].mean() == pytest.approx(np.std(made.truth["wall"] - 0.5), rel=0.3)
+
+
+def test_pixels_out_of_the_mask_are_no_data() -> None:
+    mask = np.ones((SIZE, SIZE), np.float32)
+    mask[:4] = 0.0
+    made = problem(mask=mask)
+    found = uncertainty(made, estimate(made))
+    assert found.data_share["wall"][:2].max() < 0.02
+    assert scores(0.9, mask).std() == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_prior_takes_its_share() -> None:
+    made = problem(prior={"near": 0.5, "std": 0.01})
+    free = problem()
+    values = estimate(free)
+    loose, tight = (uncertainty(one, values).data_share["wall"][:, :-1].mean() for one in (free, made))
+    assert tight < 0.6 * loose
+
+
+def test_the_diagonal_of_a_priors_curvature_is_that_of_its_product() -> None:
+    x = np.random.default_rng(0).random((5, 6, 2)).astype(np.float32)
+    prior = Prior(near=0.5, std=0.1, smoothness=0.2, total_variation=0.1)
+    bound = prior.on(x)
+    expected = [bound.product(x, one.reshape(x.shape)).reshape(-1)[n] for n, one in enumerate(np.eye(x.size))]
+    np.testing.assert_allclose(bound.diagonal(x).reshape(-1), expected, rtol=1e-6)
+
+
+def test_elements_that_share_pixels_have_an_overlap_and_no_standard_error() -> None:
+    """Blocks of four texels in one pixel: Σ_ij H_ij² is four times the sum over the diagonal."""
+    texels = 2 * SIZE
+    a = np.zeros((SIZE, SIZE, 3, texels, texels, 3))
+    for row in range(SIZE):
+        for column in range(SIZE):
+            for channel in range(3):
+                a[row, column, channel, 2 * row : 2 * row + 2, 2 * column : 2 * column + 2, channel] = 0.25
+    truth = {"wall": np.full((texels, texels, 3), 0.5)}
+    renderer = AnalyticRenderer(truth, a.reshape(3 * SIZE**2, -1), 0.0, 0.0, shape=(SIZE, SIZE), sensors=1)
+    made = Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(renderer.exact(truth))])
+    assert curvature(made).overlap["wall"] == pytest.approx(4.0, rel=0.3)
+    assert not uncertainty(made, made.initial_values()).standard_error
+    assert curvature(problem()).overlap["wall"] == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.slow
+@pytest.mark.mitsuba
+@pytest.mark.parametrize("reference_spp", [8, 1024])
+def test_runs_state_errors_of_the_right_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference_spp: int
+) -> None:
+    """A wall of 400 texels, from noisy and from clean pictures; the run folder, the page and the export have the maps."""
+    import mitsuba as mi
+
+    monkeypatch.setattr(final_images, "_SENSITIVITY_SHARE", 100.0)  # also on a busy machine
+    made = ur.gallery.problem("wall", resolution=40, texture_resolution=20, reference_spp=reference_spp)
+    key = "back.bsdf.reflectance.data"
+    result = ur.optimize(made, steps=40, run_directory=tmp_path / "run")
+    found = uncertainty(made, result.parameters)
+    error, share = found.standard_error[key], found.data_share[key]
+    z = ((result.parameters[key] - made.truth[key]) / error)[share >= 0.5]
+    assert (share >= 0.5).mean() > 0.8
+    assert z.std() == pytest.approx(1.0, abs=0.35)
+    if reference_spp == 8:  # clean references take more samples than the final pictures of a short run may have
+        run = folders.read(tmp_path / "run")
+        np.testing.assert_array_equal(run.standard_error[key], result.standard_error[key])
+        np.testing.assert_array_equal(run.data_share[key], result.data_share[key])
+        assert np.median(run.standard_error[key] / error) == pytest.approx(1.0, abs=0.3)
+        assert key not in run.record.standard_error
+        exported = ur.app.export(tmp_path / "run", tmp_path / "export")
+        record = json.loads((exported.folder / "parameters.json").read_text())[key]
+        written = np.array(mi.Bitmap(str(exported.folder / record["standard_error"])))
+        np.testing.assert_allclose(written, run.standard_error[key], rtol=1e-6)
+
+
+def test_too_few_probes_or_samples_give_no_map() -> None:
+    made = problem()
+    values = estimate(made)
+    picture = np.asarray(made.views[0].reference)
+    few = curvature(made, values, probes=4)
+    assert not of_residuals(made, values, [[picture], [picture]], few).standard_error
+    enough = curvature(made, values)
+    noisy = [[picture + np.random.default_rng(seed).normal(size=picture.shape)] for seed in range(2)]
+    assert not of_residuals(made, values, noisy, enough).standard_error
