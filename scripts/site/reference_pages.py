@@ -159,7 +159,8 @@ result = ur.optimize(problem, ur.PathGradient(spp=16), ur.optimizers.Adam(0.05),
 print(result.status, result.parameters, result.verification["best"])
 """,
         (
-            *("function optimize", "function estimate", "function unrender.runs.sensitivity", "function resume"),
+            *("function optimize", "function estimate", "function unrender.runs.sensitivity"),
+            *("function unrender.runs.uncertainty", "function resume"),
             *("function unrender.app.distribute", "function unrender.app.sweep"),
             *("class unrender.app.sweeps.record.SweepRecord", "class Result"),
             *("class unrender.runs.Live", "class unrender.runs.TensorBoard", "class unrender.core.random.Key"),
