@@ -51,6 +51,20 @@ def test_a_run_that_has_not_arrived_keeps_its_last_values() -> None:
     assert not result.adapted
 
 
+def test_a_number_that_drifts_leaves_the_others_without_errors() -> None:
+    """The first column wanders about 0.5. The second one drifts, or stays where it is."""
+    generator = np.random.default_rng(0)
+    rows = np.stack([0.5 + 0.1 * generator.standard_normal(200), np.linspace(0.0, 1.0, 200)], axis=1)
+    last = {"a": np.zeros(1, np.float32), "b": np.ones(1, np.float32)}
+    means, errors, steps = number_means._means(rows, 1, last)
+    assert (list(means), errors, list(steps)) == (["a"], {}, ["a"])
+    assert means["a"][0] == pytest.approx(0.5, abs=0.03)
+    rows[:, 1] = 1.0
+    means, errors, _ = number_means._means(rows, 1, last)
+    assert (list(means), list(errors)) == (["a"], ["a"])
+    assert errors["a"][0] == pytest.approx(0.1 / np.sqrt(190), rel=0.4)
+
+
 @pytest.mark.mitsuba
 def test_means_of_a_resumed_run_are_those_of_one_run(tmp_path: Path) -> None:
     whole = run(steps=120)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unrender.core import arrays, trees
+from unrender.core import arrays
 from unrender.core.text import grouped
 from unrender.core.trees import Tree
 from unrender.optimizers.base import averaged_by
@@ -66,18 +66,25 @@ def averaged(run: Run, result: Result) -> Result:
 def _means(
     rows: np.ndarray, size: int, last: dict[str, np.ndarray]
 ) -> tuple[dict[str, np.ndarray], Tree, dict[str, str]]:
-    """Return the means of rows (B, n) by key, the standard errors of those that have one, and the steps of each key."""
+    """Return the means of rows (B, n) by key, their standard errors, and the steps of each key.
+
+    There are standard errors only if all numbers that change are stationary. A number that still drifts takes others with it, however
+    steady those seem.
+    """
+    found = [stationary_mean(column) for column in rows.T]
+    settled = all(mean or (column == column[0]).all() for mean, column in zip(found, rows.T, strict=True))
     means: dict[str, np.ndarray] = {}
     errors: Tree = {}
     steps: dict[str, str] = {}
-    for key, columns in trees.parts(rows, last).items():
-        found = [stationary_mean(column) for column in columns.reshape(len(rows), -1).T]
-        if not any(found):
+    start = 0
+    for key, value in last.items():
+        own, start = found[start : start + value.size], start + value.size
+        known = [mean for mean in own if mean is not None]
+        if not known:
             continue
-        values = [x if mean is None else mean.value for x, mean in zip(last[key].ravel(), found, strict=True)]
-        means[key] = np.array(values, last[key].dtype).reshape(last[key].shape)
-        steps[key] = str(min(len(rows) - mean.start for mean in found if mean) * size)
-        if all(found):
-            own = np.array([mean.error for mean in found if mean], np.float32)
-            errors[key] = own.reshape(last[key].shape)
+        values = [x if mean is None else mean.value for x, mean in zip(value.ravel(), own, strict=True)]
+        means[key] = np.array(values, value.dtype).reshape(value.shape)
+        steps[key] = str(min(len(rows) - mean.start for mean in known) * size)
+        if settled and len(known) == value.size:
+            errors[key] = np.array([mean.error for mean in known], np.float32).reshape(value.shape)
     return means, errors, steps
