@@ -45,7 +45,6 @@ def test_standard_errors_of_means_cover_the_truth() -> None:
         last.append(np.mean(np.square(result.last[KEY] - np.float32(TRUTH))))
         if KEY in result.standard_error:
             inside += list(np.abs(misses) < result.standard_error[KEY])
-    print(len(inside), np.mean(inside), np.mean(mean) / np.mean(last))
     assert len(inside) > 2 * SEEDS
     assert np.mean(inside) == pytest.approx(0.68, abs=0.2)
     assert np.mean(mean) < 0.5 * np.mean(last)

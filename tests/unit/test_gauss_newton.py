@@ -382,6 +382,30 @@ def test_few_noisy_pixels_do_not_outweigh_the_others() -> None:
     assert scatter[3.0] < 0.8 * scatter[None]
 
 
+@pytest.mark.parametrize("earlier", [True, False])
+def test_weights_leave_skewed_noise_without_bias(earlier: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the truth, with rare bright pixels. The planted fault is weights by the image whose residuals they weight."""
+    states = module._Point._states
+
+    def outliers(point: Any, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
+        images = states(point, points, view, key, spp)
+        generator = np.random.default_rng(key.uint32())
+        rare = generator.exponential(1.0, images.shape[1:]) * (generator.random(images.shape[1:]) < 0.2)
+        return images + (rare - 0.2) if len(points) == 1 else images
+
+    monkeypatch.setattr(module._Point, "_states", outliers)
+    made, estimator = problem_of(np.abs(MATRIX)), ur.GaussNewton(2, 2, noise_limit=0.5)
+    state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
+    found = []
+    for seed in range(300):
+        key = Key(seed)
+        if not earlier:
+            _, state = estimator.estimate(made, TRUTH, replace(state, variances=()), key)
+        estimate, state = estimator.estimate(made, TRUTH, state, key)
+        found.append(np.concatenate([estimate.gradient[name] for name in TRUTH]))
+    assert (off(np.stack(found), np.zeros(3)) < 4.0) is earlier
+
+
 @pytest.mark.mitsuba  # which a run folder asks for its version
 def test_both_find_the_minimum_of_a_noisy_problem_and_go_on_where_they_were(tmp_path: Any) -> None:
     made = problem()

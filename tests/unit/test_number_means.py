@@ -71,7 +71,7 @@ def test_means_of_a_resumed_run_are_those_of_one_run(tmp_path: Path) -> None:
     run(steps=70, run_directory=tmp_path / "run")
     resumed = ur.resume(tmp_path / "run", steps=120, problem=problem())
     assert np.array_equal(resumed.parameters["gain"], whole.parameters["gain"])
-    assert str(resumed.standard_error) == str(whole.standard_error)
+    assert resumed.adapted[-1] == whole.adapted[-1]
     assert not np.array_equal(resumed.parameters["gain"], resumed.last["gain"])
 
 

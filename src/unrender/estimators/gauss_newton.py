@@ -93,8 +93,8 @@ class GaussNewton:
             little noise, and a start several pixels away takes few steps.
         largest: {key: maximum width, > 0}; no limit for the others. The pose of one shape needs it: the shape covers a part of the
             image, so it may never differ from the image as much as a shift of the full image would.
-        noise_limit: a pixel of variance σ² has the weight 1 / (1 + σ² / (c m)), with this c and the median m over pixels with noise, so a
-            few noisy pixels, such as those of a visible lamp, do not outweigh the others; > 0. None for equal weights.
+        noise_limit: a pixel of variance σ² in earlier images has the weight 1 / (1 + σ² / (c m)), with this c and the median m over pixels
+            with noise, so a few noisy pixels, such as those of a visible lamp, do not outweigh the others; > 0. None for equal weights.
     """
 
     spp: int = 256
@@ -284,9 +284,10 @@ class _Point:
             points, distances = self._points(elements, steps)
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
             weights = self._weights(view, images) if images else None
-            if weights is not None and total.variances:
-                # After the first step, the variances come from earlier images too, so they hardly correlate with the noise of this one.
-                weights = weights.times(noise_weights(total.variances[view], self.options.noise_limit or math.inf))
+            if weights is not None and state.variances:
+                # Of earlier images only. A bright outlier has a large residual and a large variance, so weights by this image's variance
+                # would shift the solution to darker images.
+                weights = weights.times(noise_weights(state.variances[view], self.options.noise_limit or math.inf))
             found, pairs = products(halves, distances, weights, int(state.shift)), np.ix_(elements, elements)
             total.gradient[elements] += found.gradient
             total.hessian[pairs] += found.hessian
