@@ -8,11 +8,14 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib import ticker
 from matplotlib.figure import Figure
 
 from unrender.losses.metrics import srgb
 
 ERROR = "error / at the start"
+_NARROW = 5.0
+"""Ratio of the limits of a logarithmic axis below which its ticks are evenly spaced."""
 Values = Sequence[float] | np.ndarray
 Curves = Sequence[Sequence[Any]]
 """A curve of each run, (x values, y values)."""
@@ -25,6 +28,7 @@ def curves(
     columns: int = 4,
     log: str = "y",
     level: float | None = None,
+    panel: tuple[float, float] = (4.2, 3.4),
 ) -> Figure:
     """Draw the median and the range over runs of each contender, a panel for each title.
 
@@ -35,14 +39,16 @@ def curves(
         columns: panels side by side.
         log: the axes with a logarithmic scale, "", "x", "y" or "xy".
         level: y of a thin line across each panel.
+        panel: width and height of a panel in inches.
     """
     panels = {title: contenders for title, contenders in panels.items() if contenders}
     columns = min(columns, len(panels))
     rows = math.ceil(len(panels) / columns)
-    size = (4.2 * columns, 3.4 * rows)
+    size = (panel[0] * columns, panel[1] * rows)
     figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     for axis in axes.flat[len(panels) :]:
         axis.set_axis_off()
+    labels: set[str] = set()
     for axis, (title, contenders) in zip(axes.flat, panels.items(), strict=False):
         for label, runs in contenders.items():
             grid = _grid(runs, "x" in log)
@@ -51,12 +57,26 @@ def curves(
             axis.fill_between(grid, values.min(axis=0), values.max(axis=0), color=line.get_color(), alpha=0.15, lw=0)
         if level is not None:
             axis.axhline(level, color="black", lw=0.7)
-        axis.set(title=title, xlabel=x, ylabel=y)
+        axis.set(title=title)
         if "x" in log:
             axis.set_xscale("log")
         if "y" in log:
             axis.set_yscale("log")
-        axis.legend(fontsize=7)
+            low, high = axis.get_ylim()
+            narrow = high < _NARROW * low
+            axis.yaxis.set_major_locator(
+                ticker.MaxNLocator(4) if narrow else ticker.LogLocator(subs=(1, 2, 5), numticks=6)
+            )
+            axis.yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+            axis.yaxis.set_minor_locator(ticker.NullLocator())
+        if contenders.keys() - labels:
+            axis.legend(fontsize=7)
+        labels |= contenders.keys()
+    for axis in axes[:, 0]:
+        axis.set_ylabel(y)
+    for index, axis in enumerate(axes.flat[: len(panels)]):
+        if index + columns >= len(panels):
+            axis.set_xlabel(x)
     return figure
 
 

@@ -380,4 +380,4 @@ def plot(record: Record) -> figures.Figure:
         name: {label: [(seconds, [1.0, *entry[side]])] for side, label in sides.items() if side in entry}
         for name, entry in record["problems"].items()
     }
-    return figures.curves(panels, "seconds", columns=6)
+    return figures.curves(panels, "seconds", columns=6, panel=(2.4, 2.0))
