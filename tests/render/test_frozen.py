@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from typing import Any
 
 import drjit as dr
@@ -61,6 +63,35 @@ def test_what_its_first_use_makes_recordable_is_recorded_at_the_next_call(warned
         once(nothing, x)
     assert len(calls) == 3  # an attempt that failed, its call, and one that was recorded
     assert not warned
+
+
+@pytest.mark.parametrize("collected", [True, False])
+def test_scenes_that_are_no_longer_used_are_freed_after_a_failure(
+    collected: bool, warned: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Objects of a scene in a cycle of references stay in Dr.Jit's registry, and may prevent recording, until they are collected."""
+
+    class Scene:
+        def __init__(self) -> None:
+            self.itself = self
+
+    gone = weakref.ref(Scene())
+    if not collected:
+        monkeypatch.setattr(frozen.gc, "collect", lambda: 0)
+
+    def function(x: Any) -> Any:
+        return x + 1 if gone() is None else x * float(dr.sum(x)[0])
+
+    once = FrozenFunction(function)
+    x = mi.Float([1.0, 2.0, 3.0])
+    dr.eval(x)
+    gc.disable()
+    try:
+        for _ in range(4):
+            once(nothing, x)
+    finally:
+        gc.enable()
+    assert bool(warned) != collected
 
 
 def test_the_error_of_a_replay_is_raised_and_the_recording_stays(

@@ -26,7 +26,7 @@ class FrozenFunction:
 
     A virtual call sees the objects of every scene in the process, including the caller's own. Some of them build tables at their first
     use, which cannot be recorded. Those of textured lights are built before the first recording. The traced call after a failure builds
-    others. The next call therefore records again, up to three consecutive times.
+    others, and scenes that are no longer used are freed. The next call therefore records again, up to three consecutive times.
 
     An error in a replay is raised, since out of memory, for example, does not justify tracing at every later call.
 
@@ -68,6 +68,7 @@ class FrozenFunction:
             with _naming(self._keys):
                 result = self._function(*arguments)  # an error of the function itself propagates
             self._failures += 1
+            gc.collect()  # objects of scenes that are no longer used may prevent recording until they are freed
             self._frozen = _recorder(self._function, self._tracing) if self._failures < _ATTEMPTS else None
             if self._frozen is None:
                 _warn(str(_first_cause(error)).partition("\n")[0])
