@@ -76,7 +76,7 @@ lint: .venv/ready
 	$(TYPES)
 
 docs: .venv/docs-ready
-	$(BIN)/python -m sphinx -W --keep-going -E -b html docs build/site
+	$(BIN)/python -m sphinx -W --keep-going -E -c scripts/site -b html docs build/site
 	@echo "the site: file://$(CURDIR)/build/site/index.html"
 
 package: .venv/ready

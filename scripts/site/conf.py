@@ -5,8 +5,9 @@ import sys
 from importlib.metadata import version as version_of
 from pathlib import Path
 
-HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent / "scripts" / "site"), str(HERE.parent)]
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+sys.path[:0] = [str(Path(__file__).parent), str(ROOT)]
 
 from benchmarks.runner.results_page import write_pages  # noqa: E402
 from unrender.backend import variant  # noqa: E402
@@ -15,8 +16,8 @@ variant.use(os.environ.get("UNRENDER_VARIANT", variant.LLVM))  # some public cla
 
 import site_pages  # noqa: E402
 
-write_pages(HERE / "benchmarks")
-site_pages.write_pages(HERE)
+write_pages(DOCS / "benchmarks")
+site_pages.write_pages(DOCS)
 
 project = "unrender"
 author = "the unrender contributors"
