@@ -317,7 +317,7 @@ def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.n
 def centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
     """Return the centre of rotation of each target: shapes first, then emitters, then sensors."""
     result = {shape.id(): _centre(shape.bbox()) for shape in scene.shapes() if shape.id() in targets}
-    lamps = [emitter for emitter in scene.emitters() if emitter.get_shape() is None and emitter.id() in targets]
+    lamps = [emitter for emitter in scene.emitters() if is_posable(emitter) and emitter.id() in targets]
     result |= {lamp.id(): _place(lamp) for lamp in lamps}
     for sensor in scene.sensors():
         if sensor.id() in targets:
