@@ -73,10 +73,10 @@ def gallery_page(folder: Path) -> str:
     parts = [
         "# Gallery",
         "Problems made by code, whose truth is known. Three pictures show the first view: start, result of 100 steps of "
-        "`auto` at 48 pixels a side, and reference. A single picture is the reference. Poses that start "
-        "far off need `smoothed` with a larger `sigma` ([pose](../guide/pose.md)): there the picture shows where "
-        "`auto` ends. Errors are relative to the start, after 4 s on two CPU cores: of the tutorial loop with the best of eight settings, and of `auto` "
-        "(`python -m benchmarks suite`).",
+        "`auto` at 48 pixels a side, and reference. A single picture is the reference. Poses that start far off need "
+        "`smoothed` with a larger `sigma` ([pose](../guide/pose.md)): there the picture shows where `auto` ends.",
+        "Errors are relative to the start, after 4 s on two CPU cores: of the tutorial loop with the best of eight "
+        "settings, and of `auto` (`python -m benchmarks suite`).",
     ]
     for name in gallery.names():
         parts += [f"## {name}", gallery.summary(name)]
