@@ -153,3 +153,28 @@ def test_a_lens_stays_positive() -> None:
     camera = PLUGINS["thinlens"].build(Path())["camera"]
     known = bounds(scene(camera=camera), camera__aperture_radius=0.1, camera__focus_distance=3.0)
     assert known == {"camera.aperture_radius": (0.0, None), "camera.focus_distance": (0.0, None)}
+
+
+def test_numbers_that_mitsuba_compiles_have_a_next_step() -> None:
+    """The scale of a bump map multiplies its texture; scales of the sky have no such parameter."""
+    to_scene = {
+        "type": "scene",
+        "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "sky": {"type": "sunsky"},
+        "wall": {
+            "type": "rectangle",
+            "bsdf": {
+                "type": "bumpmap",
+                "relief": {"type": "bitmap", "bitmap": mi.Bitmap(np.full((4, 4, 1), 0.5, np.float32)), "raw": True},
+                "inner": {"type": "diffuse"},
+                "scale": 0.1,
+            },
+        },
+    }
+    for key, hint in (
+        ("wall.bsdf.scale", "recover wall.bsdf.nested_texture.data in its place"),
+        ("sky.sky_scale", "run once for each of several values, and compare the losses"),
+        ("sky.sun_scale", "run once for each of several values, and compare the losses"),
+    ):
+        with pytest.raises(ur.InputError, match=hint):
+            ur.Problem(lambda: to_scene, [ur.Parameter(key)], [ur.View(np.zeros((4, 4, 3), np.float32))])

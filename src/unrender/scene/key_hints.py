@@ -12,6 +12,8 @@ from unrender.rendering.renderer import ParameterInfo
 _NAMELESS = re.compile(r"|object_\d{9,}|__.*|elm__\d+|_unnamed.*")
 """Ids that Mitsuba generates for objects without one."""
 _TRANSFORM = "to_world"
+_INSIDE = "nested_texture"
+"""Slot of the texture of a bump map, which its scale multiplies."""
 _PLACES = (
     _TRANSFORM,
     "translation",
@@ -59,8 +61,16 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
 
 
 def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
-    """Return a hint at a recoverable key in place of one that is not: a pose in place of a transformation. "" if there is none."""
+    """Return a hint at a recoverable key in place of one that is not, or at what to do; "" if there is none.
+
+    A pose replaces a transformation, and the texture of a bump map its scale. Other numbers that are compiled take one run per value.
+    """
     owner, _, rest = key.rpartition(".")
+    if (info := known.get(key)) is not None and info.compiled:
+        inside = [name for name in known if name.startswith(f"{owner}.{_INSIDE}.") and known[name].perturbable]
+        if inside:
+            return f"; recover {inside[0]} in its place, which it multiplies"
+        return "; set it in the scene file, run once for each of several values, and compare the losses"
     if rest != _TRANSFORM:
         return ""
     if poses := _poses(owner, known):
