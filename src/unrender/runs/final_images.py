@@ -161,7 +161,8 @@ def _undetermined(
     per_pass = _pass_spp(problem)
     lines += common_factor(problem, result.parameters, spp, seconds, per_pass)
     lines += undetermined(problem, result.parameters, spp, seconds, per_pass)
-    allowed = min(max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
+    slow = min(slowdown(), MOST_SLOWDOWN)
+    allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
     text = "\n".join(lines)
     lines += [line for key, line in numbers.undetermined.items() if key not in text]
