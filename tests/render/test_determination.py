@@ -78,7 +78,9 @@ def test_cells_that_hardly_change_the_pictures_are_told():
 
 def test_a_run_tells_in_its_folder(tmp_path: Any):
     material = {"type": "principled", "sheen": 0.0, "sheen_tint": 0.5}
-    made = problem(scene(material), "wall.bsdf.sheen_tint.value", "wall.bsdf.base_color.value")
+    keys = "wall.bsdf.sheen_tint.value", "wall.bsdf.base_color.value"
+    seen = ur.render(problem(scene(material), *keys), spp=64, seed=5)  # one that the base colour explains
+    made = ur.Problem(scene(material), [ur.Parameter(key) for key in keys], [ur.View(seen)], max_depth=2)
     result = ur.optimize(made, steps=2, run_directory=tmp_path / "run")
     assert [line.partition(":")[0] for line in result.undetermined] == ["wall.bsdf.sheen_tint.value"]
     page = report.page(tmp_path / "run").read_text()
