@@ -76,7 +76,7 @@ def table(record: Record) -> str:
     rows = []
     for name, entry in record["problems"].items():
         if not entry["count"]:
-            rows.append([name, 0, "no standard error: elements share pixels", "", "", ""])
+            rows.append([name, 0, "no standard error", "", "", ""])
             continue
         numbers = [f"{entry[key]:.2f}" for key in ("std", "mean")]
         shares = [f"{entry[key]:.1%}" for key in ("beyond_2", "decided")]

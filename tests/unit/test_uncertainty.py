@@ -161,6 +161,14 @@ def test_runs_state_errors_of_the_right_size(
         np.testing.assert_allclose(written, run.standard_error[key], rtol=1e-6)
 
 
+def test_volumes_have_no_map() -> None:
+    """Although here no pixel sees two voxels: rays pass many in general, and the overlap does not tell it reliably."""
+    truth = {"fog": np.random.default_rng(0).uniform(0.2, 0.8, (1, TEXELS, TEXELS, 3))}
+    renderer = AnalyticRenderer(truth, matrix(), 0.0, 0.0, shape=(SIZE, SIZE), sensors=1)
+    made = Problem(renderer, [Parameter("fog", initial=0.4, bounds=(0, 1))], [View(renderer.exact(truth))])
+    assert not uncertainty(made, made.initial_values()).standard_error
+
+
 def test_too_few_probes_or_samples_give_no_map() -> None:
     made = problem()
     values = estimate(made)

@@ -1,4 +1,4 @@
-"""Uncertainty of recovered textures and grids, per texel or voxel."""
+"""Uncertainty of recovered textures, per texel."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _PROBES = 4.0
 _FEWEST, _ERRORS = 8, 3.0
 """Fewest probes, and standard errors by which the residual must exceed the pictures' noise, or there is no map."""
 _MOST_OVERLAP = 2.0
-"""Overlap from which on elements are not independent: rays through volumes, and more texels than pixels that see them."""
+"""Overlap from which on texels are not independent, such as with more texels than pixels that see them."""
 _ELEMENTS, _LEAST = 9.0, 0.1
 """Number of elements that the mean over all cells weighs as much as beside the neighbours, and the least ratio to it."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of textures and grids.
+    """Uncertainty of textures.
 
     Attributes:
         standard_error: {key: array} of the parameters' shapes, float32: standard deviation of each element's error.
@@ -50,7 +50,7 @@ class Uncertainty:
 def uncertainty(
     problem: Problem, values: Mapping[str, np.ndarray], seconds: float = math.inf, seed: int = 0
 ) -> Uncertainty:
-    """Estimate the standard error of each texel and voxel of a problem's textures and grids.
+    """Estimate the standard error of each texel of a problem's textures.
 
     With the pictures' residual r, their derivative J by the parameters, and the diagonal elements H of the Gauss-Newton matrix JᵀJ, the
     variance of an element is that of a posterior with independent elements:
@@ -62,9 +62,9 @@ def uncertainty(
     run's noise. The references' noise, of standard deviation σ, is missing there as far as the parameters have followed it. τ² is the mean
     square change from the start plus the mean variance, and p the curvature of the parameter's prior.
 
-    Errors of what is not unknown, such as a lamp of another colour, are not included. Parameters with κ ≥ 2 have no map, since their
-    elements are not independent: most volumes, and textures with more texels than pixels that see them. There is none either if time or
-    samples are too few.
+    Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels,
+    and a diagonal does not bound their errors; nor have textures with κ ≥ 2, such as those with more texels than pixels that see them.
+    There is none either if time or samples are too few.
 
     Args:
         problem: problem with views and scene.
@@ -73,7 +73,7 @@ def uncertainty(
         seed: seed of all random numbers.
 
     Returns:
-        Maps of the parameters with at least three axes, path gradients and κ < 2.
+        Maps of the textures with path gradients and κ < 2.
 
     Raises:
         InputError: `values` have other keys or shapes than the problem's.
@@ -107,7 +107,7 @@ def of_residuals(
     keys = [
         key
         for key, square in known.squares.items()
-        if square.ndim >= MAP_AXES and square.any() and known.overlap.get(key, 1.0) < _MOST_OVERLAP
+        if square.ndim == MAP_AXES and square.any() and known.overlap.get(key, 1.0) < _MOST_OVERLAP
     ]
     if not keys or known.probes < _FEWEST:
         return Uncertainty()
@@ -136,7 +136,7 @@ def of_residuals(
 
 @dataclass(frozen=True)
 class _Cells:
-    """Texels or voxels of one parameter, with one curvature per cell.
+    """Texels of one parameter, with one curvature per texel.
 
     Attributes:
         change: mean square change of each cell from the start, (...).

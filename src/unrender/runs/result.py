@@ -57,8 +57,8 @@ class Result:
             and of the references, infinite where the images do not determine it. Runs with a run folder have it for all numbers, also
             beside textures and grids, see `runs.least_squares`. Other runs have it for numbers optimised by `AveragedNewton`, without
             errors of unknowns outside its block, and for numbers that are means over enough steps, without the references' noise.
-            Textures and grids of runs with a run folder have a map, see `unrender.runs.uncertainty`.
-        data_share: {key: array} of the parameters' shapes, in [0, 1], for textures and grids: weight of the references in each element, see
+            Textures of runs with a run folder have a map, see `unrender.runs.uncertainty`.
+        data_share: {key: array} of the parameters' shapes, in [0, 1], for textures: weight of the references in each element, see
             `unrender.runs.uncertainty`. {} for runs without a run folder.
         phases: {phase: seconds} in order: "compiling", "steps", "checkpoints and callbacks", "final pictures", and, on the command line,
             earlier phases. For a resumed run, those of the last session.

@@ -13,7 +13,7 @@ A run writes what these models describe, and `reader` checks its input against t
 | `last.npz` | {key: array} after the last step, if `parameters.npz` contains better ones of an earlier step |
 | `pictures.npz` | {"view0/reference": (H, W, 3), ...}, linear: `reference`, `initial`, `result`, `control_weight` |
 | `sensitivity.npz` | {key: array}: change of the images per unit of each element; where it is small, the value is noise or smoothing |
-| `standard_error.npz`, `data_share.npz` | {key: array} of textures and grids: how certain each element is, see `Result` |
+| `standard_error.npz`, `data_share.npz` | {key: array} of textures: how certain each element is, see `Result` |
 | `meshes.npz`, `meshes/` | see `meshes.arrays_of`; PLY and OBJ files of the recovered meshes |
 | `checkpoints/00000050/` | `state.safetensors` and `manifest.json`, see `Manifest`; the last three are kept |
 | `live/` | current state of a run, see `live.Live`; `status.json` is a `LiveStatus` |
