@@ -61,10 +61,11 @@ def images(renderer: Any, values: dict[str, np.ndarray], seeds: range, spp: int 
 
 
 def picture(name: str, **of: Any) -> np.ndarray:
-    """A picture of many samples by Mitsuba's own integrator."""
+    """A picture of many samples by Mitsuba's own integrator, which has no masks."""
     made = mi.load_dict(scene(**of))
     if name == "mask":
-        return (picture("depth", **of) > 0).astype(np.float32)
+        renderer = MitsubaRenderer(lambda: scene(**of), 1).with_aov("mask")
+        return images(renderer, {FLOOR: np.array([0.4, 0.5, 0.6])}, range(1), 4096)[0, ..., :1]
     integrator = mi.load_dict({"type": "aov", "aovs": f"a:{name}"})
     return np.array(mi.render(made, integrator=integrator, spp=1024))
 
@@ -135,7 +136,7 @@ def test_albedo_and_depth_share_one_descent(method: str) -> None:
 def test_a_pose_is_recovered_from_one_picture(name: str) -> None:
     made = problem([ur.View(picture(name, x=0.3), aov=name)], ("ball.translation.x",))
     result = ur.optimize(made, ur.GaussNewton(16, derivative_spp=8), ur.optimizers.AveragedNewton(), steps=15)
-    assert result.parameters["ball.translation.x"] == pytest.approx(0.3, abs=0.02)
+    assert result.parameters["ball.translation.x"] == pytest.approx(0.3, abs=0.03)
 
 
 def test_a_mesh_follows_masks() -> None:
@@ -145,7 +146,7 @@ def test_a_mesh_follows_masks() -> None:
         np.sqrt(np.mean((ur.render(made, values, spp=256) - np.asarray(made.views[0].reference)) ** 2))
         for values in (result.initial, result.parameters)
     )
-    assert end < 0.6 * start
+    assert end < 0.4 * start
 
 
 def test_a_file_names_the_aov_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
