@@ -35,6 +35,8 @@ _WEAKEST = 1e-4
 """Smallest eigenvalue, relative to the largest, that the length of a direction follows."""
 _REPEATS = 8
 """Most repeats of the pictures that are judged."""
+_FLAT = 0.1
+"""Change of the pictures relative to that of a shift by `_SHIFT` below which the longest difference leaves a number undetermined."""
 _COMPARABLE = 0.3
 """Noise of the references relative to that of this check from which a change that the check does not see is undetermined."""
 _CHANNELS = 3.0
@@ -214,18 +216,20 @@ class _Fit:
         whole *= residual.size / freedom if freedom > 0 else math.inf
         error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (whole, covariance(noise, noise)))
         step = numbers.inside((numbers.point + differences.directions @ along)[None])[0] - numbers.point
-        unseen = np.abs(differences.directions[:n, hidden])
+        flat = squares + _ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size
         # The noise of this check says nothing about references that have much less of it.
         comparable = np.mean(after[0] * after[1]) > _COMPARABLE**2 * np.mean(noise * noise)
-        return cls(whole, error, own, step[:n], unseen if comparable else unseen[:, :0])
+        # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
+        open_ = flat[None] | (~numbers.rigid[:, None] & comparable)
+        unseen = np.abs(differences.directions[:n]) * (hidden[None] & open_)
+        return cls(whole, error, own, step[:n], unseen[:, hidden])
 
 
 def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     """Return the lines."""
     posed = numbers.rigid | (numbers.sizes <= 0.0)
     sizes = np.where(posed, np.maximum(numbers.sizes, _OF_WIDTHS * widths), numbers.sizes)
-    # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
-    unseen = (fit.unseen > _DOUBTFUL * sizes[:, None]) & ~numbers.rigid[:, None]
+    unseen = fit.unseen > _DOUBTFUL * np.where(posed, 2.0 * numbers.limits[: numbers.count], sizes)[:, None]
     error = np.where(unseen.any(axis=1), np.inf, fit.error)
     open_ = error > _DOUBTFUL * sizes
     n, spread = numbers.count, np.outer(fit.error, fit.error)
