@@ -33,6 +33,8 @@ _LEAST_TESTS = 0.6
 """Seconds on an idle machine that the tests of undetermined parameters have together even if the budget is over."""
 _NUMBERS_SHARE = 0.05
 """Time limit of least squares of few numbers relative to the time of the steps; at least one second."""
+_UNSETTLED = 3.0
+"""Standard errors from which the remaining least-squares step is the standard error."""
 _TRIAL_PATHS = 1 << 18
 _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 """Paths of one pass over all views, and its most samples per pixel."""
@@ -167,7 +169,8 @@ def _undetermined(
     text = "\n".join(lines)
     lines += [line for key, line in numbers.undetermined.items() if key not in text]
     for key, error in numbers.errors.items():  # a block's own errors take other unknowns as known
-        shape = result.parameters[key].shape
+        shape, step = result.parameters[key].shape, np.abs(numbers.steps[key])
+        error = np.where(step > _UNSETTLED * error, step, error)  # the run ended before the noise decides
         deviations[key] = np.maximum(error.reshape(shape), deviations.get(key, 0.0)).astype(np.float32)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
