@@ -62,8 +62,8 @@ def played(unrender, path: Path, variant: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("keys", "size"),
-    [((WALL, LAMP), 12), ((WALL, LAMP), 4)],
-    ids=["light x albedo", "sixteen pixels"],
+    [((WALL, LAMP), 12), ((LAMP, OTHER), 12), ((WALL, LAMP), 4)],
+    ids=["light x albedo", "one lamp twice", "sixteen pixels"],
 )
 def test_a_pair_that_only_its_product_or_sum_determines(
     unrender, tmp_path: Path, mitsuba_variant: str, keys: tuple[str, str], size: int
