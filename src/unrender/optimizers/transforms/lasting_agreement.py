@@ -79,9 +79,9 @@ class LastingAgreement(StepTransform):
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> GradientBlocks:
         del learning_rates
-        zeros = [trees.zeros_like(parameters) for _ in range(3)]
-        agreement = {key: arrays.total(x) for key, x in zeros[0].items()}
-        return GradientBlocks(*zeros, agreement, 0, 0, dict.fromkeys(parameters, 1.0))
+        total, last, earlier = (trees.zeros_like(parameters) for _ in range(3))
+        agreement = {key: arrays.total(x) for key, x in total.items()}
+        return GradientBlocks(total, last, earlier, agreement, 0, 0, dict.fromkeys(parameters, 1.0))
 
     def update(self, update: StepUpdate, state: GradientBlocks) -> tuple[StepUpdate, GradientBlocks]:
         """Set the lasting fractions. Waits for the device at the end of a block."""
