@@ -151,13 +151,13 @@ def test_the_seconds_of_a_run_cover_its_compilation_and_pictures(
     """As in `unrender run`. The budget of each run begins with it."""
     check, left, began = Budget.on_start, [], []
 
-    def on_start(self: Budget, descent: Any) -> None:
-        check(self, descent)
-        left.append(descent.run.time_left())
-        began.append(descent.run.deadline - 1.0)
+    def on_start(self: Budget, run: Any) -> None:
+        check(self, run)
+        left.append(run.time_left())
+        began.append(run.deadline - 1.0)
 
     monkeypatch.setattr(Budget, "on_start", on_start)
-    monkeypatch.setattr(Budget, "on_update", lambda self, descent, *_: descent.run.stop("seconds"))
+    monkeypatch.setattr(Budget, "on_update", lambda self, run, *_: run.stop("seconds"))
     answer = unrender(*command, "--out", "s", "--variant", mitsuba_variant)
     assert answer.status in (0, 3), answer.error
     assert len(left) == (2 if command is SWEPT else 1)
@@ -168,7 +168,7 @@ def test_the_seconds_of_a_run_cover_its_compilation_and_pictures(
 def test_a_sweep_tells_once_of_seconds_that_allow_few_steps(
     unrender, monkeypatch: pytest.MonkeyPatch, mitsuba_variant: str
 ) -> None:
-    monkeypatch.setattr(Budget, "on_update", lambda self, descent, *_: descent.run.stop("seconds"))
+    monkeypatch.setattr(Budget, "on_update", lambda self, run, *_: run.stop("seconds"))
     answer = unrender(*SWEPT, "--out", "s", "--variant", mitsuba_variant)
     assert answer.out.count("note: the budget of 1 s allows about 1 steps") == 1
 
