@@ -198,7 +198,7 @@ class _Mean:
 
     @property
     def is_known(self) -> bool:
-        """Whether it is significantly positive."""
+        """Return whether the estimate is significantly positive."""
         return self.value > _ERRORS * self.error
 
 

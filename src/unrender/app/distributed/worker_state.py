@@ -1,4 +1,4 @@
-"""What workers have, as the driver tracks it: their memories of views, and the parameters that were sent to them.
+"""State of the workers as the main process tracks it: memories of views, and the parameters that were sent.
 
 Memories have numbers, with the steps that restore them. Each parameter array is sent once, in full or as a float16 difference.
 """
