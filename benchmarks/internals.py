@@ -48,6 +48,7 @@ from unrender.scene.batches import WholeView
 from unrender.scene.bounds import project
 from unrender.scene.executor import LOCAL
 from unrender.scene.parameter import ParameterSettings
+from unrender.statistics import gaussian
 from unrender.statistics.recursion import advance
 
 dr: Any = importlib.import_module("drjit")

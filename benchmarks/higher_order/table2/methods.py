@@ -153,6 +153,14 @@ def _lbfgs(task: Task, n: int, c: Config) -> tuple[Any, Any]:
     return _smoothed(task, c, _samples(n, c)), ur.optimizers.LBFGS(**_newton(n, c))
 
 
+def _gauss_newton(task: Task, n: int, c: Config) -> tuple[Any, Any]:
+    """Return differences of renders at widths of at most σ, with the mean of all quadratic models as `auto` uses it."""
+    largest = {key: task.widths.get(key, task.sigma) for key in task.problem().initial()}
+    coarse = c["coarse"] if c["coarse"] > 0.0 else None
+    estimator = ur.GaussNewton(int(c["spp"]), int(c["derivative_spp"]), coarse=coarse, largest=largest)
+    return estimator, ur.optimizers.AveragedNewton(trust_radius=c["radius"])
+
+
 _NEWTON_GRID = {"half_life": (6.0,), "steps": (30.0,), "radius": (0.5,)}
 _HALF_OR_ALL = {"samples": (0.5, 1.0)}
 _KEPT_GRID = {"adaptive": (0.0, 1.0), "steps": (10.0,)}
@@ -165,6 +173,9 @@ METHODS = {
     "OurHVP": Method(_products(False), _NEWTON_GRID),
     "OurHVPA": Method(_products(True), {**_KEPT_GRID, "radius": (1.5,), "memory": (0.25, 0.5), **_HALF_OR_ALL}),
     "OurJoint": Method(_joint, {**_KEPT_GRID, "radius": (1.0,), "memory": (0.3, 1.0), **_HALF_OR_ALL}),
+    "OurGN": Method(
+        _gauss_newton, {"spp": (8.0, 32.0), "derivative_spp": (2.0, 8.0), "coarse": (4.0, 8.0), "radius": (2.0,)}
+    ),
 }
 _RATES = {"rate": (0.03, 0.1, 0.3)}
 _WIDE = {"half_life": (1e6,), "steps": (1e6,), "radius": (0.5,), "iterations": (1.0,)}
@@ -207,7 +218,10 @@ OTHER_GRIDS: dict[tuple[str, str], Grid | tuple[Grid, ...]] = {
     ("TEXTURE", "OurJoint"): {"samples": (6.0, 8.0), **_ONE_BY_ONE},
 }
 """What is tried in place of a method's own grid; several grids are tried one after the other."""
-LEFT_OUT = {("TEXTURE", "OurH"): "a Hessian of 1024 × 1024 elements, each from perturbations of its own"}
+LEFT_OUT = {
+    ("TEXTURE", "OurH"): "a Hessian of 1024 × 1024 elements, each from perturbations of its own",
+    ("QUAD", "OurGN"): "its images have one pixel, which determines one combination of two numbers",
+}
 
 
 def configurations(task: str, method: str) -> list[Config]:

@@ -1,0 +1,160 @@
+"""FR22 and OurHVPA with the settings of the paper's public code (wangzican/prdpt2024), which are not tuned here.
+
+Schedules of σ are linear: constant for the first steps, then down to the last value, which the last steps have. OurHVPA is the nonlinear
+conjugate gradient of that code: one Hessian-vector product along the direction, by differences at ± σ / 3, and a step from a gradient of
+its own, 8 renders in all for one pair of perturbations. Negative curvature counts as 1, and steps are at most `trust` σ long. The
+direction is the gradient's again where it would not descend; the code's counter of steps to a restart never rises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+import unrender as ur
+from benchmarks.higher_order.table2.descents import Descent, measured, truth_of
+from benchmarks.internals import Key, black_box, gaussian, trees
+from benchmarks.runner.timing import work_time
+
+Function = Callable[[np.ndarray], np.ndarray]
+METHODS = ("FR22, published", "OurHVPA, published")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of one method on one task.
+
+    Attributes:
+        sigma, last_sigma: σ at the start and at the end, in units of `unit`.
+        steps: number of steps.
+        first, last: steps before and after the change of σ.
+        rate: Adam's learning rate, in units of `unit`; 0 for conjugate gradients.
+        trust: longest step in units of σ.
+        pairs: antithetic pairs of perturbations per gradient.
+        spp: samples per pixel of a render.
+        unit: the paper's unit of the parameters in ours.
+    """
+
+    sigma: float
+    last_sigma: float
+    steps: int
+    first: int = 0
+    last: int = 0
+    rate: float = 0.0
+    trust: float = 1.0
+    pairs: int = 1
+    spp: int = 32
+    unit: float = 1.0
+
+    def sigma_at(self, step: int) -> float:
+        """Return σ of a step."""
+        share = np.clip((step - self.first) / max(self.steps - self.last - self.first, 1), 0.0, 1.0)
+        return float(self.sigma + share * (self.last_sigma - self.sigma))
+
+
+_TWENTY_DEGREES, _PIXEL = float(np.radians(20.0)), 2.0 / 500.0
+SETTINGS: dict[str, dict[str, Settings]] = {
+    "MUG": {
+        "FR22, published": Settings(3.0, 0.01, 300, 50, 100, rate=0.1, unit=_TWENTY_DEGREES),
+        "OurHVPA, published": Settings(3.0, 0.01, 30, 0, 10, trust=4.0, unit=_TWENTY_DEGREES),
+    },
+    "SHADOW": {
+        "FR22, published": Settings(0.5, 0.01, 350, 150, rate=0.02),
+        "OurHVPA, published": Settings(0.5, 0.05, 60, 0, 41, trust=4.0),
+    },
+    "BUNNY": {
+        "FR22, published": Settings(0.004, 0.004, 200, rate=0.02, pairs=2),
+        "OurHVPA, published": Settings(0.06, 0.005, 100, 20, 20, trust=2.0, pairs=2),
+    },
+    "BOX10": {
+        "FR22, published": Settings(50.0, 0.1, 7000, 2000, 500, rate=0.05, pairs=6, unit=_PIXEL),
+        "OurHVPA, published": Settings(50.0, 0.1, 400, 0, 50, trust=10.0, pairs=6, unit=_PIXEL),
+    },
+}
+"""Of the public code, by task. BOX10's number of steps of OurHVPA, and what stays constant there, are ours: they are not published."""
+
+
+def descend(name: str, method: str, problem: ur.Problem, seed: int) -> Descent:
+    """Return one run with the published settings."""
+    settings = SETTINGS[name][method]
+    truth, start = truth_of(problem), trees.ravel(problem.initial())
+    stepper = _fr22 if settings.rate else _conjugate_gradients
+    points, times, errors = [start], [0.0], [1.0]
+    scale = float(np.sqrt(np.mean((start - truth) ** 2)))
+    stepper(problem, settings, seed, lambda *_: None, 2)
+    began = work_time()
+
+    def moved(point: np.ndarray) -> None:
+        points.append(settings.unit * point)
+        times.append(work_time() - began)
+        errors.append(float(np.sqrt(np.mean((points[-1] - truth) ** 2))) / scale)
+
+    renders = stepper(problem, settings, seed, moved, settings.steps)
+    return measured(problem, points, times, errors, settings.spp * renders)
+
+
+def _loss(problem: ur.Problem, settings: Settings, seed: int, step: int) -> Function:
+    """Return the loss at points in units of `Settings.unit`, all with the same random numbers."""
+    losses = black_box(problem, problem.initial(), settings.spp, Key(seed, step))
+    return lambda points: losses(settings.unit * points)
+
+
+def _fr22(problem: ur.Problem, settings: Settings, seed: int, moved: Callable[[np.ndarray], None], steps: int) -> int:
+    """Descend by Adam on the gradient of Fischer and Ritschel 2023. Return the number of renders."""
+    rng, x = np.random.default_rng([31, seed]), trees.ravel(problem.initial()) / settings.unit
+    mean, square = np.zeros_like(x), np.zeros_like(x)
+    for step in range(steps):
+        sigma = settings.sigma_at(step)
+        z = gaussian.gradient_sample(rng.uniform(size=(settings.pairs, x.size)))
+        change = _odd(_loss(problem, settings, seed, step), x, sigma, z)
+        gradient = np.mean(change[:, None] * np.sign(z), axis=0) * gaussian.GRADIENT_MASS / sigma
+        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
+        unbiased = mean / (1 - 0.9 ** (step + 1)), square / (1 - 0.999 ** (step + 1))
+        x = x - settings.rate * unbiased[0] / (np.sqrt(unbiased[1]) + 1e-8)
+        moved(x)
+    return 2 * settings.pairs * steps
+
+
+def _conjugate_gradients(
+    problem: ur.Problem, settings: Settings, seed: int, moved: Callable[[np.ndarray], None], steps: int
+) -> int:
+    """Descend by nonlinear conjugate gradients with aggregate gradients and products. Return the number of renders."""
+    rng, x = np.random.default_rng([37, seed]), trees.ravel(problem.initial()) / settings.unit
+    sigma = settings.sigma_at(0)
+    residual = -_gradient(_loss(problem, settings, seed, -1), x, sigma, settings.pairs, rng)
+    direction = residual
+    for step in range(steps):
+        sigma = settings.sigma_at(step)
+        loss, length = _loss(problem, settings, seed, step), float(np.linalg.norm(direction))
+        if length > 0.0:
+            ahead = sigma / 3 / length * direction
+            state = rng.bit_generator.state
+            product = -_gradient(loss, x - ahead, sigma, settings.pairs, rng)
+            rng.bit_generator.state = state
+            product = (product + _gradient(loss, x + ahead, sigma, settings.pairs, rng)) / (2 * sigma / 3) * length
+            curvature = float(direction @ product)
+            slope = float(_gradient(loss, x, sigma, settings.pairs, rng) @ direction)
+            move = -slope / (curvature if curvature > 0.0 else 1.0) * direction
+            x = x + move * min(1.0, settings.trust * sigma / max(float(np.linalg.norm(move)), 1e-30))
+        moved(x)
+        last, residual = residual, -_gradient(loss, x, sigma, settings.pairs, rng)
+        direction = residual + (residual @ residual) / max(float(last @ last), 1e-30) * direction
+        if residual @ direction <= 0.0:
+            direction = residual
+    return 8 * settings.pairs * steps
+
+
+def _gradient(f: Function, x: np.ndarray, sigma: float, pairs: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the aggregate gradient of the paper's section 3.5 from antithetic pairs, (n,)."""
+    normal = rng.standard_normal((pairs, x.size))
+    z = gaussian.gradient_mixture(rng.uniform(size=pairs), rng.uniform(size=(pairs, x.size)), normal)
+    weight = z / (sigma * gaussian.gradient_ratio(z)[:, None])
+    return np.mean(_odd(f, x, sigma, z)[:, None] * weight, axis=0)
+
+
+def _odd(f: Function, x: np.ndarray, sigma: float, z: np.ndarray) -> np.ndarray:
+    """Return half of f(x + σ z) − f(x − σ z), (B,)."""
+    values = f(np.concatenate([x + sigma * z, x - sigma * z]))
+    return 0.5 * (values[: len(z)] - values[len(z) :])
