@@ -107,6 +107,20 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
     assert sum(allowed) == pytest.approx(0.6)
 
 
+@pytest.mark.parametrize("tested", [False, True])
+def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that ends without its test of numbers says so; one that was tested does not."""
+    made = problem()
+    values = {"wall": np.full(3, 0.4, np.float32)}
+    result = Result(values, values, [{}], 30.0, 0.0, "steps")
+    line = "whether wall arrived: there was no time to test it; use more seconds or fewer pixels"
+    if tested:
+        assert line not in final_images.render_final_images(made, result).undetermined
+        monkeypatch.setattr(final_images, "slowdown", lambda: 1e-9)
+    late = final_images.render_final_images(made, result, left=lambda: 0.0, tested=tested)
+    assert line in late.undetermined
+
+
 def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:
     class Slow(Callback):
         def on_step(self, run: Run, record: dict[str, Any]) -> None:

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from unrender.core import phases
+from unrender.core.text import listed
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
 from unrender.runs.image_sensitivity import Curvature, curvature
-from unrender.runs.least_squares import check_numbers, compile_check
+from unrender.runs.least_squares import NumbersCheck, check_numbers, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, of_residuals
 from unrender.runs.result import Result
 from unrender.scene.problem import Problem
@@ -141,6 +142,8 @@ def render_final_images(
         known = curvature(problem, result.parameters, seconds=seconds) if everything else Curvature({}, {}, 0)
         sensitivities, maps = known.sensitivity(), Uncertainty()
         lines, warnings, deviations = [], (), dict(result.standard_error)
+        if not tested and result.steps:
+            lines = _unchecked(check_numbers(problem, result.parameters, result.initial, 0.0))
         if everything:
             lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests)
             if result.steps and len(ends[0]) == 2 and left() > 0.0:
@@ -167,7 +170,7 @@ def _undetermined(
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
     text = "\n".join(lines)
-    lines += [line for key, line in numbers.undetermined.items() if key not in text]
+    lines += [line for key, line in numbers.undetermined.items() if key not in text] + _unchecked(numbers)
     for key, error in numbers.errors.items():  # a block's own errors take other unknowns as known
         shape, step = result.parameters[key].shape, np.abs(numbers.steps[key])
         error = np.where(step > _UNSETTLED * error, step, error)  # the run ended before the noise decides
@@ -175,6 +178,15 @@ def _undetermined(
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
     return lines, unfinished, deviations
+
+
+def _unchecked(check: NumbersCheck) -> list[str]:
+    """Return a line about the numbers that there was no time to test."""
+    if not check.unchecked:
+        return []
+    return [
+        f"whether {listed(check.unchecked)} arrived: there was no time to test it; use more seconds or fewer pixels"
+    ]
 
 
 def _chosen(problem: Problem) -> list[int]:

@@ -62,12 +62,14 @@ class NumbersCheck:
         unfinished: {key: line} of those that a least-squares step would still move.
         errors: {key: standard errors} of all numbers, the references' noise included.
         steps: {key: least-squares steps} of all numbers.
+        unchecked: keys of the numbers that there was no time to test.
     """
 
     undetermined: Mapping[str, str] = field(default_factory=dict)
     unfinished: Mapping[str, str] = field(default_factory=dict)
     errors: Mapping[str, np.ndarray] = field(default_factory=dict)
     steps: Mapping[str, np.ndarray] = field(default_factory=dict)
+    unchecked: tuple[str, ...] = ()
 
 
 @exclusive("check_numbers")
@@ -92,7 +94,7 @@ def check_numbers(
         problem: problem with views and scene.
         values: {key: array} at the end.
         start: {key: array} at the start.
-        seconds: time after which nothing further is started; there is no result then.
+        seconds: time after which nothing further is started; the numbers are `unchecked` then. Nothing is rendered without any.
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
     """
     numbers = Numbers.of(problem, values, start)
@@ -118,13 +120,13 @@ def compile_check(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
 
 
 def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: float) -> NumbersCheck:
-    """Return the lines, or none where there is no time."""
+    """Return the lines, or the keys where there is no time."""
     key, change = Key(0, 0, _STREAM), _SHIFT * numbers.slope()
     widths, longest = _FIRST_WIDTH * numbers.limits, 0.0
     for index in range(_PASSES + 1):
         started = time.perf_counter()
         if started + longest > until:
-            return NumbersCheck()
+            return NumbersCheck(unchecked=numbers.keys)
         differences = numbers.differences(np.diag(widths), key.fold(index))
         longest = time.perf_counter() - started
         if index < _PASSES:
