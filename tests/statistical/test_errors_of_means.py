@@ -40,9 +40,9 @@ def test_standard_errors_of_means_cover_the_truth() -> None:
     made, inside, mean, last = problem(), [], [], []
     for seed in range(SEEDS):
         result = ur.optimize(made, ur.PathGradient(spp=2), Adam(0.02), steps=STEPS, seed=seed, progress=False)
-        misses = result.parameters[KEY] - np.float32(TRUTH)
+        misses = result.parameters[KEY] - np.array(TRUTH, np.float32)
         mean.append(np.mean(misses**2))
-        last.append(np.mean(np.square(result.last[KEY] - np.float32(TRUTH))))
+        last.append(np.mean(np.square(result.last[KEY] - np.array(TRUTH, np.float32))))
         if KEY in result.standard_error:
             inside += list(np.abs(misses) < result.standard_error[KEY])
     assert len(inside) > 2 * SEEDS

@@ -335,7 +335,8 @@ def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(m
     rigid = {key: dataclasses.replace(of, viewpoint=True, rigid=True) for key, of in known.items()}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: rigid)
     estimator, optimizer = chosen(problem())
-    spp, largest = CONSTANTS.image_spp[1], dict.fromkeys(("map", "gain"), 0.2 * CONSTANTS.pose_reach)
+    spp = CONSTANTS.image_spp[1]
+    largest: dict[str, float] = dict.fromkeys(("map", "gain"), 0.2 * CONSTANTS.pose_reach)
     assert estimator == GaussNewton(spp, spp // CONSTANTS.per_derivative, largest=largest)
     assert isinstance(optimizer, optimizers.AveragedNewton)
     assert chosen(problem(losses.L1()), tolerance=3, spp=40)[0] == GaussNewton(40, 5, tolerance=3.0, largest=largest)

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import io
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -267,8 +268,10 @@ def test_a_map_has_its_standard_error_and_what_the_references_decided(tmp_path):
     shape = read(folder).parameters[KEY].shape
     share = np.zeros(shape, np.float32)
     share[:2] = 0.9
-    np.savez(folder / "standard_error.npz", **{KEY: np.full(shape, 0.02, np.float32), "other": np.zeros(3)})
-    np.savez(folder / "data_share.npz", **{KEY: share})
+    errors: dict[str, Any] = {KEY: np.full(shape, 0.02, np.float32), "other": np.zeros(3)}
+    shares: dict[str, Any] = {KEY: share}
+    np.savez(folder / "standard_error.npz", **errors)
+    np.savez(folder / "data_share.npz", **shares)
     run = read(folder)
     assert set(run.standard_error) == set(run.data_share) == {KEY}
     captions = {item.caption: item for stack in panels.map_of_run(run, KEY).stacks for item in stack}
