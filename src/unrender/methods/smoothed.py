@@ -21,10 +21,7 @@ from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.scene.problem import Problem
 
-SIGMA_HELP = (
-    "smoothing width in units of the parameters, optionally per parameter: 0.2, mug.rotation.y=0.6; none for 0.2, times the order of "
-    "magnitude of the parameter's size"
-)
+SIGMA_HELP = "smoothing width in units of the parameters, optionally per parameter: 0.2, mug.rotation.y=0.6; none for 0.2 times their size"
 WIDTH = 0.2
 """Default smoothing width relative to the order of magnitude of a parameter's size."""
 _WIDTH = pydantic.TypeAdapter(PositiveFloat)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
@@ -38,12 +39,12 @@ from unrender.runs.result import Result
 from unrender.runs.run import Run, terminate_if_told, to_numpy
 from unrender.runs.verify import Verify
 from unrender.runs.watches import BoundsWatch, InfluenceWatch, MeshWatch
+from unrender.scene import serialization
 from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree
-from unrender.scene.serialization import origin
 
-__all__ = ["RunAnnotations", "check", "descend_with", "estimate", "open_writer", "optimize"]
+__all__ = ["RunAnnotations", "check", "connected", "estimate", "open_writer", "optimize"]
 
 
 @exclusive("optimize", long=True)
@@ -104,8 +105,12 @@ def optimize(
     run.begin_budget(annotations.began)
     run.warnings += watches.remarks(problem, plan.optimizer)
     run.description, run.initial = describe_run(run, annotations), first_values(run)
-    with _progress(progress) as shown, _folder(run, annotations, run_directory, checkpoint_every) as writers:
-        return descend_with(run, [*shown, *callbacks], *writers, earlier=annotations.phases)
+    with (
+        _progress(progress) as shown,
+        _folder(run, annotations, run_directory, checkpoint_every) as writers,
+        connected(run, [*shown, *callbacks], *writers, earlier=annotations.phases),
+    ):
+        return descend(run)
 
 
 @contextmanager
@@ -129,17 +134,18 @@ def _folder(
         yield []
         return
     run.folder = Path(directory)
-    run.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": origin(run.problem)}
+    run.description["problem"] |= {"fingerprint": fingerprint_of(run), "origin": serialization.origin(run.problem)}
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
         writer.start(run.result())
         yield [writer]
     terminate_if_told(run)
 
 
-def descend_with(
+@contextmanager
+def connected(
     run: Run, callbacks: Sequence[Callback], *folder: Callback, earlier: Mapping[str, float] | None = None
-) -> Result:
-    """Take the steps of a run with the callbacks of every run, those of the run folder, and, last, the user's.
+) -> Iterator[None]:
+    """Connect a run with the callbacks of every run, those of the run folder, and, last, the user's; `descend` then takes its steps.
 
     The first ones of the folder restore a run, so that they come before all others. The last one writes.
 
@@ -165,16 +171,15 @@ def descend_with(
         UserCallbacks(callbacks),
     ]
     with phases.listening(*callbacks):
-        return descend(run)
+        yield
 
 
 def open_writer(run: Run, folder: Path, method: str, checkpoint_every: int | None, final_spp: int | None) -> RunWriter:
     """Return the writer of a run's folder, a context manager. Failures are added to the run's warnings."""
     table = method_file.serialize(run, method, checkpoint_every, final_spp)
     # A closure, because resuming replaces the list of warnings.
-    return RunWriter(
-        folder, run.plan.problem, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line)
-    )
+    save_problem = functools.partial(serialization.save, run.plan.problem)
+    return RunWriter(folder, save_problem, table, checkpoint_every, final_spp, lambda line: run.warnings.append(line))
 
 
 @exclusive("estimate")

@@ -26,10 +26,10 @@ from unrender.runs.folder.method_file import Method
 from unrender.runs.folder.schema import ENDED, HISTORY, METHOD, RunRecord
 from unrender.runs.folder.state import check_alike, not_finite, unpack
 from unrender.runs.folder.writer import RunWriter
-from unrender.runs.loop import initialize, prepare
+from unrender.runs.loop import descend, initialize, prepare
 from unrender.runs.metadata import RunAnnotations, describe_run, fingerprint_of, first_values
 from unrender.runs.number_trace import NumberTrace
-from unrender.runs.optimize import check, descend_with, open_writer
+from unrender.runs.optimize import check, connected, open_writer
 from unrender.runs.result import NON_FINITE, Result
 from unrender.runs.run import SNAPSHOT_COUNTS, Run, terminate_if_told
 from unrender.scene.coarse_to_fine import NEVER
@@ -120,7 +120,8 @@ def resume_run(
             restoring = _Restore(stored.record, source, changes, writer)
             run.description, run.history, run.warmup_seconds = _description(run, stored, fingerprint), [], 0.0
             try:
-                result = descend_with(run, callbacks, restoring, writer, earlier=earlier)
+                with connected(run, callbacks, restoring, writer, earlier=earlier):
+                    result = descend(run)
                 break
             except _UnusableCheckpoint as error:
                 source.passed_over.append(str(error))  # an earlier checkpoint may be usable

@@ -50,7 +50,6 @@ from unrender.runs.folder.schema import (
 from unrender.runs.folder.state import not_finite, pack
 from unrender.runs.result import PRUNED, TERMINATED, Result
 from unrender.scene import serialization
-from unrender.scene.problem import Problem
 
 if TYPE_CHECKING:
     from unrender.runs.run import Run
@@ -78,7 +77,7 @@ class RunWriter(Callback):
 
     Args:
         folder: path of the folder.
-        problem: problem of the run.
+        save_problem: function that writes the problem's file into a folder.
         method: contents of method.toml, see `method_file`.
         checkpoint_every: steps between checkpoints. None takes about 50: fewer if they take over a minute, more if writing would take
             over a hundredth of the run's time.
@@ -87,7 +86,7 @@ class RunWriter(Callback):
     """
 
     folder: Path
-    problem: Problem
+    save_problem: Callable[[Path], None]
     method: Mapping[str, Any]
     checkpoint_every: int | None = None
     final_spp: int | None = None
@@ -258,7 +257,7 @@ class RunWriter(Callback):
         method_file.encode(self.method, self.folder / METHOD)
 
     def _write_start(self, result: Result) -> None:
-        serialization.save(self.problem, self.folder)
+        self.save_problem(self.folder)
         files.write(self.folder / METHOD, method_file.encode(self.method, self.folder / METHOD), name_too=False)
         contents.write_arrays(self.folder, result, (INITIAL, TRUTH, MESHES, PARAMETERS))
         self._history.rewrite(result.history, name_too=False)
