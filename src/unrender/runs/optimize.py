@@ -105,11 +105,8 @@ def optimize(
     run.begin_budget(annotations.began)
     run.warnings += watches.remarks(problem, plan.optimizer)
     run.description, run.initial = describe_run(run, annotations), first_values(run)
-    with (
-        _progress(progress) as shown,
-        _folder(run, annotations, run_directory, checkpoint_every) as writers,
-        connected(run, [*shown, *callbacks], *writers, earlier=annotations.phases),
-    ):
+    folder = _folder(run, annotations, run_directory, checkpoint_every)
+    with _progress(progress) as bar, folder as writers, connected(run, [*bar, *callbacks], writers, annotations.phases):
         return descend(run)
 
 
@@ -143,7 +140,7 @@ def _folder(
 
 @contextmanager
 def connected(
-    run: Run, callbacks: Sequence[Callback], *folder: Callback, earlier: Mapping[str, float] | None = None
+    run: Run, callbacks: Sequence[Callback], folder: Sequence[Callback], earlier: Mapping[str, float] | None
 ) -> Iterator[None]:
     """Connect a run with the callbacks of every run, those of the run folder, and, last, the user's; `descend` then takes its steps.
 

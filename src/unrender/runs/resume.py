@@ -120,7 +120,7 @@ def resume_run(
             restoring = _Restore(stored.record, source, changes, writer)
             run.description, run.history, run.warmup_seconds = _description(run, stored, fingerprint), [], 0.0
             try:
-                with connected(run, callbacks, restoring, writer, earlier=earlier):
+                with connected(run, callbacks, (restoring, writer), earlier):
                     result = descend(run)
                 break
             except _UnusableCheckpoint as error:
