@@ -62,6 +62,7 @@ TOY = ["run", "exponential", "--method", "plain", "--final-spp", "1", "--out", "
 
 def start(folder: Path, words: list[str], limit: int | None = None, before: str = "") -> subprocess.Popen[str]:
     def limited() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # shells ignore it for what they start in the background
         if limit:
             resource.setrlimit(resource.RLIMIT_AS, (limit << 10, limit << 10))
 
