@@ -38,11 +38,11 @@ _listeners: ContextVar[tuple[Listener, ...]] = ContextVar("listeners", default=(
 @contextmanager
 def listening(*listeners: Listener) -> Iterator[None]:
     """Send the phases of all calls within this context to listeners. One that already receives them receives them once."""
-    found = list(_listeners.get())
+    receiving = list(_listeners.get())
     for listener in listeners:
-        if not any(listener is each for each in found):
-            found.append(listener)
-    token = _listeners.set(tuple(found))
+        if not any(listener is each for each in receiving):
+            receiving.append(listener)
+    token = _listeners.set(tuple(receiving))
     try:
         yield
     finally:

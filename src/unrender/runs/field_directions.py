@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from unrender.core import arrays
 from unrender.core.random import Key
 from unrender.rendering.renderer import RenderSession
-from unrender.runs.image_sensitivity import MAP_AXES, adjoint_spp, around, derivative_session
+from unrender.runs.image_sensitivity import MAP_AXES, adjoint_spp, adjoints, around, derivative_session
 from unrender.runs.numbers import Differences, Numbers
 from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
-from unrender.scene.render import as_tree, view_request
+from unrender.scene.render import as_tree
 
 __all__ = ["beside_fields", "fields_of"]
 
@@ -175,18 +174,14 @@ class _Adjoints:
 
     def of(self, pictures: np.ndarray) -> dict[str, np.ndarray]:
         """Return {key: (k, *shape)} for pictures (k, P, 3) with the roots of the pixels' weights. Their largest change is that allowed."""
-        sums = {key: np.zeros((len(pictures), *x.shape)) for key, x in self._diagonals.items()}
+        views, problem = self._numbers.views, self._problem
+        roots = np.concatenate([self._numbers.roots(view) for view in views])
+        weighted = self._numbers.by_view(pictures * roots)
+        parts = []
         for launch in range(self._launches):
-            for view, parts in zip(self._numbers.views, self._numbers.by_view(pictures), strict=True):
-                seed = self._key.fold(launch).fold(view).uint32()
-                rendering = self._session.image(self._tree, view_request(self._problem, view, self._spp, seed))
-                shape, roots = arrays.shape(rendering.images), self._numbers.roots(view)
-                for index, part in enumerate(parts):
-                    weights = (part.reshape(-1, 3) * roots).reshape(shape)
-                    gradient = self._session.adjoint(self._tree, rendering.paths, self._problem.renderer.array(weights))
-                    for key in sums:
-                        sums[key][index] += arrays.numpy(gradient[key]).reshape(sums[key][index].shape)
-        directions = {key: x / self._diagonals[key] for key, x in sums.items()}
+            seeds = {view: self._key.fold(launch).fold(view) for view in views}
+            parts.append(adjoints(problem, self._session, self._tree, self._diagonals, self._spp, seeds, weighted))
+        directions = {key: sum(part[key] for part in parts) / x for key, x in self._diagonals.items()}
         lengths = [np.abs(x).reshape(len(x), -1).max(axis=1) / self._reach[key] for key, x in directions.items()]
         longest = np.maximum(np.max(lengths, axis=0), 1e-300)
         return {key: x / longest.reshape(-1, *(1,) * (x.ndim - 1)) for key, x in directions.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -148,9 +148,10 @@ def transposed(
     if session is None:
         return {}
     parameters, spp = off_ends(as_tree(problem, values), problem.renderer.parameters()), adjoint_spp(problem)
-    seeds = [[key.fold(number * len(pictures) + view) for view in range(len(pictures))] for number in range(passes)]
-    parts = [_adjoint(problem, session, parameters, keys, spp, of, pictures) for of in seeds]
-    return {name: np.mean([part[name] for part in parts], axis=0) for name in keys}
+    count, each = len(pictures), [picture[None] for picture in pictures]
+    seeds = [{view: key.fold(number * count + view) for view in range(count)} for number in range(passes)]
+    parts = [adjoints(problem, session, parameters, keys, spp, of, each) for of in seeds]
+    return {name: np.mean([part[name][0] for part in parts], axis=0) for name in keys}
 
 
 def around(values: np.ndarray) -> np.ndarray:
@@ -158,10 +159,15 @@ def around(values: np.ndarray) -> np.ndarray:
 
     It averages the noise of single elements from few probes.
     """
-    from scipy.ndimage import uniform_filter
-
-    means = uniform_filter(np.mean(np.square(values, dtype=np.float64), axis=-1), 3, mode="nearest")
+    means = neighbour_means(np.mean(np.square(values, dtype=np.float64), axis=-1))
     return np.sqrt(means.clip(min=0.0))  # running sums may round to below 0 next to large values
+
+
+def neighbour_means(cells: np.ndarray) -> np.ndarray:
+    """Return the means over neighbouring cells, those of a cell included."""
+    from scipy.ndimage import uniform_filter  # takes long to import
+
+    return uniform_filter(cells, 3, mode="nearest")
 
 
 def hardly_seen(values: np.ndarray) -> np.ndarray:
@@ -220,29 +226,41 @@ def _projections(
     """Return {key: Jᵀs} for the signs s of a probe, on one of its two sets of paths."""
     signs = np.random.default_rng(key.uint32())
     pictures = [
-        signs.choice(np.array([-1, 1], np.float32), size=(*problem.sizes[view], 3)) * mask_roots(problem, view)
+        signs.choice(np.array([-1, 1], np.float32), size=(1, *problem.sizes[view], 3)) * mask_roots(problem, view)
         for view in range(len(problem.views))[:views]
     ]
-    return _adjoint(
-        problem, session, parameters, keys, spp, [key.fold(2 * n + half) for n in range(len(pictures))], pictures
-    )
+    seeds = {view: key.fold(2 * view + half) for view in range(len(pictures))}
+    return {name: x[0] for name, x in adjoints(problem, session, parameters, keys, spp, seeds, pictures).items()}
 
 
-def _adjoint(
+def adjoints(
     problem: Problem,
     session: RenderSession,
     parameters: Tree,
-    keys: frozenset[str],
+    keys: Collection[str],
     spp: int,
-    seeds: Sequence[Key],
+    seeds: Mapping[int, Key],
     pictures: Sequence[np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """Return {key: Jᵀ times the pictures (H, W, 3) of the first views}."""
-    sums = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
-    for view, (seed, picture) in enumerate(zip(seeds, pictures, strict=True)):
+    """Return {key: Jᵀx, (k, *shape)} of k pictures x, from one rendering of each view.
+
+    Args:
+        problem: problem with views and scene.
+        session: session with derivatives by `keys`.
+        parameters: point.
+        keys: keys of the parameters.
+        spp: samples per pixel of a rendering.
+        seeds: {view: key of its random numbers}.
+        pictures: (k, H, W, 3) for each of these views.
+    """
+    count = len(pictures[0])
+    sums = {key: np.zeros((count, *shape)) for key, shape in problem.shapes().items() if key in keys}
+    for (view, seed), parts in zip(seeds.items(), pictures, strict=True):
         rendering = session.image(parameters, view_request(problem, view, spp, seed.uint32()))
-        weights = problem.renderer.array(picture.astype(np.float32).reshape(arrays.shape(rendering.images)))
-        gradient = session.adjoint(parameters, rendering.paths, weights)
-        for name, total in sums.items():
-            total += arrays.numpy(gradient[name]).reshape(total.shape)
+        shape = arrays.shape(rendering.images)
+        for index, part in enumerate(parts):
+            weights = problem.renderer.array(part.astype(np.float32).reshape(shape))
+            gradient = session.adjoint(parameters, rendering.paths, weights)
+            for name, total in sums.items():
+                total[index] += arrays.numpy(gradient[name]).reshape(total.shape[1:])
     return sums

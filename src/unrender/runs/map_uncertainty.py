@@ -10,7 +10,14 @@ import numpy as np
 
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
-from unrender.runs.image_sensitivity import MAP_AXES, Curvature, curvature, mask_roots, transposed
+from unrender.runs.image_sensitivity import (
+    MAP_AXES,
+    Curvature,
+    curvature,
+    mask_roots,
+    neighbour_means,
+    transposed,
+)
 from unrender.scene.problem import Problem
 from unrender.scene.render import render
 
@@ -128,9 +135,10 @@ def of_residuals(
     for key in keys:
         own = _Cells.of(values[key], problem.unknowns[key].initial, known.squares[key], known.probes)
         prior = 0.0 if (of := problem.unknowns[key].prior) is None else of.diagonal(values[key])
-        found = own.posterior(one[key] * other[key], known.overlap.get(key, 1.0), noise, prior)
-        if found is not None:
-            errors[key], shares[key] = np.sqrt(found[0]).astype(np.float32), found[1].astype(np.float32)
+        posterior = own.posterior(one[key] * other[key], known.overlap.get(key, 1.0), noise, prior)
+        if posterior is not None:
+            variance, share = posterior
+            errors[key], shares[key] = np.sqrt(variance).astype(np.float32), share.astype(np.float32)
     return Uncertainty(errors, shares)
 
 
@@ -153,7 +161,7 @@ class _Cells:
         """Return the cells. The fewer probes, the more a cell's curvature follows those of its neighbours, as geometric mean."""
         means = squares.mean(axis=-1)
         logarithms = np.log(np.maximum(means, 1e-6 * np.median(means[means > 0])))
-        logarithms = (probes * logarithms + _PROBES * _around(logarithms)) / (probes + _PROBES)
+        logarithms = (probes * logarithms + _PROBES * neighbour_means(logarithms)) / (probes + _PROBES)
         change = np.square(values.astype(np.float64) - start).mean(axis=-1)
         return cls(change, np.exp(logarithms), values.shape[-1])
 
@@ -176,7 +184,7 @@ class _Cells:
         mean = m.value
         followed = max(math.sqrt(max(noise.value, 0.0)) - math.sqrt(max(mean, 0.0)), 0.0) ** 2
         elements = 3.0**explained.ndim * self.channels
-        local = _around(np.where(counted, explained, mean))
+        local = neighbour_means(np.where(counted, explained, mean))
         pooled = (elements * local + _ELEMENTS * mean) / (elements + _ELEMENTS)
         c = np.maximum(pooled, max(_LEAST * mean, followed, 1e-12))
         before = float(self.change[counted].mean()) + max(mean, followed) / float(self.curvature[counted].mean())
@@ -200,13 +208,6 @@ class _Mean:
     def is_known(self) -> bool:
         """Return whether the estimate is significantly positive."""
         return self.value > _ERRORS * self.error
-
-
-def _around(cells: np.ndarray) -> np.ndarray:
-    """Return the means over neighbouring cells, those of a cell included."""
-    from scipy.ndimage import uniform_filter
-
-    return uniform_filter(cells, 3, mode="nearest")
 
 
 def _noise(residuals: Sequence[Sequence[np.ndarray]]) -> _Mean:

@@ -35,13 +35,14 @@ class NumberMeans(Callback):
 
 def numbers_of(problem: Problem, optimizer: Any) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the numbers and colours of a problem, without those that the optimizer averages itself."""
-    own, shapes = averaged_by(optimizer, problem.shapes()), problem.shapes()
-    found = {
+    shapes = problem.shapes()
+    own = averaged_by(optimizer, shapes)
+    numbers = {
         key: shape
         for key, shape in shapes.items()
         if key not in own and len(shape) <= 1 and np.prod(shape, dtype=int) <= _MOST_OF_ONE
     }
-    return found if sum(int(np.prod(shape, dtype=int)) for shape in found.values()) <= _MOST_ELEMENTS else {}
+    return numbers if sum(int(np.prod(shape, dtype=int)) for shape in numbers.values()) <= _MOST_ELEMENTS else {}
 
 
 def averaged(run: Run, result: Result) -> Result:
@@ -71,14 +72,14 @@ def _means(
     There are standard errors only if all numbers that change are stationary. A number that still drifts takes others with it, however
     steady those seem.
     """
-    found = [stationary_mean(column) for column in rows.T]
-    settled = all(mean or (column == column[0]).all() for mean, column in zip(found, rows.T, strict=True))
+    columns = [stationary_mean(column) for column in rows.T]
+    settled = all(mean or (column == column[0]).all() for mean, column in zip(columns, rows.T, strict=True))
     means: dict[str, np.ndarray] = {}
     errors: Tree = {}
     steps: dict[str, str] = {}
     start = 0
     for key, value in last.items():
-        own, start = found[start : start + value.size], start + value.size
+        own, start = columns[start : start + value.size], start + value.size
         known = [mean for mean in own if mean is not None]
         if not known:
             continue

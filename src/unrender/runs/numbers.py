@@ -10,7 +10,9 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.random import Key
+from unrender.estimators.derivative_images import squared_slope
 from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.runs.image_sensitivity import mask_roots
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two
 
@@ -193,9 +195,7 @@ class Numbers:
 
     def roots(self, view: int) -> np.ndarray:
         """Return the roots of the weights of a view's pixels, (P, 1)."""
-        mask, (height, width) = self.problem.views[view].mask, self.problem.sizes[view]
-        weights = np.ones(height * width) if mask is None else np.asarray(mask, np.float64).reshape(-1)
-        return np.sqrt(weights * self.problem.views[view].weight)[:, None]
+        return mask_roots(self.problem, view).reshape(-1, 1) * math.sqrt(self.problem.views[view].weight)
 
     def differences(self, directions: np.ndarray, key: Key) -> Differences:
         """Return the differences along directions (n, K) of some length."""
@@ -210,7 +210,7 @@ class Numbers:
         squares, total = 0.0, 0
         for view in self.views:
             image = np.asarray(self.problem.views[view].reference, np.float64)
-            squares += 0.5 * sum(float(np.square(np.diff(image, axis=axis)).sum()) for axis in (0, 1))
+            squares += squared_slope([image[None]] * 2)
             total += image.size
         least = 0.01 * math.sqrt(float(np.mean(np.square(self.references()))))
         return max(math.sqrt(squares / total), least, 1e-30)

@@ -173,7 +173,7 @@ class _State:
     began: float = field(default_factory=time.monotonic)
     before: float = 0.0
     stopped: str = ""
-    told: bool = False
+    advised: bool = False
 
     def save(self, folder: Path, status: str = "running") -> None:
         """Write the current sweep.json."""
@@ -302,21 +302,21 @@ def _drive(console: Console, session: Session, state: _State, executor: Executor
                     break
                 trials.end(record)
                 display.end(record.number, line(record))
-                _tell_of_few_steps(state, record, display)
+                _advise_on_few_steps(state, record, display)
                 state.save(session.folder)
 
 
-def _tell_of_few_steps(state: _State, record: TrialRecord, display: TaskDisplay) -> None:
+def _advise_on_few_steps(state: _State, record: TrialRecord, display: TaskDisplay) -> None:
     """Print advice, once, if the seconds of a run allowed few steps."""
     plan = state.record.plan
     ends = [run.steps for run in record.runs if run.status in ENDED]
     if (
         plan.seconds is not None
         and ends
-        and not state.told
+        and not state.advised
         and (advice := few_steps(plan.seconds, min(ends), plan.steps))
     ):
-        state.told = True
+        state.advised = True
         display.say(f"note: {advice}")
 
 

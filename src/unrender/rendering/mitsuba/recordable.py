@@ -46,10 +46,10 @@ def _registered(kind: Any) -> Iterator[Any]:
     while missing < _LONGEST_GAP:
         pointer: Any = dr.reinterpret_array(kind, mi.UInt32(number))
         try:
-            found = pointer[0]
+            registered = pointer[0]
         except RuntimeError:
-            found = None
-        if found is not None:  # an object has that id
-            yield found
-        missing = 0 if found is not None else missing + 1
+            registered = None
+        if registered is not None:  # an object has that id
+            yield registered
+        missing = 0 if registered is not None else missing + 1
         number += 1
