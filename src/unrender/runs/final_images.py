@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,7 +15,7 @@ from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
 from unrender.runs.image_sensitivity import Curvature, curvature
-from unrender.runs.least_squares import NumbersCheck, check_numbers, compile_check
+from unrender.runs.least_squares import check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, of_residuals
 from unrender.runs.result import Result
 from unrender.scene.problem import Problem
@@ -143,7 +143,7 @@ def render_final_images(
         sensitivities, maps = known.sensitivity(), Uncertainty()
         lines, warnings, deviations = [], (), dict(result.standard_error)
         if not tested and result.steps:
-            lines = _unchecked(check_numbers(problem, result.parameters, result.initial, 0.0))
+            lines = _unchecked(checked_keys(problem, result.parameters, result.initial))
         if everything:
             lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests)
             if result.steps and len(ends[0]) == 2 and left() > 0.0:
@@ -170,7 +170,7 @@ def _undetermined(
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
     text = "\n".join(lines)
-    lines += [line for key, line in numbers.undetermined.items() if key not in text] + _unchecked(numbers)
+    lines += [line for key, line in numbers.undetermined.items() if key not in text] + _unchecked(numbers.unchecked)
     for key, error in numbers.errors.items():  # a block's own errors take other unknowns as known
         shape, step = result.parameters[key].shape, np.abs(numbers.steps[key])
         error = np.where(step > _UNSETTLED * error, step, error)  # the run ended before the noise decides
@@ -180,13 +180,11 @@ def _undetermined(
     return lines, unfinished, deviations
 
 
-def _unchecked(check: NumbersCheck) -> list[str]:
-    """Return a line about the numbers that there was no time to test."""
-    if not check.unchecked:
+def _unchecked(keys: Sequence[str]) -> list[str]:
+    """Return a line about numbers that there was no time to test."""
+    if not keys:
         return []
-    return [
-        f"whether {listed(check.unchecked)} arrived: there was no time to test it; use more seconds or fewer pixels"
-    ]
+    return [f"whether {listed(keys)} arrived: there was no time to test it; use more seconds or fewer pixels"]
 
 
 def _chosen(problem: Problem) -> list[int]:

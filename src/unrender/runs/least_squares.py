@@ -21,7 +21,7 @@ from unrender.runs.numbers import Differences, Numbers
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
 
-__all__ = ["NumbersCheck", "check_numbers", "compile_check"]
+__all__ = ["NumbersCheck", "check_numbers", "checked_keys", "compile_check"]
 
 _STREAM, _FIELDS = 4, 1 << 16
 """Stream of all random numbers, and index of those of textures and grids."""
@@ -94,7 +94,7 @@ def check_numbers(
         problem: problem with views and scene.
         values: {key: array} at the end.
         start: {key: array} at the start.
-        seconds: time after which nothing further is started; the numbers are `unchecked` then. Nothing is rendered without any.
+        seconds: time after which nothing further is started; the numbers are `unchecked` then.
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
     """
     numbers = Numbers.of(problem, values, start)
@@ -108,6 +108,14 @@ def check_numbers(
         np.linalg.LinAlgError,
     ):  # a value that the renderer rejects, or matrices without eigenvalues in double precision
         return NumbersCheck()
+
+
+def checked_keys(
+    problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]
+) -> tuple[str, ...]:
+    """Return the keys of the numbers that `check_numbers` tests."""
+    numbers = Numbers.of(problem, values, start)
+    return () if numbers is None else numbers.keys
 
 
 @exclusive("compile_check")
