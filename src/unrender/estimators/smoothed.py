@@ -277,9 +277,8 @@ class SmoothedDerivatives:
         if self.joint:
             derivatives = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
             if self.hessian_form == "diagonal":
-                return *derivatives.gradient(), _diagonal(
-                    stored, derivatives.draws * derivatives.draws, derivatives.curvatures, rate
-                )
+                rows, values = derivatives.draws * derivatives.draws, derivatives.curvatures
+                return *derivatives.gradient(), diagonal_curvature.updated(stored, rows, values, rate)
             hessian = derivatives.hessian()[0] * np.outer(sigma, sigma)
             return *derivatives.gradient(), hessian if stored is None else stored + rate * (hessian - stored)
         v = np.random.default_rng([seed, _DIRECTIONS]).standard_normal(theta.size)
@@ -287,7 +286,7 @@ class SmoothedDerivatives:
         both = estimate_gradient_and_product(f, theta, sigma * v, sigma, self._options(seed))
         gradient, error, product = both.gradient, both.error, sigma * both.product
         if self.hessian_form == "diagonal":
-            return gradient, error, _diagonal(stored, both.draws * v, both.changes, rate)
+            return gradient, error, diagonal_curvature.updated(stored, both.draws * v, both.changes, rate)
         if stored is None:
             stored, rate = float(v @ product) * np.eye(theta.size), 1.0
         missing = product - stored @ v
@@ -330,12 +329,6 @@ class SmoothedDerivatives:
         if missing:
             raise InputError(f"SmoothedDerivatives: sigma has no entry for parameter {missing[0]}")
         return {key: float(self.sigma[key] if key in self.sigma else self.sigma["*"]) for key in parameters}
-
-
-def _diagonal(stored: np.ndarray | None, rows: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
-    """Return the updated diagonal (n,), where each sample requires rows[b] · diagonal = values[b]."""
-    before = np.full(rows.shape[1], diagonal_curvature.isotropic(rows, values)) if stored is None else stored
-    return diagonal_curvature.corrected(before, rows, values, rate)
 
 
 def _convergence(losses: np.ndarray, center: float) -> float:

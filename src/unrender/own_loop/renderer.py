@@ -143,9 +143,9 @@ class Renderer:
             case "numpy":
                 attached = images
             case "drjit":
-                from unrender.own_loop import drjit_operation
+                from unrender.own_loop import graph_operations
 
-                attached = drjit_operation.apply(backward, images, self._exchange.attached(inputs))
+                attached = graph_operations.with_drjit(backward, images, self._exchange.attached(inputs))
             case "torch":
                 attached = self._with_torch(inputs, images, backward)
         return attached[0] if self._alone(sensor) else attached
@@ -314,7 +314,7 @@ class Renderer:
             )
 
     def _with_torch(self, inputs: Given, images: tuple[Any, ...], backward: Callable[..., Tree]) -> tuple[Any, ...]:
-        from unrender.own_loop import torch_operation
+        from unrender.own_loop import graph_operations
 
         tensors = {key: value for key, value in inputs.values.items() if frameworks.is_torch(value)}
         detached = {key: value.detach() for key, value in tensors.items()}
@@ -325,7 +325,7 @@ class Renderer:
             return [frameworks.to_torch(arrays.numpy(gradient[key]), x).to("cpu") for key, x in detached.items()]
 
         on_host = tuple(image.to("cpu") for image in images)
-        return tuple(x.to(device) for x in torch_operation.apply(gradients, on_host, list(tensors.values())))
+        return tuple(x.to(device) for x in graph_operations.with_torch(gradients, on_host, list(tensors.values())))
 
     # ------------------------------------------------------------------ sensors
 

@@ -136,8 +136,8 @@ def _overlap(squares: np.ndarray, probes: int, kept: list[tuple[np.ndarray, np.n
 
 def mask_roots(problem: Problem, view: int) -> np.ndarray:
     """Return the roots of the weights of a view's pixels by its mask, (H, W, 1)."""
-    mask, size = problem.views[view].mask, problem.sizes[view]
-    return np.ones((*size, 1)) if mask is None else np.sqrt(np.asarray(mask, np.float64))[..., None]
+    weights = problem.views[view].pixel_weights(problem.sizes[view])
+    return np.sqrt(np.asarray(weights, np.float64))[..., None]
 
 
 def transposed(

@@ -242,8 +242,7 @@ def _full_view(problem: Problem, view: int) -> _Frame:
     height, width = problem.sizes[view]
     own = problem.views[view]
     reference = np.asarray(own.reference, np.float32).reshape(-1, 3)
-    mask = np.ones((height, width)) if own.mask is None else np.asarray(own.mask)
-    factors = mask.reshape(-1, 1) * (own.weight / reference.size)
+    factors = own.pixel_weights((height, width)).reshape(-1, 1) * (own.weight / reference.size)
     return _Frame(view, np.full(height * width, view), np.arange(height * width), reference, factors)
 
 

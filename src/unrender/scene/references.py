@@ -83,7 +83,7 @@ class References:
         if all(view.mask is None for view in self._views):
             return None
         pairs = zip(self._views, self._sizes, strict=True)
-        columns = [np.ones(size // 3) if view.mask is None else np.asarray(view.mask).ravel() for view, size in pairs]
+        columns = [view.pixel_weights(size // 3).ravel() for view, size in pairs]
         return self._array(np.concatenate(columns)[:, None])
 
     @cached_property

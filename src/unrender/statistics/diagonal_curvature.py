@@ -38,6 +38,17 @@ def corrected(diagonal: np.ndarray, rows: np.ndarray, values: np.ndarray, rate: 
     return diagonal + rate * (rows.T @ np.linalg.solve(gram, values - rows @ diagonal))
 
 
+def updated(stored: np.ndarray | None, rows: np.ndarray, values: np.ndarray, rate: float) -> np.ndarray:
+    """Return the diagonal after a step's equations, (n,): `corrected`, from `isotropic` if there is none yet.
+
+    Args:
+        stored: diagonal before the step, (n,), or None.
+        rows, values, rate: see `corrected`.
+    """
+    before = np.full(rows.shape[1], isotropic(rows, values)) if stored is None else stored
+    return corrected(before, rows, values, rate)
+
+
 def positive(diagonal: np.ndarray) -> np.ndarray:
     """Clamp the elements of a diagonal (n,) to at least `LEAST` times their mean magnitude.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from unrender.app.evaluation import pictures, scenes
 from unrender.app.evaluation.measures import Albedo, Measures, best_factors, compare_albedo, mean, measure
-from unrender.app.evaluation.pictures import mask_of, names_of
+from unrender.app.evaluation.pictures import names_of
 from unrender.app.exporting import ready_made
 from unrender.app.exporting.asset import read_environment
 from unrender.app.stages import run_folders, stages_file
@@ -235,12 +235,13 @@ def _albedo(
         return None
     other = scenes.export_scene(problem, values | known, scratch / "truth")
     sensors, pixels = scenes.sensors(problem), []
+    masks = [view.pixel_weights() for view in problem.views]
     integrator = mi.load_dict({"type": "aov", "aovs": "albedo:albedo"})
     for file in (path, other):
         scene = scenes.load_scene(file)
         images = [
             np.array(mi.render(scene, sensor=sensors[view.sensor], integrator=integrator, spp=16))[..., -3:][mask > 0]
-            for view, mask in zip(problem.views, map(mask_of, problem.views), strict=True)
+            for view, mask in zip(problem.views, masks, strict=True)
         ]
         pixels.append(np.concatenate(images))
     return compare_albedo(*pixels)
@@ -272,7 +273,7 @@ def _photographed(
 
 def _exposed(image: np.ndarray, view: Any) -> np.ndarray:
     """Multiply the channels of a rendering by the factors that bring it closest to the photograph inside the mask."""
-    mask = mask_of(view) > 0
+    mask = view.pixel_weights() > 0
     return image * best_factors(image[mask], np.asarray(view.reference)[mask])
 
 
@@ -280,7 +281,7 @@ def _measure(problem: Problem, images: list[np.ndarray]) -> list[Measures]:
     measures = []
     for name, view, image in zip(names_of(problem), problem.views, images, strict=True):
         try:
-            measures.append(measure(image, np.asarray(view.reference), mask_of(view)))
+            measures.append(measure(image, np.asarray(view.reference), view.pixel_weights()))
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
     return measures

@@ -15,7 +15,6 @@ from unrender.core.text import printable
 from unrender.losses import metrics
 from unrender.losses.metrics import exposure, srgb
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
 
 MOST_ROWS = 48
 _CELL, _LABEL, _GAP = 240, 14, 4
@@ -81,11 +80,6 @@ _DIFFERENCE = 4
 _BORDER = 4
 
 
-def mask_of(view: View) -> np.ndarray:
-    """Return the mask (H, W) of a loaded view, positive where pixels count."""
-    return np.ones(np.asarray(view.reference).shape[:2], np.float32) if view.mask is None else np.asarray(view.mask)
-
-
 def names_of(problem: Problem) -> list[str]:
     """Return the names of the photographs: file names without extension."""
     return [
@@ -111,7 +105,7 @@ def write(
         measures: measures of `images` for the labels; empty if they were not measured.
     """
     (folder / FOLDER).mkdir()
-    masks = [mask_of(view) for view in problem.views]
+    masks = [view.pixel_weights() for view in problem.views]
     level = 1.0
     if relit:
         level = metrics.exposure(np.concatenate([image[mask > 0] for image, mask in zip(relit, masks, strict=True)]))
