@@ -22,7 +22,7 @@ def records(head: str, row: str, entries: Iterable[Mapping[str, Any]]) -> str:
 
 
 def fill(template: str, *values: Mapping[str, Any]) -> str:
-    """Fill "{runs[0][-1]:.3f}" from dictionaries; "{final!m}" writes (median, least, greatest), and "{errors!v}" those of values."""
+    """Fill "{runs[0][-1]:.3f}" from dictionaries. "!m" writes (median, least, greatest), "!v" those of values, "!n" their number."""
     return _Template().vformat(template, (), {key: value for each in values for key, value in each.items()})
 
 
@@ -67,5 +67,5 @@ class _Template(string.Formatter):
         return found, name
 
     def convert_field(self, value: Any, conversion: str | None) -> Any:
-        written = {"m": median_range, "v": spread}.get(conversion or "")
+        written = {"m": median_range, "v": spread, "n": len}.get(conversion or "")
         return written(value) if written else super().convert_field(value, conversion)  # pyright: ignore[reportArgumentType]

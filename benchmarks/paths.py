@@ -8,7 +8,17 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import ImageEstimate, ImageEstimator, Key, SampleRequest, Tree, arrays, image_step, prepare
+from benchmarks.internals import (
+    Estimator,
+    ImageEstimate,
+    ImageEstimator,
+    Key,
+    SampleRequest,
+    Tree,
+    arrays,
+    image_step,
+    prepare,
+)
 from benchmarks.moments import Moments
 
 CHUNK = 64
@@ -56,7 +66,7 @@ class _Recorder(ur.protocols.Callback):
         self.path.append(dict(run.parameters))
 
 
-def descent(problem: ur.Problem, estimator: ur.PathGradient, rate: float, steps: int, seed: int = 0) -> list[Tree]:
+def descent(problem: ur.Problem, estimator: Estimator, rate: float, steps: int, seed: int = 0) -> list[Tree]:
     """The parameters at each of `steps` steps of a real optimization, the first one included."""
     recorder = _Recorder()
     ur.optimize(problem, estimator, ur.optimizers.Adam(rate), steps=max(steps - 1, 1), seed=seed, callbacks=[recorder])

@@ -80,7 +80,9 @@ class Recorder(ur.protocols.Callback):
         clock: seconds; None for the run's own.
     """
 
-    def __init__(self, measure: Measure, start: dict[str, float], every: float, clock: Callable[[], float] | None):
+    def __init__(
+        self, measure: Measure, start: dict[str, float], every: float, clock: Callable[[], float] | None = None
+    ):
         self.measure, self.every, self.due, self.clock, self.steps = measure, every, every, clock, 0
         self.points: dict[str, Points] = {name: [(0.0, 0.0, error)] for name, error in start.items()}
         self.since = self.spent = 0.0
@@ -231,6 +233,11 @@ def over(runs: Runs, other: str) -> dict[str, dict[str, list[float]]]:
         axis: {name: [a / b for a, b in zip(errors, found[other], strict=True)] for name, errors in found.items()}
         for axis, found in by.items()
     }
+
+
+def first_at(curve: Sequence[Sequence[float]], goal: float) -> float:
+    """The time at which a curve (times, errors) reaches a goal, inf where it does not."""
+    return next((time for time, error in zip(*curve, strict=True) if error <= goal), math.inf)
 
 
 def reached(runs: list[list[tuple[float, float, float]]], error: float, column: int) -> float | None:

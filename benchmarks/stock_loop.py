@@ -26,36 +26,40 @@ def stock_loop(
     steps: int = sys.maxsize,
     seed: int = 0,
     every: int = 5,
-    falling: bool = False,
+    fall: Callable[[float], float] | None = None,
     error: Callable[[dict[str, Any]], Any] | None = None,
     timer: Callable[[], float] = time.perf_counter,
+    views: int | None = None,
 ) -> list[dict[str, Any]]:
-    """`mi.render` with `prb`, or `prbvolpath` where there are media, `dr.backward`, `mi.ad.Adam`, values clipped.
+    """Take the steps of `mi.render` with `prb`, or `prbvolpath` for media, `dr.backward`, `mi.ad.Adam`, values clipped. Return the history.
 
-    With `falling`, rates fall over the budget as half a cosine.
+    Warm-up (two steps, or one of each view) and error measurement are left out of the clock, as in `ur.optimize`.
 
-    `error` is what the history has under "parameter_error"; None for the problem's own. `timer` counts the seconds: `time.process_time`
-    for those of the processor.
-
-    Warm-up (two steps) and error measurement are left out of the clock, as in `ur.optimize`. Returns its history.
+    Args:
+        fall: factor of all rates by the share of the budget that is spent; None for constant rates.
+        error: what the history has under "parameter_error"; None for the problem's own.
+        timer: counts the seconds: `time.process_time` for those of the processor.
+        views: random views a step, with one rate for all parameters; None for all views, and the problem's own rates where it has some.
     """
     scene, parameters = stock_scene(problem)
     kind = "prbvolpath" if volumetric(problem) else "prb"
     integrator = mi.load_dict({"type": kind, "max_depth": problem.max_depth})
-    start = problem.initial()
+    start, count, rng = problem.initial(), len(problem.views), np.random.default_rng(seed)
+    own = {} if views else problem.learning_rates
     history: list[dict[str, Any]] = []
     for warm in (True, False):
-        rates = {key: problem.learning_rates.get(key, learning_rate) for key in start}
+        rates = {key: own.get(key, learning_rate) for key in start}
         optimizer = mi.ad.Adam(lr=learning_rate)
         for key, value in start.items():
             optimizer[key] = from_tensor(value, parameters[key])
         optimizer.set_learning_rate(rates)
         parameters.update(optimizer)
         clock, step = 0.0, 0
-        while clock < seconds and step < (2 if warm else steps):
+        while clock < seconds and step < ((count if views else 2) if warm else steps):
             began = timer()
             loss: Any = 0.0
-            for view in range(len(problem.views)):
+            drawn = [step] if warm else rng.choice(count, min(views or count, count), replace=False).tolist()
+            for view in drawn if views else range(count):
                 number = step_seed(seed, step, view)
                 image = mi.render(
                     scene,
@@ -68,10 +72,9 @@ def stock_loop(
                 )
                 loss += problem.loss_value(view, image)
             dr.backward(loss)
-            if falling:
-                done = max(clock / seconds, step / steps)
-                fall = ur.schedules.Cosine(1)(done)
-                optimizer.set_learning_rate({key: max(rate * fall, 1e-9) for key, rate in rates.items()})
+            if fall:
+                factor = fall(min(max(clock / seconds, step / steps), 1.0))
+                optimizer.set_learning_rate({key: max(rate * factor, 1e-9) for key, rate in rates.items()})
             optimizer.step()
             for key in start:
                 low, high = problem.unknowns[key].bounds

@@ -20,6 +20,7 @@ from benchmarks import figures, markdown
 from benchmarks.internals import dr, mi, scene_description
 from benchmarks.own_loop import loops
 from benchmarks.own_loop.loops import Clock, Task
+from benchmarks.races import median_and_range
 from benchmarks.runner.records import Record
 
 QUICK = {
@@ -109,8 +110,7 @@ def run(
                 entries[name]["steps"] = clock.steps
                 print(f"{kind} {name} seed {seed}: {clock.history[-1][1]:.4f} in {clock.steps} steps", flush=True)
         for entry in entries.values():
-            ends = [history[-1][1] for history in entry["runs"]]
-            entry["final"] = [float(np.median(ends)), min(ends), max(ends)]
+            entry["final"] = median_and_range([history[-1][1] for history in entry["runs"]])
         found["losses"][kind] = entries
         yield found
 

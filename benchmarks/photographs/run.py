@@ -14,20 +14,21 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.internals import StagedProblem, dr, from_tensor, project, stages_file, stock_scene
+from benchmarks.internals import StagedProblem, dr, stages_file
 from benchmarks.photographs.projection import Projection
 from benchmarks.runner.records import Record, scratch
+from benchmarks.stock_loop import stock_loop
 from benchmarks.timed_runs import Kept
 from unrender import methods
 from unrender.app.capture import importing
@@ -94,45 +95,19 @@ def stock(
 
     With `falling`, the rate falls exponentially, to a twentieth at the end.
     """
-    scene, parameters = stock_scene(problem)
-    integrator = mi.load_dict({"type": "prb", "max_depth": problem.max_depth})
-    start, rng, step = problem.initial(), np.random.default_rng(seed), 0
-    optimizer: Any = None
-    for warm in (True, False):
-        optimizer = mi.ad.Adam(lr=rate)
-        for key, value in start.items():
-            optimizer[key] = from_tensor(value, parameters[key])
-        parameters.update(optimizer)
-        clock, step = 0.0, 0
-        while step < len(problem.views) if warm else clock < seconds:
-            began = time.process_time()
-            loss: Any = 0.0
-            drawn = rng.choice(len(problem.views), min(views, len(problem.views)), replace=False)
-            for view in [step] if warm else drawn:
-                number = int(rng.integers(1 << 30))
-                sensor = problem.views[view].sensor
-                image = mi.render(
-                    scene,
-                    parameters,
-                    sensor=sensor,
-                    integrator=integrator,
-                    spp=1 if warm else spp,
-                    seed=mi.UInt32(number),
-                    seed_grad=number + 1,
-                )
-                loss += problem.loss_value(int(view), image)
-            dr.backward(loss)
-            optimizer.step()
-            if falling:
-                optimizer.set_learning_rate(rate * LAST_RATE ** min(clock / seconds, 1.0))
-            for key in start:
-                optimizer[key] = project(optimizer[key], *problem.unknowns[key].bounds)
-            parameters.update(optimizer)
-            dr.sync_thread()
-            clock += time.process_time() - began
-            step += 1
-    shapes = {key: tuple(value.shape) for key, value in start.items()}
-    return {key: np.array(dr.ravel(optimizer[key])).reshape(shape) for key, shape in shapes.items()}, step
+    (end,) = stock_loop(
+        problem,
+        spp,
+        rate,
+        seconds,
+        seed=seed,
+        every=sys.maxsize,
+        fall=(lambda done: LAST_RATE**done) if falling else None,
+        error=lambda values: {key: np.array(value) for key, value in values.items()},
+        timer=time.process_time,
+        views=views,
+    )
+    return end["parameter_error"], end["step"] + 1
 
 
 def in_stages(folder: Path, seconds: float, seed: int) -> tuple[dict[str, np.ndarray], int]:

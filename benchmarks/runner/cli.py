@@ -11,6 +11,7 @@ python -m benchmarks golden                compare short descents with their rec
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -38,18 +39,8 @@ def main(arguments: Sequence[str]) -> int:
 
         print(f"wrote {write_pages()}")
         return 0
-    if arguments[0] == "gpu":
-        from benchmarks.gpu.cli import main as gpu
-
-        return gpu(arguments[1:])
-    if arguments[0] == "golden":
-        from benchmarks.golden.cli import main as golden
-
-        return golden(arguments[1:])
-    if arguments[0] == "coverage":
-        from benchmarks.coverage.cli import main as coverage
-
-        return coverage(arguments[1:])
+    if arguments[0] in ("gpu", "golden", "coverage"):
+        return importlib.import_module(f"benchmarks.{arguments[0]}.cli").main(arguments[1:])
     if arguments[0] not in known:
         print(f"no benchmark {arguments[0]!r}; python -m benchmarks lists them", file=sys.stderr)
         return 2

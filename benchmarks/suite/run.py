@@ -27,7 +27,7 @@ import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.fixed_point import applies, fixed_point
 from benchmarks.internals import dr, hardly_seen, method
-from benchmarks.races import total_error
+from benchmarks.races import Recorder, total_error
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
 from benchmarks.stock_loop import stock_loop
@@ -78,31 +78,15 @@ def error_of(problem: ur.Problem) -> Callable[[dict[str, Any]], float]:
     return lambda values: total_error(errors(values), start)
 
 
-class Curve(ur.protocols.Callback):
-    """(seconds, error) along a run, as often as the loop's."""
-
-    def __init__(self, error: Callable[[dict[str, Any]], float], every: float):
-        self.points: Points = []
-        self._error, self._every = error, every
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """A point."""
-        if not self.points or run.clock >= self.points[-1][0] + self._every:
-            self.points.append((run.clock, self._error(run.parameters)))
-
-    def on_end(self, run: Any, result: Any) -> None:
-        """The last point."""
-        self.points.append((run.clock, self._error(run.parameters)))
-
-
 def ours(
     problem: ur.Problem, error: Callable[[dict[str, Any]], float], seconds: float, seed: int, option: str = ""
 ) -> tuple[Points, dict[str, Any]]:
     """A run with no option given, or one of `auto`'s, as "spp=2"; its curve, and how many steps and seconds of compilation it took."""
-    curve = Curve(error, seconds / 100)
+    curve = Recorder(lambda values: {"": error(values)}, {"": 1.0}, 1 / 100)
     plan = method("auto").plan(problem, dict([option.split("=")]) if option else {})
     result = ur.optimize(problem, plan, seconds=seconds, seed=seed, callbacks=[curve])
-    return curve.points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
+    points = [(at, found) for at, _, found in curve.points[""][1:]]
+    return points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
 
 
 def loop(
@@ -121,7 +105,7 @@ def loop(
         seconds,
         seed=seed,
         every=every,
-        falling=setting["falling"],
+        fall=ur.schedules.Cosine(1) if setting["falling"] else None,
         error=error,
     )
     return [(h["seconds"], h["parameter_error"]) for h in history]

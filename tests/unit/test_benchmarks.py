@@ -75,7 +75,7 @@ def test_templates_take_entries_of_records() -> None:
         "ends": [3.0, 1.0, 2.0],
     }
     assert markdown.fill("{name}: {runs[-1][1]:g}, {final[both]!m}", entry) == "a: 4.5, 0.500 (0.250 to 1.000)"
-    assert markdown.fill("{ends!v} {spp}", entry, {"spp": 4}) == "2.000 (1.000 to 3.000) 4"
+    assert markdown.fill("{ends!v} {spp} {runs!n}", entry, {"spp": 4}) == "2.000 (1.000 to 3.000) 4 2"
     with pytest.raises(KeyError):
         markdown.fill("{rate}", entry)
 

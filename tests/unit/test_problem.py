@@ -320,3 +320,11 @@ def test_refuses(arguments: dict[str, Any], message: str):
 def test_refuses_a_scene_that_is_none():
     with pytest.raises(InputError, match=r"scene: expected an \.xml file, a Mitsuba dictionary or a function, got int"):
         Problem(3, [WALL], [VIEW])  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("size", [None, (HEIGHT, WIDTH)])
+def test_pixel_weights_are_the_mask_or_ones(size: tuple[int, int] | None) -> None:
+    reference, mask = np.zeros((HEIGHT, WIDTH, 3)), np.random.default_rng(1).random((HEIGHT, WIDTH))
+    np.testing.assert_array_equal(View(reference).pixel_weights(size), np.ones((HEIGHT, WIDTH)))
+    np.testing.assert_array_equal(View(reference, mask=mask).pixel_weights(size), mask)
+    assert View(reference).pixel_weights(HEIGHT * WIDTH).shape == (HEIGHT * WIDTH,)

@@ -140,6 +140,7 @@ def descents(problem: ur.Problem, count: int, rate: float, steps: int, seeds: in
                 "mean": float(np.mean(last)),
                 "error": float(np.std(last, ddof=1) / np.sqrt(seeds)),
                 "seconds": (time.process_time() - spent) / seeds,
+                "budget": [steps, count],
                 "along": np.round(np.mean(runs, axis=0), 4).tolist(),
             }
             print(
@@ -163,6 +164,7 @@ def run(
     steps: int = 300,
     seeds: int = 6,
     reference_spp: int = 1024,
+    part: tuple[str, ...] = ("variance", "descents"),
 ) -> Iterator[dict[str, Any]]:
     """A part per scene.
 
@@ -177,20 +179,21 @@ def run(
         steps: of the descents
         seeds: of the descents
         reference_spp: of the references
+        part: measured; the other's figures stay
     """
     for name in scene:
         problem = opened(name, resolution, reference_spp)
-        part: dict[str, Any] = {"variance": {name: []}}
-        for alpha in alphas:
+        found: dict[str, Any] = {"variance": {name: []}} if "variance" in part else {}
+        for alpha in alphas if found else ():
             at = {problem.parameters[0].key: problem.renderer.array(np.full((), alpha, np.float32))}
             point: dict[str, Any] = {"alpha": alpha}
             for measured, of in (("derivative", image_derivative), ("loss", loss_gradient)):
                 point[measured] = compared({kind: of(problem, at, kind, spp) for kind in KINDS}, runs)
-            part["variance"][name].append(point)
+            found["variance"][name].append(point)
             print(name, point, flush=True)
-        if name in DESCENTS:
-            part["descents"] = {name: descents(problem, count, rate, steps, seeds)}
-        yield part
+        if name in DESCENTS and "descents" in part:
+            found["descents"] = {name: descents(problem, count, rate, steps, seeds)}
+        yield found
 
 
 def table(record: Record) -> str:
@@ -210,10 +213,10 @@ def table(record: Record) -> str:
     return markdown.blocks(
         *parts,
         f"The largest |z| of the difference of the {len(every)} pairs of means: {worst:.2f}.",
-        "**descents**: {steps} steps of {count} pixels, two paths each, {seeds} seeds".format(**s),
+        "**descents**: two paths a pixel, constant rate",
         markdown.records(
-            "scene | pixels, derivatives | error of alpha, last quarter | processor seconds a run",
-            "{scene} | {kind} | {mean:.3f} ± {error:.2g} | {seconds:.1f}",
+            "scene | steps × pixels | seeds | pixels, derivatives | error of alpha, last quarter | processor seconds a run",
+            "{scene} | {budget[0]} × {budget[1]} | {last!n} | {kind} | {mean:.3f} ± {error:.2g} | {seconds:.1f}",
             markdown.named(record["descents"], "scene", "", "kind"),
         ),
     )

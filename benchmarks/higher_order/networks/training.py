@@ -90,9 +90,19 @@ class Data:
 
     def error(self, network: Any) -> float:
         """Root mean square of the answers, in units of the ranges."""
+        return float(np.sqrt(np.mean((self._answers(network) - self.truth) ** 2)))
+
+    def image_error(self, network: Any) -> float:
+        """Mean square difference of the answers' renders from the references, less that of the truth's renders."""
+        squares = [
+            np.mean((self._render(self.session, poses, 64, 3) - self.references) ** 2)
+            for poses in (self._answers(network), self.truth)
+        ]
+        return float(squares[0] - squares[1])
+
+    def _answers(self, network: Any) -> np.ndarray:
         with torch.no_grad():
-            found = network(self.images).double().numpy()
-        return float(np.sqrt(np.mean((found - self.truth) ** 2)))
+            return network(self.images).double().numpy()
 
 
 def train(data: Data, method: str, rate: float, seconds: float, seed: int, samples: int = 8) -> dict[str, Any]:
@@ -102,7 +112,7 @@ def train(data: Data, method: str, rate: float, seconds: float, seed: int, sampl
     network = PoseNetwork(len(data.ranges))
     weights = list(network.parameters())
     adam = torch.optim.Adam(weights, lr=rate)
-    curve, clock = [(0.0, data.error(network))], 0.0
+    curve, clock, first_image = [(0.0, data.error(network))], 0.0, data.image_error(network)
 
     joint = method == "OurJoint"
     squares = [torch.zeros_like(weight) for weight in weights]
@@ -147,6 +157,7 @@ def train(data: Data, method: str, rate: float, seconds: float, seed: int, sampl
     return {
         "reached": reached,
         "final": float(smooth[-1]),
+        "image": data.image_error(network) / first_image,
         "steps": data.step,
         "evaluations": data.evaluations,
         "curve": [times[keep].round(3).tolist(), errors[keep].round(5).tolist()],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,18 +59,29 @@ class Descent:
         return [float(seconds[np.argmax(values <= goal)]) if (values <= goal).any() else math.inf for goal in GOALS]
 
 
-class _Track(ur.protocols.Callback):
+class Track(ur.protocols.Callback):
     """Keeps where a run went; ends it once the last goal is met in parameters, or the budget spent.
 
     Its clock is the processor's time of this process, warm-up and its own work left out: with one thread that is the time on a machine
     that has nothing else to do.
+
+    Args:
+        problem: with known truth.
+        budget: seconds of the clock.
+        most: samples.
     """
 
-    def __init__(self, truth: np.ndarray, start: np.ndarray, budget: float, most: float):
-        self.truth, self.points, self.seconds, self.samples = truth, [start], [0.0], 0.0
+    def __init__(self, problem: ur.Problem, budget: float = math.inf, most: float = math.inf):
+        self.problem, self.truth, start = problem, truth_of(problem), trees.ravel(problem.initial())
+        self.points, self.seconds, self.samples = [start], [0.0], 0.0
         self.budget, self.most, self.clock, self.resumed = budget, most, 0.0, 0.0
-        self.scale = float(np.sqrt(np.mean((start - truth) ** 2)))
+        self.scale = float(np.sqrt(np.mean((start - self.truth) ** 2)))
         self.errors = [1.0]
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the last goal is met in the parameters."""
+        return bool(np.mean(self.errors[-WINDOW:]) < 0.8 * GOALS[-1])
 
     def on_start(self, run: Any) -> None:
         self.resumed = work_time()
@@ -80,7 +90,7 @@ class _Track(ur.protocols.Callback):
         self.clock += work_time() - self.resumed
         self.add(trees.ravel(run.parameters), self.clock)
         self.samples = record["samples"]
-        if np.mean(self.errors[-WINDOW:]) < 0.8 * GOALS[-1]:
+        if self.arrived:
             run.stop("goal")
         if self.clock >= self.budget:
             run.stop("seconds")
@@ -93,35 +103,28 @@ class _Track(ur.protocols.Callback):
         self.seconds.append(seconds)
         self.errors.append(float(np.sqrt(np.mean((point - self.truth) ** 2))) / self.scale)
 
+    def descent(self, work: float) -> Descent:
+        """Return the run with its errors in the image at some steps, evenly spread over the logarithm of their number."""
+        chosen = np.unique(np.round(np.geomspace(1, len(self.points), _IMAGES)).astype(int) - 1)
+        evaluate = black_box(self.problem, self.problem.initial(), _IMAGE_SPP, Key(99))
+        stack = np.stack([self.truth, *(self.points[index] for index in chosen)])
+        losses = np.concatenate([evaluate(part) for part in np.array_split(stack, max(len(stack) // 8, 1))])
+        image = np.full(len(self.points), np.nan)
+        image[chosen] = np.abs(losses[1:] - losses[0])
+        return Descent(
+            np.array(self.seconds), np.array(self.errors), image / image[0], work, np.asarray(self.points[-1])
+        )
+
 
 def descend(
     problem: ur.Problem, estimator: Any, optimizer: Any, seconds: float, seed: int, evaluations: float = math.inf
 ) -> Descent:
     """One run of the library's, of so many seconds and `Descent.evaluations` at most."""
-    truth, start = truth_of(problem), trees.ravel(problem.initial())
     size = sum(math.prod(problem.renderer.resolutions()[view.sensor]) for view in problem.views)
-    track = _Track(truth, start, seconds, evaluations * size)
+    track = Track(problem, seconds, evaluations * size)
     longest = _PATIENCE * min(seconds, _LONGEST)
     ur.optimize(problem, estimator, optimizer, seconds=longest, seed=seed, callbacks=[track])
-    return measured(problem, track.points, track.seconds, track.errors, track.samples / size)
-
-
-def measured(
-    problem: ur.Problem, points: Sequence[np.ndarray], seconds: Sequence[float], errors: Sequence[float], work: float
-) -> Descent:
-    """A descent with its errors in the image at some steps, evenly spread over the logarithm of their number."""
-    parameters = problem.initial()
-    chosen = np.unique(np.round(np.geomspace(1, len(points), _IMAGES)).astype(int) - 1)
-    evaluate = black_box(problem, parameters, _IMAGE_SPP, Key(99))
-    stack = _stack(problem, points, chosen)
-    losses = np.concatenate([evaluate(part) for part in np.array_split(stack, max(len(stack) // 8, 1))])
-    image = np.full(len(points), np.nan)
-    image[chosen] = np.abs(losses[1:] - losses[0])
-    return Descent(np.array(seconds), np.array(errors), image / image[0], work, np.asarray(points[-1]))
-
-
-def _stack(problem: ur.Problem, points: Sequence[np.ndarray], chosen: np.ndarray) -> np.ndarray:
-    return np.stack([truth_of(problem), *(points[index] for index in chosen)])
+    return track.descent(track.samples / size)
 
 
 def truth_of(problem: ur.Problem) -> np.ndarray:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.higher_order.table2.descents import GOALS, WINDOW, Descent, measured, truth_of
-from benchmarks.internals import dr, mi, stock_scene, trees
+from benchmarks.higher_order.table2.descents import Descent, Track
+from benchmarks.internals import dr, mi, stock_scene
 from benchmarks.runner.timing import work_time
 
 MITSUBA = ("BUNNY", "TEXTURE")
@@ -51,13 +51,11 @@ def _texture(problem: ur.Problem, parameters: Any) -> tuple[Any, Callable[[Any],
 def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Descent:
     """One run of `mi.render`, `dr.backward`, `mi.ad.Adam`: projective sampling of silhouettes for BUNNY, `prb` for TEXTURE."""
     scene, parameters = stock_scene(problem)
-    start, truth = trees.ravel(problem.initial()), truth_of(problem)
+    track, step = Track(problem), 0
     integrator, place = _bunny(scene, parameters) if name == "BUNNY" else _texture(problem, parameters)
-    points, times, errors = [start], [0.0], [1.0]
-    scale = float(np.sqrt(np.mean((start - truth) ** 2)))
     for warm in (True, False):
         optimizer = mi.ad.Adam(lr=rate)
-        optimizer["x"] = mi.Float(start)
+        optimizer["x"] = mi.Float(track.points[0])
         clock, step = 0.0, 0
         while clock < seconds and step < (2 if warm else 100_000):
             began = work_time()
@@ -78,9 +76,7 @@ def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Desc
             step += 1
             if warm:
                 continue
-            points.append(np.array(optimizer["x"], float))
-            times.append(clock)
-            errors.append(float(np.sqrt(np.mean((points[-1] - truth) ** 2))) / scale)
-            if np.mean(errors[-WINDOW:]) < 0.8 * GOALS[-1]:
+            track.add(np.array(optimizer["x"], float), clock)
+            if track.arrived:
                 break
-    return measured(problem, points, times, errors, step * _SPP[name])
+    return track.descent(step * _SPP[name])

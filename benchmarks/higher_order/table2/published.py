@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import unrender as ur
-from benchmarks.higher_order.table2.descents import Descent, measured, truth_of
-from benchmarks.internals import Key, black_box, gaussian, trees
+from benchmarks.higher_order.table2.descents import Descent, Track
+from benchmarks.internals import Estimate, Key, black_box, gaussian, trees
 from benchmarks.runner.timing import work_time
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -79,20 +79,15 @@ SETTINGS: dict[str, dict[str, Settings]] = {
 def descend(name: str, method: str, problem: ur.Problem, seed: int) -> Descent:
     """Return one run with the published settings."""
     settings = SETTINGS[name][method]
-    truth, start = truth_of(problem), trees.ravel(problem.initial())
-    stepper = _fr22 if settings.rate else _conjugate_gradients
-    points, times, errors = [start], [0.0], [1.0]
-    scale = float(np.sqrt(np.mean((start - truth) ** 2)))
+    stepper, track = _fr22 if settings.rate else _conjugate_gradients, Track(problem)
     stepper(problem, settings, seed, lambda *_: None, 2)
     began = work_time()
 
     def moved(point: np.ndarray) -> None:
-        points.append(settings.unit * point)
-        times.append(work_time() - began)
-        errors.append(float(np.sqrt(np.mean((points[-1] - truth) ** 2))) / scale)
+        track.add(settings.unit * point, work_time() - began)
 
     renders = stepper(problem, settings, seed, moved, settings.steps)
-    return measured(problem, points, times, errors, settings.spp * renders)
+    return track.descent(settings.spp * renders)
 
 
 def _loss(problem: ur.Problem, settings: Settings, seed: int, step: int) -> Function:
@@ -104,15 +99,15 @@ def _loss(problem: ur.Problem, settings: Settings, seed: int, step: int) -> Func
 def _fr22(problem: ur.Problem, settings: Settings, seed: int, moved: Callable[[np.ndarray], None], steps: int) -> int:
     """Descend by Adam on the gradient of Fischer and Ritschel 2023. Return the number of renders."""
     rng, x = np.random.default_rng([31, seed]), trees.ravel(problem.initial()) / settings.unit
-    mean, square = np.zeros_like(x), np.zeros_like(x)
+    adam = ur.optimizers.Adam(settings.rate)
+    state = adam.init({"x": x})
     for step in range(steps):
         sigma = settings.sigma_at(step)
         z = gaussian.gradient_sample(rng.uniform(size=(settings.pairs, x.size)))
         change = _odd(_loss(problem, settings, seed, step), x, sigma, z)
         gradient = np.mean(change[:, None] * np.sign(z), axis=0) * gaussian.GRADIENT_MASS / sigma
-        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
-        unbiased = mean / (1 - 0.9 ** (step + 1)), square / (1 - 0.999 ** (step + 1))
-        x = x - settings.rate * unbiased[0] / (np.sqrt(unbiased[1]) + 1e-8)
+        move, state = adam.update(Estimate(0.0, {"x": gradient}), state, {"x": x})
+        x = x + move["x"]
         moved(x)
     return 2 * settings.pairs * steps
 

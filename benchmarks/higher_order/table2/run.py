@@ -29,6 +29,7 @@ from benchmarks.higher_order.table2.methods import LEFT_OUT, METHODS, Config, co
 from benchmarks.higher_order.table2.mitsuba_baseline import MITSUBA, mitsuba
 from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
 from benchmarks.internals import dr
+from benchmarks.races import first_at
 from benchmarks.runner.records import Record, command
 
 TUNING = 3
@@ -173,7 +174,10 @@ def table(record: Record) -> str:
     for rival in ("FR22", "CMA-ES"):
         text = "'s time over the better of OurHVPA and OurJoint, per goal (>: its budget over theirs where it never got there):"
         parts += [rival + text, _gains(record["tasks"], rival)]
-    text = "Times over those of one method alone, OurHVPA, the paper's, and OurJoint: means over the goals that both reached."
+    text = (
+        "Times over those of one method alone, OurHVPA, the paper's, and OurJoint: means over the goals that both reached, with standard "
+        "errors by a bootstrap over runs."
+    )
     papers = (
         "By the paper's goals: squared errors of the parameters of .1, .01 and .001, that is RMSE of .316, .1 and .032, of single steps. "
         "Times at which the median curve of the runs reaches them; each cell is the mean ratio over the goals that both reached, with "
@@ -210,17 +214,12 @@ def _ratios(methods: dict[str, Any], theirs: tuple[str, ...], ours: tuple[str, .
     for which, goals in _PAPERS_GOALS.items():
         for goal in goals:
             them, us = (
-                [_first(methods[name]["curves"][which], goal) for name in side if name in methods]
+                [first_at(methods[name]["curves"][which], goal) for name in side if name in methods]
                 for side in (theirs, ours)
             )
             if them and us and math.isfinite(min(them)) and math.isfinite(min(us)):
                 ratios.append(min(them) / min(us))
     return ratios
-
-
-def _first(curve: list[list[float]], goal: float) -> float:
-    """Return the time at which a curve reaches a goal, inf where it does not."""
-    return next((time for time, error in zip(*curve, strict=True) if error <= goal), math.inf)
 
 
 def _apart(tasks: dict[str, Any]) -> str:
@@ -229,7 +228,10 @@ def _apart(tasks: dict[str, Any]) -> str:
     for method, rival in itertools.product(OURS, ("FR22", "CMA-ES", "L-BFGS", "Mitsuba")):
         ratios = {name: _both(task["methods"], rival, method) for name, task in tasks.items()}
         every = [ratio for found in ratios.values() for ratio in found]
-        cells = [f"{statistics.fmean(found):.2f}" if found else "—" for found in ratios.values()]
+        cells = [
+            f"{statistics.fmean(found):.2f} ± {_spread(tasks[name]['methods'], rival, method):.2f}" if found else "—"
+            for name, found in ratios.items()
+        ]
         middle = f"{statistics.fmean(every):.2f} ({statistics.geometric_mean(every):.2f})" if every else "—"
         rows.append([f"{rival} / {method}", *cells, middle, len(every)])
     return markdown.table(" | ".join(["", *tasks, "all (geometric)", "goals"]), rows)
@@ -243,6 +245,21 @@ def _both(methods: dict[str, Any], rival: str, method: str) -> list[float]:
         [*entry["image"], *entry["parameter"]] for entry in (methods[m]["summary"] for m in (rival, method))
     )
     return [a / b for a, b in zip(theirs, ours, strict=True) if a is not None and b is not None]
+
+
+def _spread(methods: dict[str, Any], rival: str, method: str, resamples: int = 1000) -> float:
+    """Return the standard error of the mean of `_both`, by a bootstrap over the runs of both methods."""
+    rng, found = np.random.default_rng(0), []
+    times = [
+        np.array([[*run["image"], *run["parameter"]] for run in methods[name]["runs"]], float)
+        for name in (rival, method)
+    ]
+    for _ in range(resamples):
+        theirs, ours = (np.median(each[rng.integers(len(each), size=len(each))], axis=0) for each in times)
+        both = np.isfinite(theirs) & np.isfinite(ours)
+        if both.any():
+            found.append(float(np.mean(theirs[both] / ours[both])))
+    return float(np.std(found))
 
 
 def _gains(tasks: dict[str, Any], rival: str) -> str:

@@ -18,6 +18,7 @@ import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.debiasing import DebiasedGradient
 from benchmarks.internals import Estimator
+from benchmarks.paths import descent
 from benchmarks.runner.records import Record
 
 RATE = 0.005
@@ -36,24 +37,10 @@ MERGE = ("descents.*.methods",)
 QUICK = {"steps": 6, "seeds": 2, "resolution": 8}
 
 
-class Distance(ur.protocols.Callback):
-    """Keeps how far the parameters are from the truth."""
-
-    def __init__(self, truth: dict[str, np.ndarray]):
-        self.truth = truth
-        self.rows: list[list[float]] = []
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
-        del record
-        self.rows.append([float(np.mean(np.array(run.parameters[key]) / x - 1)) for key, x in self.truth.items()])
-
-
 def drift(problem: ur.Problem, estimator: Estimator, steps: int, seed: int) -> np.ndarray:
-    """(steps, parameters)."""
-    distance = Distance(problem.truth)
-    ur.optimize(problem, estimator, ur.optimizers.Adam(RATE), steps=steps, seed=seed, callbacks=[distance])
-    return np.array(distance.rows)
+    """How far the parameters are from the truth after each step, relative to it, (steps, parameters)."""
+    path = descent(problem, estimator, RATE, steps + 1, seed)[1:]
+    return np.array([[float(np.mean(np.array(at[key]) / x - 1)) for key, x in problem.truth.items()] for at in path])
 
 
 def summarize(record: dict[str, Any]) -> dict[str, Any]:
