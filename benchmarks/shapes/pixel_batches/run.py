@@ -29,6 +29,8 @@ QUICK: dict[str, Any] = {
 }  # fmt: skip
 _LEARNING = 12
 """Steps before the variance is measured."""
+_USUAL = 2048, 4
+"""Pixels of a mini-batch and samples per pixel; others have entries of their own."""
 
 
 def samplers(pixels: int, views: int) -> dict[str, PixelSampler]:
@@ -99,7 +101,8 @@ def run(
         (key,) = problem.faces
         problem = with_preconditioner(problem, ur.preconditioners.LargeSteps(strength), key)
         what = "surface" if problem.has_truth else "pictures"
-        found[name] = {"judged by": what, "views": len(problem.views), "methods": {}}
+        label = name if (pixels, spp) == _USUAL else f"{name}, {pixels} pixels, {spp} spp"
+        found[label] = {"judged by": what, "views": len(problem.views), "methods": {}}
         for way, sampler in samplers(pixels, len(problem.views)).items():
 
             def final(rate: float, sampler: PixelSampler = sampler, problem: ur.Problem = problem) -> float:
@@ -109,7 +112,7 @@ def run(
             rate, _ = search(tuple(rates), final)
             runs = [descend(problem, sampler, rate, spp, seconds, seed) for seed in range(seeds)]
             noise = variance(problem, sampler, spp, repetitions)
-            found[name]["methods"][way] = {"rate": rate, "variance": noise, "runs": runs}
+            found[label]["methods"][way] = {"rate": rate, "variance": noise, "runs": runs}
             print(name, way, rate, [float(np.round(one[what], 3)) for one in runs], noise, flush=True)
             yield {"problems": found}
 
@@ -126,7 +129,7 @@ def table(record: Record) -> str:
             rows.append([problem, name, f"{of['rate']:g}", *finals, noise])
     text = (
         "Of the start's, after {seconds:g} s of the processor, {seeds} seeds: median (least to greatest). "
-        "Views of {resolution}², mini-batches of {pixels} pixels, {spp} spp. "
+        "Views of {resolution}², mini-batches of 2048 pixels, 4 spp, where no others are named. "
         "Variance of the gradient at the start, over that of uniform mini-batches."
     )
     head = "problem | pixels | rate | surface error | picture error | variance"
