@@ -35,6 +35,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if HERE / "unit" not in item.path.parents:
             item.add_marker("mitsuba")
+        if (cpu := item.get_closest_marker("cpu")) and os.environ.get("UNRENDER_VARIANT", variant.LLVM) != variant.LLVM:
+            item.add_marker(pytest.mark.skip(reason=cpu.args[0]))
         if item.get_closest_marker("mitsuba") and isinstance(item, pytest.Function):
             item.fixturenames.insert(0, "mitsuba_variant")
 

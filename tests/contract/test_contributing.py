@@ -132,7 +132,8 @@ def found(tmp_path_factory: pytest.TempPathFactory, mitsuba_variant: str) -> dic
     source = Path(unrender.__file__).parents[1]
     process = subprocess.run(
         [sys.executable, "-W", "error", "-c", DRIVER, str(Path(__file__).parent), mitsuba_variant, str(folder / "run"), PLAN],
-        env={**os.environ, "PYTHONPATH": f"{source}{os.pathsep}{folder}"}, capture_output=True, text=True, timeout=300,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(source), str(folder), *sys.path])},
+        capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     assert process.returncode == 0, process.stderr
     assert not process.stderr

@@ -226,7 +226,7 @@ def test_forward_mode_says_that_there_is_none() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("framework", ["drjit", "torch"])
 def test_many_steps_leak_nothing(framework: str) -> None:
-    """Neither variables of Dr.Jit nor memory."""
+    """Neither variables of Dr.Jit nor memory. Objects of other tests may add some variables once, but a leak adds to every span."""
     torch = pytest.importorskip("torch") if framework == "torch" else None
     renderer = ur.Renderer(surface, [TEXTURE], image=CV(), spp=2, groups=2, max_depth=3)
     reference = mi.TensorXf(REFERENCE)
@@ -245,10 +245,10 @@ def test_many_steps_leak_nothing(framework: str) -> None:
             with torch.no_grad():
                 gradient: Any = value.grad
                 value -= 0.01 * gradient
-        if step in (200, 799):
+        if step in (200, 500, 799):
             gc.collect()
             counts.append(len(str(dr.whos(as_string=True)).splitlines()))
             status = Path("/proc/self/status")
             memory.append(int(status.read_text().split("VmRSS:")[1].split()[0]) if status.exists() else 0)
-    assert counts[1] <= counts[0] + 4
-    assert memory[1] <= memory[0] + 4096  # KiB
+    assert min(np.diff(counts)) <= 2
+    assert memory[-1] <= memory[0] + 4096  # KiB

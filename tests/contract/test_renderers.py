@@ -441,6 +441,7 @@ def disturbance(backend: Backend, renderer: Renderer) -> Any:
     return disturb
 
 
+@pytest.mark.cpu("atomic additions of a GPU have no order")
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("name", without_media(BACKENDS))
 def test_equal_arguments_give_equal_results_whatever_other_sessions_do(name: str) -> None:

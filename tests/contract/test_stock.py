@@ -19,6 +19,7 @@ from unrender.estimators.stock import StockGradient
 from unrender.methods import method
 
 
+@pytest.mark.cpu("atomic additions of a GPU have no order")
 @pytest.mark.usefixtures("one_thread")
 def test_its_gradient_is_that_of_mitsubas_own_functions() -> None:
     asked, key = problem(), Key(5, 3)

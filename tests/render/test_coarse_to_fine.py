@@ -86,6 +86,7 @@ def test_upsampling_is_exact_for_linear_functions_away_from_the_borders(coarse: 
     assert np.abs(upsampled(given, fine, corners=True) - expected)[inner].max() > 0.01
 
 
+@pytest.mark.cpu("texture units interpolate with 8-bit weights")
 @pytest.mark.parametrize("wrap", [False, True])
 @pytest.mark.parametrize("axes", [2, 3])
 def test_upsampling_reads_what_mitsuba_reads(axes: int, wrap: bool) -> None:

@@ -189,8 +189,8 @@ def test_a_small_network_over_coordinates_is_a_texture() -> None:
 
 
 def box(size: float = 1.0) -> dict[str, Any]:
-    """A box under a lamp and a sky."""
-    look = mi.ScalarTransform4f().look_at([1, 2, 5], [0, 0, 0], [0, 1, 0])
+    """A box under a lamp and a sky. No face's plane contains the camera, where the derivative by the size has two sides."""
+    look = mi.ScalarTransform4f().look_at([1.4, 2, 5], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
     return {
         "type": "scene",

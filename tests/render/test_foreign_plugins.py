@@ -172,7 +172,7 @@ def test_commands_load_no_plugins_of_where_they_run(library: Path, marker: Path,
         done = subprocess.run(command, cwd=folder, env=os.environ, capture_output=True, text=True, timeout=200)
         assert not marker.exists(), words
         assert done.returncode == 0, (words, done.stderr[-2000:])
-    code = "from unrender.backend import variant; print(variant._trial_problem('llvm_ad_rgb'))"
+    code = "from unrender.backend import variant; print(variant.gpu_trial(variant='llvm_ad_rgb'))"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=folder, env=os.environ, capture_output=True, text=True, timeout=200
     )

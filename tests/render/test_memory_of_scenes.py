@@ -76,6 +76,7 @@ def test_the_previous_state_has_no_gradient_that_nobody_asks_for(renderer: Mitsu
     assert np.abs(both[1][KEY].numpy()).max() > 0
 
 
+@pytest.mark.cpu("NumPy does not see the memory of a GPU")
 def test_both_loads_and_the_problem_share_the_values_that_were_loaded(renderer: MitsubaRenderer) -> None:
     pair = renderer.pair
     assert pair.loaded()._own[KEY].array.index == pair.loaded(previous=True)._own[KEY].array.index

@@ -139,6 +139,7 @@ def test_an_emitter_that_no_path_finds_is_refused_and_leaves_other_scenes_alone(
     assert np.isfinite(np.array(other.prepare([], None, False).image({}, SampleRequest(0, 4, 1)).images)).all()
 
 
+@pytest.mark.cpu("a GPU traces one scene, so poses cannot transform rays")
 def test_a_mesh_of_ellipsoids_moves_in_perturbed_renders_only() -> None:
     assert "is not a mesh (EllipsoidsMesh)" in refusal(built("ellipsoidsmesh"), "ball.translation", derivatives=False)
 

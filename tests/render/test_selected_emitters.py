@@ -116,6 +116,7 @@ def test_gradients_are_unbiased(name: str) -> None:
     assert (np.abs(1.3 * mine.mean(axis=0) - plain.mean(axis=0)) / error).max() > limit, "a planted error went unseen"
 
 
+@pytest.mark.cpu("atomic additions of a GPU have no order")
 @pytest.mark.usefixtures("one_thread")
 def test_one_emitter_leaves_nothing_to_choose() -> None:
     asked = problem(1)
@@ -174,6 +175,7 @@ class Stop(ur.protocols.Callback):
             raise KeyboardInterrupt
 
 
+@pytest.mark.cpu("atomic additions of a GPU have no order")
 @pytest.mark.usefixtures("one_thread")
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:
     asked = ur.gallery.problem("mirror-trio", resolution=16, reference_spp=16)

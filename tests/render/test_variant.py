@@ -155,7 +155,7 @@ def test_ensure_refuses_a_variant_without_derivatives(fake: FakeMitsuba):
 
 
 def test_the_trial_passes_where_kernels_run(mitsuba_variant: str):
-    assert variant._trial_problem(mitsuba_variant) is None
+    assert variant.gpu_trial(variant=mitsuba_variant) is None
 
 
 @pytest.mark.parametrize(
@@ -166,15 +166,15 @@ def test_the_trial_passes_where_kernels_run(mitsuba_variant: str):
     ],
 )
 def test_the_trial_survives_a_broken_driver(code: str, said: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(variant, "_GPU_TRIAL", code)
-    problem = variant._trial_problem("cuda_ad_rgb")
+    monkeypatch.setattr(variant, "_TRIAL", "")
+    problem = variant.gpu_trial(code)
     assert problem is not None
     assert said in problem
 
 
 def test_a_hidden_gpu_is_not_tried(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    monkeypatch.setattr(variant, "_trial_problem", lambda name: pytest.fail("tried"))
+    monkeypatch.setattr(variant, "gpu_trial", lambda: pytest.fail("tried"))
     assert "CUDA_VISIBLE_DEVICES" in str(variant.gpu_problem.__wrapped__())
 
 

@@ -16,7 +16,12 @@ from unrender.images.denoising import denoise
 OIDN = pytest.param(
     "oidn", marks=pytest.mark.skipif(importlib.util.find_spec("pyoidn") is None, reason="pyoidn is not installed")
 )
-OPTIX = pytest.param("optix", marks=pytest.mark.skipif(variant.gpu_problem() is not None, reason="no GPU"))
+OPTIX = pytest.param(
+    "optix",
+    marks=pytest.mark.skipif(
+        variant.gpu_problem() is not None or denoising._failure_of_optix() is not None, reason="no GPU with weights"
+    ),
+)
 KINDS = [OIDN, OPTIX, "variation"]
 
 
@@ -118,5 +123,11 @@ def test_without_a_denoiser_one_line_says_what_to_install(monkeypatch: pytest.Mo
     with pytest.raises(ur.InputError, match="cuda_ad_rgb"):
         denoise(np.ones((4, 4)), by="optix")
     monkeypatch.setattr(variant, "current", lambda: variant.CUDA)
+    monkeypatch.setattr(denoising, "_failure_of_optix", lambda: None)
     assert denoising.choose() == "optix"
+    monkeypatch.setattr(denoising, "_failure_of_optix", lambda: "no weights")
+    with pytest.raises(ur.InputError, match="denoiser optix: no weights; oidn runs on the CPU"):
+        denoising.choose("optix")
+    with pytest.raises(ur.InputError, match="needs pyoidn"):
+        denoising.choose()
     assert denoise(np.ones((4, 4)), by="variation").shape == (4, 4)

@@ -36,13 +36,16 @@ _threads_limited = False
 _setting = threading.RLock()
 """Lock: Mitsuba's module attributes are incomplete while another thread sets the variant."""
 
-_GPU_TRIAL = """
+_TRIAL = """
 import os, sys
 sys.path[:] = {path!r}
 import drjit as dr, mitsuba as mi
 mi.file_resolver().prepend(os.path.dirname(mi.__file__))  # see plugins.py
 mi.set_variant({variant!r})
-scene = mi.load_dict({{"type": "scene", "wall": {{"type": "rectangle"}}}})
+"""
+
+_RAYS = """
+scene = mi.load_dict({"type": "scene", "wall": {"type": "rectangle"}})
 rays = mi.Ray3f(mi.Point3f(dr.linspace(mi.Float, -0.5, 0.5, 8), 0, 2), mi.Vector3f(0, 0, -1))
 assert dr.allclose(scene.ray_intersect_preliminary(rays).t, 2)
 """
@@ -219,7 +222,7 @@ def gpu_problem() -> str | None:
         return "CUDA_VISIBLE_DEVICES hides every GPU"
     if not has_cuda_driver():
         return "no NVIDIA driver is installed"
-    return _trial_problem(CUDA)
+    return gpu_trial()
 
 
 def has_cuda_driver() -> bool:
@@ -249,8 +252,9 @@ def llvm_version() -> tuple[int, ...] | None:
     return version if version[0] > 0 else None
 
 
-def _trial_problem(variant: str) -> str | None:
-    code = _GPU_TRIAL.format(path=[os.path.abspath(place) for place in sys.path], variant=variant)
+def gpu_trial(statements: str = _RAYS, variant: str = CUDA) -> str | None:
+    """Return why statements on `dr` and `mi` fail on the GPU, in one line; None if they do not. They run in a separate process."""
+    code = _TRIAL.format(path=[os.path.abspath(place) for place in sys.path], variant=variant) + statements
     try:
         trial = subprocess.run(
             [sys.executable, "-c", code],

@@ -42,10 +42,23 @@ def choose(by: Denoiser = "auto") -> Denoiser:
             f"denoiser optix: it needs the variant {variant.CUDA}, which is not in use; oidn runs on the CPU"
         )
     if by == "auto":
-        by = "optix" if on_gpu else "oidn"
+        by = "optix" if on_gpu and optix_problem() is None else "oidn"
+    elif by == "optix" and (problem := optix_problem()):
+        raise InputError(f"denoiser optix: {problem}; oidn runs on the CPU")
     if by == "oidn" and importlib.util.find_spec("pyoidn") is None:
         raise InputError("denoising needs pyoidn: pip install 'unrender[denoise]'")
     return by
+
+
+def optix_problem() -> str | None:
+    """Return why OptiX cannot denoise here, in one line; None if it can. Tested once per process."""
+    return f"it needs the variant {variant.CUDA}" if variant.current() != variant.CUDA else _failure_of_optix()
+
+
+@functools.cache
+def _failure_of_optix() -> str | None:
+    """Return why a denoiser cannot be made. A separate process tries, since OptiX ends it where its weights are not installed."""
+    return variant.gpu_trial(f"mi.OptixDenoiser(mi.ScalarVector2u({_SMALLEST}, {_SMALLEST}))")
 
 
 def denoise(

@@ -76,7 +76,7 @@ def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser, counts: np.nd
     """
     if by == "none":
         return values
-    if by == "auto" and denoising.variant.current() != denoising.variant.CUDA:
+    if by == "auto" and denoising.optix_problem() is not None:
         by = "oidn" if importlib.util.find_spec("pyoidn") else "pooling"
     if by == "pooling":
         return pool(tiles, values, counts, _PRIOR)

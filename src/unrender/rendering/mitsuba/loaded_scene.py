@@ -23,6 +23,7 @@ from unrender.core import arrays, memory
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.core.trees import Tree
+from unrender.rendering.mitsuba import gpu
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
 from unrender.rendering.mitsuba.ranges import SlotReaders
@@ -319,6 +320,8 @@ class LoadedScene:
         gradients = {key: to_tensor(dr.grad(leaf)) for key, leaf in self.leaves.items()}
         dr.eval(gradients)
         self.clear_gradients()
+        if gpu.is_gpu():  # a texture's copy gives a leaf one gradient only
+            self._spend()
         return gradients
 
     def set_tangents(self, values: Tree, tangents: Tree, attached: AbstractSet[str]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba import poses
+from unrender.rendering.mitsuba import gpu, poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle, translation_obstacle
 from unrender.rendering.mitsuba.equal_objects import merge_notices
@@ -207,20 +207,21 @@ class MitsubaRenderer:
         """Return the poses of the scene. With media only lights have poses, since a posed shape in a scene of its own does not see the
         media."""
         written, instances = self.pair.loaded().poses, has_instances(self.pair.current)
+        traced = gpu.is_gpu()
         return {
             key: pose
             for key, pose in poses.keys(self.pair.current).items()
-            if (pose.light or not self.pair.volumetric) and (key in written or not (pose.light or instances))
+            if (pose.light or not self.pair.volumetric) and (key in written or not (pose.light or instances or traced))
         }
 
     def _is_written(self, key: str, keys: Iterable[str]) -> bool:
         """Return whether a pose is written into the scene instead of transforming rays.
 
         This holds for lights. It holds for other poses if an emitting shape moves too, which changes the scene's acceleration
-        structure, and in scenes with instances, which Mitsuba cannot add to another scene.
+        structure, in scenes with instances, which Mitsuba cannot add to another scene, and on a GPU, which traces one scene.
         """
         scene = self.pair.loaded()
-        if self._poses[key].light or has_instances(scene.scene):
+        if self._poses[key].light or has_instances(scene.scene) or gpu.is_gpu():
             return True
         lit = any(other in self._poses and self._poses[other].light and moved_shape(scene, other) for other in keys)
         return lit and key in scene.poses

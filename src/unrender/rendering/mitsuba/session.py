@@ -14,6 +14,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.rendering.mitsuba import gpu
 from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
 from unrender.rendering.mitsuba.camera_paths import Kernel
 from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor, moving_geometry, no_tangents
@@ -97,7 +98,9 @@ class MitsubaSession:
         moved |= {key: "" for key in keys if key in scene.poses and key not in derivatives}
         # Moving shapes and fixed sensors of a pair.
         self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
-        self._related = not any(shape.class_name() in ("Instance", "ShapeGroup") for shape in pair.current.shapes())
+        self._related = not gpu.is_gpu() and not any(
+            shape.class_name() in ("Instance", "ShapeGroup") for shape in pair.current.shapes()
+        )
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
@@ -215,7 +218,8 @@ class MitsubaSession:
         self.set_parameters(current)
         # A virtual call reaches both scenes' objects, and its adjoint accumulates gradients in all that are attached.
         self.set_parameters(previous, previous=True, attach=request.both_gradients)
-        space = "primary" if self._light.aov else space  # rays of AOVs have one segment, which both states share
+        if self._light.aov or (self._geometric and gpu.is_gpu()):
+            space = "primary"  # rays of AOVs have one segment, which both states share
         if space == "primary" and (self._light.aov or not (self._geometric and self._related)):
             radiance = self.kernel(ImagePass(), request)()
             radiance_previous = self.kernel(ImagePass(previous=True), request)()

@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.rendering.mitsuba import mesh_layout
+from unrender.rendering.mitsuba import gpu, mesh_layout
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
 __all__ = ["meshed", "moving_targets"]
@@ -35,7 +35,7 @@ def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
     """Return the scene with these spheres replaced by meshes, and their ids.
 
     Spheres are not replaced if they are emitters, sensors or boundaries of media, or if they are mirrors or glass, whose facets would
-    be visible. No sphere is replaced in a scene with a sensor that is a shape.
+    be visible. No sphere is replaced in a scene with a sensor that is a shape, nor on a GPU in one with shape groups.
 
     The mesh has the sphere's texture coordinates and vertex normals, which are interpolated linearly.
 
@@ -51,10 +51,13 @@ def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
     ]
     if not spheres or any(sensor.get_shape() is not None for sensor in scene.sensors()):
         return scene, []
+    groups = [group for group in ObjectGraph(scene).of("shape") if group.class_name().startswith("ShapeGroup")]
+    if groups and gpu.is_gpu():  # OptiX cannot have a group in two scenes, and ends the process
+        return scene, []
     replaced = [shape.id() for shape in spheres]
     objects = [_mesh(shape) if shape.id() in replaced else shape for shape in scene.shapes()]
     # The shape groups of instances are not among the scene's shapes.
-    objects += [group for group in ObjectGraph(scene).of("shape") if group.class_name().startswith("ShapeGroup")]
+    objects += groups
     objects += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
     described: dict[str, Any] = {"type": "scene"}
     own = [] if scene.integrator() is None else [scene.integrator()]

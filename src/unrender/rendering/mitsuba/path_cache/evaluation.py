@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.camera_paths import dropped_together, is_finite
+from unrender.rendering.mitsuba.gpu import lookup_mask
 from unrender.rendering.mitsuba.integrators.base import total
 from unrender.rendering.mitsuba.path_cache.lookups import Lookups
 from unrender.rendering.mitsuba.path_cache.tracing import SOURCES
@@ -80,7 +81,7 @@ class Evaluation:
             si: Any = dr.zeros(mi.SurfaceInteraction3f)
             si.uv = mi.Point2f(place.x, place.y)
             si.wi = mi.Vector3f(0, 0, 1) if index <= self._areas else -mi.Vector3f(place)
-            light = dr.select(on, mi.Color3f(emitter.eval(si, on)), light)
+            light = dr.select(on, mi.Color3f(emitter.eval(si, lookup_mask(on))), light)
         return _read(vertices[source], row) * light
 
 
@@ -91,7 +92,7 @@ def _reflectance(vertices: Vertices, row: mi.UInt32, textures: Sequence[Any]) ->
     value = mi.Color3f(1)
     for index, texture in enumerate(textures, 1):
         on = number == index
-        value = dr.select(on, mi.Color3f(texture.eval(si, on)), value)
+        value = dr.select(on, mi.Color3f(texture.eval(si, lookup_mask(on))), value)
     return value
 
 
