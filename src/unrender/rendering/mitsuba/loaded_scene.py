@@ -98,12 +98,8 @@ def share_addresses(others: Sequence[mi.Scene] = ()) -> None:
     if (others or _registry.any_new) and len(scenes) > 1:
         recorded = FrozenFunction(lambda scenes, number: number + 1)
         for _ in range(2):
-            dr.eval(recorded(_nothing, scenes, dr.opaque(mi.Float, 0)))
+            dr.eval(recorded(lambda: None, scenes, dr.opaque(mi.Float, 0)))
     _registry.any_new = False
-
-
-def _nothing() -> None:
-    return None
 
 
 _OF_MITSUBA = re.compile(r"\[\w+\.(h|cpp):\d+\]")

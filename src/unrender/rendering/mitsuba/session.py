@@ -44,6 +44,7 @@ from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
 from unrender.rendering.mitsuba.recordable import are_recordable
 from unrender.rendering.mitsuba.rendered_paths import DroppedSamples, Paths
 from unrender.rendering.mitsuba.rough_lobes import RoughLobes
+from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.tensors import is_broadcast, tensor
 from unrender.rendering.renderer import EmitterMoments, Rendering, SampleRequest, Space
@@ -98,9 +99,7 @@ class MitsubaSession:
         moved |= {key: "" for key in keys if key in scene.poses and key not in derivatives}
         # Moving shapes and fixed sensors of a pair.
         self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
-        self._related = not gpu.is_gpu() and not any(
-            shape.class_name() in ("Instance", "ShapeGroup") for shape in pair.current.shapes()
-        )
+        self._related = not (gpu.is_gpu() or has_instances(pair.current))
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
@@ -218,8 +217,7 @@ class MitsubaSession:
         self.set_parameters(current)
         # A virtual call reaches both scenes' objects, and its adjoint accumulates gradients in all that are attached.
         self.set_parameters(previous, previous=True, attach=request.both_gradients)
-        if self._light.aov or (self._geometric and gpu.is_gpu()):
-            space = "primary"  # rays of AOVs have one segment, which both states share
+        space = "primary" if self._light.aov or (self._geometric and gpu.is_gpu()) else space
         if space == "primary" and (self._light.aov or not (self._geometric and self._related)):
             radiance = self.kernel(ImagePass(), request)()
             radiance_previous = self.kernel(ImagePass(previous=True), request)()
@@ -391,10 +389,8 @@ class MitsubaSession:
         tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         if request.emitters is not None and len(self.emitters()) > 1:
             tables |= pair.emitter_tables(task.previous, request.emitters)
-        seeds = (
-            dr.opaque(mi.UInt32, request.seed),
-            request.positions,
-        )  # opaque, since a constant would record each kernel again
+        seed = dr.opaque(mi.UInt32, request.seed)  # a constant would record each kernel again
+        seeds = seed, request.positions
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
         prepare: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
