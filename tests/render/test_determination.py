@@ -89,8 +89,8 @@ def test_a_run_tells_in_its_folder(tmp_path: Any):
 
 
 def test_a_run_that_ended_early_is_warned_in_its_folder(tmp_path: Any):
-    seen = ur.render(problem(scene(DIFFUSE), LIGHT), spp=64, seed=5)
-    made = ur.Problem(scene(DIFFUSE), [ur.Parameter(LIGHT, initial=[2, 2, 2])], [ur.View(seen)], max_depth=2)
+    seen = ur.render(problem(scene(DIFFUSE), COLOUR), spp=64, seed=5)
+    made = ur.Problem(scene(DIFFUSE), [ur.Parameter(COLOUR, initial=0.1)], [ur.View(seen)], max_depth=2)
     result = ur.optimize(made, steps=2, run_directory=tmp_path / "run")
     (line,) = [line for line in result.warnings if "ended before it settled" in line]
-    assert line.startswith(f"{LIGHT}: ")
+    assert line.startswith(f"{COLOUR}: ")

@@ -24,6 +24,8 @@ _USED, _SHRINK, _GROW = 0.5, 0.7, 1 / 0.7
 is 1, so noise alone neither closes the region nor opens it."""
 _WEAK_SHARE = 0.01
 """Squared share of an element in damped directions above which its standard error is infinite."""
+_OF_LINEAR = 1e4
+"""Factor of the trust region along parameters in which images are linear."""
 _LEAST_WEIGHT, _SCORE_ERRORS = 0.05, 2.0
 """Least weight of the latest covariance of scores, because earlier residuals include the distance to the solution; standard errors by which
 the covariance must exceed 0."""
@@ -82,6 +84,8 @@ class AveragedNewton:
     are in coordinates x / η with each parameter's learning rate η, times the σ of smoothed derivatives or the widths of differences
     (`Estimate.sigma`).
 
+    Where images are linear in a parameter (`linear`), a model is exact at any distance, so Δ hardly limits its steps.
+
     Δ shrinks after a long step if the new gradient shows that the loss rises along it, and grows while the loss falls. So averaging
     begins even where noise moves the minimum by more than the region.
 
@@ -92,14 +96,17 @@ class AveragedNewton:
         averaging: r, >= 0.
         trust_radius: Δ of the first step and upper limit of the later ones, > 0; None for no limit.
         damping: smallest eigenvalue relative to the largest, in (0, 1).
+        linear: keys of parameters in which images are linear, such as radiances.
     """
 
     learning_rate: float = 1.0
     averaging: float = 2.0
     trust_radius: float | None = 2.0
     damping: float = 1e-3
+    linear: tuple[str, ...] = ()
 
     def __post_init__(self):
+        object.__setattr__(self, "linear", tuple(self.linear))  # files hold lists
         rates.check("AveragedNewton", self.learning_rate, None)
         checks.number("AveragedNewton", "averaging", self.averaging, above=0.0, inclusive=True)
         checks.number("AveragedNewton", "damping", self.damping, above=0.0, below=1.0)
@@ -136,6 +143,8 @@ class AveragedNewton:
         references = estimate.get(ScoreCovariance)
         fresh = np.zeros_like(hessian) if references is None else np.nan_to_num(arrays.numpy(references.matrix))
         scale = coordinate_scales(estimate, state, parameters)
+        far = {key: _OF_LINEAR if key in self.linear else 1.0 for key in parameters}
+        region = scale * trees.repeat_per_element(far, parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
         noise, shares, counts = state.noise.copy(), state.shares.copy(), state.counts.copy()
         lengths, scatter, radii = np.zeros_like(x), state.scatter.copy(), state.radii.copy()
@@ -156,14 +165,14 @@ class AveragedNewton:
             scores[both] += recent * (fresh[both] - scores[both])
             shares[block] = (1.0 - weight) ** 2 * shares[block] + weight**2
             target[block] += weight * (hessian[both] @ x[block] - gradient[block] - target[block])
-            own = scale[block]
+            own = region[block]
             radius = self._radius(radii[block].min(), state.step[block] / own, own * gradient[block])
             radii[block] = radius
             slope = matrix[both] @ x[block] - target[block]
             damped = matrix[both] + shares[block].max() * noise[both]
             moved = self._solve(own[:, None] * damped * own, own * slope, radius)
-            lengths[block] = np.linalg.norm(moved)
             step[block] = own * moved
+            lengths[block] = np.linalg.norm(step[block] / scale[block])
         return trees.unravel(step, parameters), AveragedNewtonState(
             state.learning_rates,
             matrix,

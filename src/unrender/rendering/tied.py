@@ -89,6 +89,7 @@ class Tie:
             light=all(info.light for info in infos),
             viewpoint=any(info.viewpoint for info in infos),
             sensor=sensors.pop() if len(sensors) == 1 else None,
+            brightness=infos[0].brightness if len({info.brightness for info in infos}) == 1 else "",
             nonlinear=any(info.nonlinear for info in infos),
             length=max(info.length for info in infos),
         )

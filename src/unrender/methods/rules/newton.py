@@ -61,7 +61,7 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
 
 
 def few_numbers(traits: Traits) -> Plan | None:
-    """Return Gauss-Newton steps if few numbers are unknown and the image depends nonlinearly on one of them; else None.
+    """Return Gauss-Newton steps if few numbers are unknown, and one is a light's or changes the form of the image; else None.
 
     Poses take them if derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be
     combined with other numbers, such as intensities.
@@ -70,7 +70,7 @@ def few_numbers(traits: Traits) -> Plan | None:
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear]
     shapes = any(not traits.infos[key].light for key in traits.poses)
     mixed = shapes and len(traits.poses) < len(keys)
-    if not nonlinear or mixed or not traits.newton_suits or not _few(traits, keys):
+    if not (nonlinear or traits.lights) or mixed or not traits.newton_suits or not _few(traits, keys):
         return None
     estimator = _estimator(traits, keys, constants.pose_images)
     if traits.poses:
@@ -79,7 +79,8 @@ def few_numbers(traits: Traits) -> Plan | None:
         least = constants.explained if shapes else constants.explained_light
         if not problem.loss.linear or not explained(problem, trial) > least:
             return None
-    reason = f"{_reason(traits, keys, estimator)}: pictures change their form with {listed(nonlinear)}"
+    why = f"change their form with {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
+    reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
     return Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
 
 
@@ -146,7 +147,9 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
 
 def _optimizer(traits: Traits, keys: tuple[str, ...]) -> AveragedNewton:
     poses = any(key in traits.poses and not traits.infos[key].light for key in keys)
-    return AveragedNewton(averaging=traits.constants.pose_averaging) if poses else AveragedNewton()
+    linear = tuple(key for key in traits.lights if key in keys)
+    averaging = traits.constants.pose_averaging if poses else AveragedNewton.averaging
+    return AveragedNewton(averaging=averaging, linear=linear)
 
 
 def _elements(traits: Traits, keys: tuple[str, ...]) -> int:

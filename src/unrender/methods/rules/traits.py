@@ -59,6 +59,12 @@ class Traits:
         return [key for key, info in self.infos.items() if info.rigid]
 
     @property
+    def lights(self) -> list[str]:
+        """Keys of radiances and other values in which images are linear, without those that are optimised in other coordinates."""
+        known = self.problem.unknowns
+        return [k for k, info in self.infos.items() if info.brightness == "light" and known[k].transform is None]
+
+    @property
     def only_cameras(self) -> bool:
         """Return whether all unknowns are poses of sensors. Lens parameters have other units."""
         return all(info.viewpoint and info.rigid for info in self.infos.values())
