@@ -142,6 +142,43 @@ def test_auto_finds_the_right_values(name: str) -> None:
     assert max(errors.values()) < tolerance, errors
 
 
+LIGHTS = {
+    "ball": {
+        "type": "sphere",
+        "center": [0.8, 1.0, 0.0],
+        "radius": 0.3,
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [30.0, 25.0, 20.0]}},
+    },
+    "point": {"type": "point", "position": [-1.5, 1.5, 1.5], "intensity": {"type": "rgb", "value": [5.0, 3.0, 8.0]}},
+    "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.3, 0.4]}},
+}
+"""A lamp that the camera sees, and two lights that it does not see."""
+BRIGHTNESSES = {"ball.emitter.radiance.value": 25.0, "point.intensity.value": 5.0, "sky.radiance.value": 0.3}
+
+
+@pytest.mark.parametrize(
+    "factors", [(0.1, 0.1, 0.1), (10.0, 10.0, 10.0), (10.0, 0.1, 10.0)], ids=["low", "high", "mixed"]
+)
+def test_lights_arrive_from_a_tenth_and_from_ten_times_their_brightness(
+    factors: tuple[float, ...], tmp_path: Any
+) -> None:
+    view = camera("perspective", [0, 2, 5])
+    view["film"] |= {"width": 12, "height": 12}
+    scene = {"type": "scene", "cam": view, "floor": floor({"type": "diffuse", "reflectance": rgb(0.5)}, 0, 3), **LIGHTS}
+    reference = np.array(mi.render(mi.load_dict(scene | {"integrator": {"type": "path", "max_depth": 2}}), spp=1024))
+    starts = zip(BRIGHTNESSES.items(), factors, strict=True)
+    unknown = [ur.Parameter(key, initial=factor * value) for (key, value), factor in starts]
+    problem = ur.Problem(scene, unknown, [ur.View(reference)], max_depth=2)
+    result = ur.optimize(problem, steps=10, progress=False, run_directory=tmp_path / "run")
+    assert "pictures are linear in ball.emitter.radiance.value" in result.choices[0]
+    assert result.status == "finished"
+    assert not result.undetermined
+    assert not result.warnings
+    for key, light in zip(BRIGHTNESSES, LIGHTS.values(), strict=True):
+        colour = light.get("emitter", light).get("radiance") or light["intensity"]
+        np.testing.assert_allclose(result.parameters[key], colour["value"], rtol=0.03)
+
+
 def test_on_a_plateau_poses_take_steps_by_a_smoothed_loss() -> None:
     """Derivative images explain a residual that overlaps the block, and none beside it."""
     scene, _, _, _ = pose()

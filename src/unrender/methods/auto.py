@@ -42,7 +42,7 @@ class AutoMethod(Options):
     | logarithms | positive numbers, colours and textures without an upper bound | `parameterise` |
     | grids of media | a quarter of the resolution before step 8, half before step 20 | `coarse` |
     | vertices | large steps, one rate for all | |
-    | cameras; up to 24 numbers that change the form of the picture | Gauss-Newton steps | `image` |
+    | cameras; up to 24 numbers, one of a light or of the picture's form | Gauss-Newton steps | `image` |
     | poses, and what path gradients refuse | perturbed renders: Gauss-Newton steps, or a smoothed loss | `sigma` |
     """
 

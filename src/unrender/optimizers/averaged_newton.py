@@ -26,6 +26,8 @@ _WEAK_SHARE = 0.01
 """Squared share of an element in damped directions above which its standard error is infinite."""
 _OF_LINEAR = 1e4
 """Factor of the trust region along parameters in which images are linear."""
+_OF_WIDTH = 0.1
+"""Share of a width below which the end of a step along such a parameter counts as 0."""
 _LEAST_WEIGHT, _SCORE_ERRORS = 0.05, 2.0
 """Least weight of the latest covariance of scores, because earlier residuals include the distance to the solution; standard errors by which
 the covariance must exceed 0."""
@@ -172,7 +174,7 @@ class AveragedNewton:
             damped = matrix[both] + shares[block].max() * noise[both]
             moved = self._solve(own[:, None] * damped * own, own * slope, radius)
             step[block] = own * moved
-            lengths[block] = np.linalg.norm(step[block] / scale[block])
+            lengths[block] = _length(x[block], step[block], scale[block], own > scale[block])
         return trees.unravel(step, parameters), AveragedNewtonState(
             state.learning_rates,
             matrix,
@@ -245,6 +247,16 @@ class AveragedNewton:
         return eigenvectors @ trust_region_step(
             np.maximum(curvatures, 0.0), eigenvectors.T @ gradient, None if np.isinf(radius) else radius
         )
+
+
+def _length(x: np.ndarray, step: np.ndarray, scale: np.ndarray, linear: np.ndarray) -> float:
+    """Return the length of a step, in units of `scale`, or relative to its end where images are linear, whichever is longer.
+
+    The noise of a model is proportional to its distance from the solution. So a model of a lamp ten times too bright must not remain in
+    the mean, even if the step from it is short in units of the widths, which are large there, too.
+    """
+    relative = step[linear] / (np.abs(x + step) + _OF_WIDTH * scale)[linear]
+    return max(float(np.linalg.norm(step / scale)), float(np.linalg.norm(relative)))
 
 
 def _significant(scores: np.ndarray, variances: np.ndarray, units: np.ndarray) -> np.ndarray:
