@@ -140,6 +140,8 @@ def _settings_table(own: ParameterSettings) -> dict[str, Any]:
         settings["preconditioner"] = _table(own.preconditioner)
     if own.coarse_to_fine is not None:
         settings["coarse_to_fine"] = tables.fields(own.coarse_to_fine)
+    if own.start_factor is not None:
+        settings["start_factor"] = own.start_factor
     return settings
 
 

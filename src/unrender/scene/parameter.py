@@ -79,11 +79,13 @@ class ParameterSettings:
         parameterisation: parameterisation or its name; None for no choice.
         preconditioner: linear map of gradients and steps; None for no choice.
         coarse_to_fine: resolutions over the steps; None for no choice.
+        start_factor: factor of the initial values before the first step; None for no choice.
     """
 
     parameterisation: Parameterisation | str | None = None
     preconditioner: Preconditioner | None = None
     coarse_to_fine: CoarseToFine | None = None
+    start_factor: float | None = None
 
 
 def ties_of(parameters: Sequence[Parameter]) -> tuple[Tie, ...]:

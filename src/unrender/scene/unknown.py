@@ -42,6 +42,7 @@ class Unknown:
         truth: True value, of the shape of `initial`; None if unknown.
         surface: True surface of a mesh, if the true position of each vertex is unknown; else None.
         notices: One line for each change of the input.
+        start_factor: Factor of `initial` before the first step, chosen by a method.
     """
 
     parameter: Parameter
@@ -60,6 +61,7 @@ class Unknown:
     truth: np.ndarray | None = None
     surface: Surface | None = None
     notices: tuple[str, ...] = ()
+    start_factor: float = 1.0
 
     @cached_property
     def _scale(self) -> float:
@@ -76,7 +78,8 @@ class Unknown:
 
     def start(self, step: int) -> np.ndarray:
         """Return the initial value at the resolution of a step."""
-        return self.initial if self.coarse_to_fine is None else self.coarse_to_fine.coarsened(self.initial, step)
+        first = self.initial if self.start_factor == 1.0 else np.float32(self.start_factor) * self.initial
+        return first if self.coarse_to_fine is None else self.coarse_to_fine.coarsened(first, step)
 
     def full(self, values: np.ndarray) -> np.ndarray:
         """Return values at the scene's resolution; coarser ones are interpolated."""

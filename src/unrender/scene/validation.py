@@ -171,8 +171,10 @@ def _check_rate(rate: Any) -> float | None:
 
 def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo) -> Unknown:
     """Return the unknown with those settings for which its own are None. Raises `InputError` for an unsuitable one."""
-    own = {n: x for n, x in vars(settings).items() if x is not None and getattr(unknown.parameter, n) is None}
-    changes: dict[str, Any] = dict(own)
+    chosen = {n: x for n, x in vars(settings).items() if x is not None}
+    factor = chosen.pop("start_factor", unknown.start_factor)
+    own = {n: x for n, x in chosen.items() if getattr(unknown.parameter, n) is None}
+    changes: dict[str, Any] = {**own, "start_factor": factor}
     if "parameterisation" in own:
         pair = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
         changes |= {"parameterisation": pair[0], "transform": pair[1]}

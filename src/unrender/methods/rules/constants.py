@@ -50,6 +50,9 @@ class Constants:
     (4e93f49)."""
     margins: float = 10.0
     """Distance from its bound, in margins, from which a positive value is optimised as its logarithm. Source: by hand (b1f36e3)."""
+    far_light: float = 3.0
+    """Ratio of a light's brightness to that of the references from which its start is scaled. Source: by hand, radiances and environment
+    maps that start at 0.1 and 10 times the truth."""
     albedo_share: float = 0.2
     """First learning rate of an albedo with an unknown extinction, relative to that of other grids.
 

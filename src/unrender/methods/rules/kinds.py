@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from unrender.core.text import grouped, listed
+from unrender.methods.rules.brightness import start_factors
 from unrender.methods.rules.first_rates import logarithms
 from unrender.methods.rules.traits import Traits
 from unrender.optimizers.adam import Adam
@@ -83,6 +84,16 @@ def positive_values(traits: Traits) -> Part:
     return Part(tuple(named), f"moved as {grouped(named)}", settings) if named else Part()
 
 
+def lights(traits: Traits) -> Part:
+    """Start lights whose brightness is far from the references' at a multiple of their initial values."""
+    positive = positive_values(traits).settings
+    keys = [key for key in traits.lights if key in positive]
+    factors = start_factors(traits.problem, keys, traits.constants)
+    named = {key: f"{factor:.3g} times the initial values" for key, factor in factors.items()}
+    settings = {key: ParameterSettings(start_factor=factor) for key, factor in factors.items()}
+    return Part(tuple(factors), f"lights start by least squares: {grouped(named)}", settings) if factors else Part()
+
+
 def meshes(traits: Traits) -> Part:
     """Use large steps for vertices, with one learning rate for all that decays with the root of the steps."""
     keys, constants = traits.meshes, traits.constants
@@ -96,5 +107,5 @@ def meshes(traits: Traits) -> Part:
     return Part(keys, reason, settings, optimizer=lambda rate: Adam(rate, schedule=schedule, uniform=True))
 
 
-KINDS: tuple[Callable[[Traits], Part], ...] = (textures, volumes, positive_values, meshes)
+KINDS: tuple[Callable[[Traits], Part], ...] = (textures, volumes, positive_values, lights, meshes)
 """Rules in the order of their reasons."""

@@ -1,0 +1,83 @@
+"""Factors of unknown lights at the start, by least squares: images are linear in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from unrender.core.errors import InputError
+from unrender.methods.rules.constants import Constants
+from unrender.scene.problem import Problem
+from unrender.scene.render import power_of_two, render
+
+__all__ = ["start_factors"]
+
+_SEEDS = (11, 12)
+"""Seeds of two independent halves."""
+_MOST_VIEWS, _MOST_PIXELS = 4, 1 << 19
+_PATHS, _SPP = 1 << 17, (2, 64)
+"""Path budget of the images of one state, and limits of their samples per pixel."""
+_LIMIT = 1e4
+"""Largest factor, and reciprocal of the smallest."""
+_BETTER = 0.25
+"""Ratio of the mean square residuals with and without the factors from which these are used."""
+
+
+def start_factors(problem: Problem, keys: Sequence[str], constants: Constants) -> dict[str, float]:
+    """Return {key: factor} of the lights' initial values, for those that are far from 1; {} if factors hardly reduce the residual.
+
+    With D_k, the image of light k alone, f minimises ‖I + Σ (f_k − 1) D_k − R‖². Its normal equations are products of two independent
+    halves, so noise does not bias them. The other unknowns are at their start, so factors are no better than these.
+
+    A start that is ten times too bright costs Adam more steps than one that is ten times too dark: its second moments remember the first
+    gradients, which are a hundred times as large as the later ones.
+
+    Args:
+        problem: Problem with views and scene.
+        keys: Keys of unknown lights.
+        constants: Constants of the rules; `far_light` is the least ratio that counts as far.
+    """
+    if not keys or not problem.loss.pixelwise:
+        return {}
+    try:
+        factors, change = _least_squares(problem, keys)
+    except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects
+        return {}
+    far = max((max(f, 1.0 / f) for f in factors.values() if f > 0.0), default=1.0) > constants.far_light
+    usable = all(math.isfinite(f) and 1.0 / _LIMIT < f < _LIMIT for f in factors.values())
+    return factors if usable and far and change < _BETTER else {}
+
+
+def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, float], float]:
+    """Return the factors, and the ratio of the mean square residuals with and without them."""
+    start, views = problem.initial_values(), _views(problem)
+    pixels = sum(math.prod(problem.sizes[view]) for view in views)
+    spp = power_of_two(min(max(_PATHS // pixels, _SPP[0]), _SPP[1]))
+    states: list[Mapping[str, np.ndarray]] = [start, *({**start, key: 2.0 * start[key]} for key in keys)]
+    count = len(keys)
+    matrix, vector, squares = np.zeros((count, count)), np.zeros(count), 0.0
+    for view in views:
+        own = problem.views[view]
+        mask = np.ones(problem.sizes[view]) if own.mask is None else np.asarray(own.mask, np.float64)
+        weight = own.weight * mask.reshape(*problem.sizes[view], 1)
+        halves = [np.stack([render(problem, x, view, spp, seed) for x in states]).astype(np.float64) for seed in _SEEDS]
+        one, other = ((images[1:] - images[0]).reshape(count, -1) for images in halves)
+        residuals = [(np.asarray(own.reference) - images[0]) * weight for images in halves]
+        matrix += (one * np.broadcast_to(weight, residuals[0].shape).reshape(-1)) @ other.T
+        vector += 0.5 * (one @ residuals[1].reshape(-1) + other @ residuals[0].reshape(-1))
+        squares += float((residuals[0] * (np.asarray(own.reference) - halves[1][0])).sum())
+    matrix = 0.5 * (matrix + matrix.T)
+    step = np.linalg.solve(matrix, vector)
+    after = squares - 2.0 * float(step @ vector) + float(step @ matrix @ step)
+    factors = {key: 1.0 + float(x) for key, x in zip(keys, step, strict=True)}
+    return factors, max(after, 0.0) / squares if squares > 0.0 else 1.0
+
+
+def _views(problem: Problem) -> list[int]:
+    """Return an even selection of the views, as many as the limit of pixels allows, at least one."""
+    count = len(problem.views)
+    chosen = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
+    ends = np.cumsum([math.prod(problem.sizes[view]) for view in chosen])
+    return [view for view, end in zip(chosen, ends, strict=True) if end <= max(_MOST_PIXELS, ends[0])]
