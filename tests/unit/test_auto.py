@@ -330,6 +330,51 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     assert all(error < 0.05 for error in made.parameter_error(result.parameters).values())
 
 
+LIT = {
+    "map": np.random.default_rng(2).uniform(0.2, 0.8, (3, 3, 1)),
+    "sky": np.full((2, 2, 1), 3.0),
+    "lamp": np.array([4.0]),
+}
+
+
+def lit(monkeypatch: pytest.MonkeyPatch, sky: float, lamp: float, bounded: bool = False) -> Problem:
+    """A texture, a light with texels and a lamp, whose images are linear in both lights."""
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 14))
+    matrix[:, :9] *= 0.2
+    renderer = AnalyticRenderer(LIT, matrix, 0.0, 0.3, shape=SHAPE)
+    lights = {key: dataclasses.replace(renderer.parameters()[key], brightness="light") for key in ("sky", "lamp")}
+    known = dict(renderer.parameters()) | lights
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
+    bounds = (0, 100) if bounded else (0, None)
+    unknown = [
+        Parameter("map", initial=0.5, bounds=(0, 1)),
+        Parameter("sky", initial=sky, bounds=bounds),
+        Parameter("lamp", initial=lamp, bounds=bounds),
+    ]
+    return Problem(renderer, unknown, [View(renderer.exact(LIT))], truth=LIT)
+
+
+@pytest.mark.parametrize(("sky", "lamp"), [(30.0, 40.0), (0.3, 0.4), (30.0, 0.4), (3.0, 40.0)])
+def test_lights_far_from_the_references_start_at_a_multiple(
+    sky: float, lamp: float, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made = lit(monkeypatch, sky, lamp)
+    plan = method("auto").plan(made)
+    assert any(reason.startswith("lights start by least squares: ") for reason in plan.reasons)
+    factors = {key: own.start_factor or 0.0 for key, own in plan.settings.items()}
+    assert factors.pop("map") == 0.0
+    np.testing.assert_allclose([factors["sky"], factors["lamp"]], [3.0 / sky, 4.0 / lamp], rtol=0.15)
+    whole = optimize(made, plan, steps=6, run_directory=tmp_path / "whole")
+    begun = optimize(made, plan, steps=3, run_directory=tmp_path / "part")
+    np.testing.assert_allclose(begun.initial["sky"], 3.0, rtol=0.15)
+    np.testing.assert_array_equal(resume(tmp_path / "part", made, steps=6).parameters["sky"], whole.parameters["sky"])
+
+
+def test_lights_that_are_near_or_bounded_start_where_they_were_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    for made in (lit(monkeypatch, 2.0, 6.0), lit(monkeypatch, 30.0, 40.0, bounded=True)):
+        assert all(own.start_factor is None for own in method("auto").plan(made).settings.values())
+
+
 def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     known = AnalyticRenderer(TRUTH, np.ones((48, 10)), shape=SHAPE).parameters()
     rigid = {key: dataclasses.replace(of, viewpoint=True, rigid=True) for key, of in known.items()}

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.core.random import Key
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.least_squares import check_numbers
+from unrender.runs.numbers import Numbers
 
 SHAPE = (8, 8)
 ROWS = SHAPE[0] * SHAPE[1] * 3
@@ -217,3 +221,49 @@ def test_the_step_of_a_number_beside_a_texture_is_that_of_all_unknowns():
     np.testing.assert_allclose(found.steps["a"], full[0] - numbers[0], rtol=0.35)
     assert "a" in found.unfinished or "a" in found.undetermined
     assert abs(check_numbers(made, values, start, FAR).steps["a"][0]) < 0.2 * abs(found.steps["a"][0])
+
+
+def test_the_length_of_a_direction_is_neither_open_nor_unfinished(monkeypatch: pytest.MonkeyPatch):
+    """Pictures of a unit vector; the run ended with a vector twice as long."""
+
+    made = problem(MATRIX)
+    known = dict(made.renderer.parameters())
+    known["a"] = dataclasses.replace(known["a"], role="direction")
+    inner = Numbers.pictures
+
+    def pictures(self: Numbers, points: np.ndarray, key: Key) -> np.ndarray:
+        scaled = points.copy()
+        scaled[:, :3] /= np.linalg.norm(scaled[:, :3], axis=1, keepdims=True)
+        return inner(self, scaled, key)
+
+    renderer = AnalyticRenderer(TRUTH, MATRIX, offset=2.0, noise=0.05, shape=SHAPE)
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
+    monkeypatch.setattr(Numbers, "pictures", pictures)
+    truth = TRUTH["a"] / np.linalg.norm(TRUTH["a"])
+    seen = renderer.exact({"a": truth, "b": TRUTH["b"]})
+    seen = (seen + np.random.default_rng(5).normal(0.0, NOISE, seen.shape)).astype(np.float32)
+    made = ur.Problem(renderer, [ur.Parameter(k, initial=x) for k, x in TRUTH.items()], [ur.View(seen)])
+    values = {"a": (2.0 * truth).astype(np.float32), "b": TRUTH["b"].astype(np.float32)}
+    found = check_numbers(made, values, made.initial_values(), FAR)
+    assert not found.undetermined
+    assert not found.unfinished
+    assert found.errors["a"].max() < 0.05
+    monkeypatch.setattr(Numbers, "tangents", lambda self: np.eye(self.point.size))
+    assert "a" in check_numbers(made, values, made.initial_values(), FAR).undetermined
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.5])
+def test_errors_of_squares_follow_the_noise_and_not_the_scatter_over_pixels(noise: float):
+    """One pixel that shows all of the change leaves its square certain, and the errors are those of repetitions."""
+    matrix = np.zeros_like(MATRIX)
+    matrix[:3] = 5.0 * MATRIX[:3]
+    made = problem(matrix, noise=noise)
+    numbers = Numbers.of(made, made.initial_values(), made.initial_values())
+    assert numbers is not None
+    runs = [numbers.differences(np.diag(numbers.limits), Key(0).fold(n)).squares() for n in range(64)]
+    squares, errors = (np.array([run[part] for run in runs]) for part in (0, 1))
+    scatter = squares.std(axis=0)
+    assert (squares.mean(axis=0) > 3.0 * scatter).all()
+    typical = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert (typical > 0.6 * scatter).all()
+    assert (typical < 1.7 * scatter).all()

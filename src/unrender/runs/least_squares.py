@@ -206,6 +206,8 @@ class _Fit:
         inverse = np.linalg.pinv(matrix / np.outer(units, units), rcond=1e-6, hermitian=True) / np.outer(units, units)
         slopes = differences.average()
         share = math.sqrt(len(numbers.views) / len(numbers.problem.views))
+        tangents, n = numbers.tangents(), numbers.count
+        changes = tangents @ differences.directions
 
         def covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
             """Return the covariance of numbers and factors for residuals (P, 3) with independent rendering noise."""
@@ -216,22 +218,22 @@ class _Fit:
             middle[hidden, :] = middle[:, hidden] = 0.0
             mean_square = _CHANNELS * max(float(np.mean(one * other)), 0.0)
             middle += np.diag(np.where(hidden, mean_square * units**2, 0.0))
-            return share**2 * (differences.directions @ inverse @ middle @ inverse @ differences.directions.T)
+            return share**2 * (changes @ inverse @ middle @ inverse @ changes.T)
 
         residual, noise = (0.5 * (residuals[0] + sign * residuals[1]) for sign in (1.0, -1.0))
         along = -inverse @ np.where(hidden, 0.0, np.tensordot(slopes, residual, axes=2))
         after = residuals + np.tensordot(along, slopes, axes=1)  # a run that ended early leaves more
-        whole, n = covariance(*after), numbers.count
+        whole = covariance(*after)
         freedom = residual.size - len(whole)
         whole *= residual.size / freedom if freedom > 0 else math.inf
         error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (whole, covariance(noise, noise)))
-        step = numbers.inside((numbers.point + differences.directions @ along)[None])[0] - numbers.point
+        step = numbers.inside((numbers.point + changes @ along)[None])[0] - numbers.point
         flat = squares + _ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size
         # The noise of this check says nothing about references that have much less of it.
         comparable = np.mean(after[0] * after[1]) > _COMPARABLE**2 * np.mean(noise * noise)
         # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
         open_ = flat[None] | (~numbers.rigid[:, None] & comparable)
-        unseen = np.abs(differences.directions[:n]) * (hidden[None] & open_)
+        unseen = np.abs(changes[:n]) * (hidden[None] & open_)
         return cls(whole, error, own, step[:n], unseen[:, hidden])
 
 

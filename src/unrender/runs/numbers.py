@@ -168,6 +168,15 @@ class Numbers:
             key: slice(int(end) - self.values[key].size, int(end)) for key, end in zip(self.keys, ends, strict=True)
         }
 
+    def tangents(self) -> np.ndarray:
+        """Return the projection (n + k, n + k) of changes that leaves out those of the lengths of directions, which no picture shows."""
+        matrix, known = np.eye(self.point.size), self.problem.renderer.parameters()
+        for key, of in self.places().items():
+            own = self.point[of]
+            if known[key].role == "direction" and own.any():
+                matrix[of, of] -= np.outer(own, own) / float(own @ own)
+        return matrix
+
     def inside(self, points: np.ndarray) -> np.ndarray:
         """Return the points (B, n + k) with the numbers within their bounds."""
         own = np.zeros_like(points)
