@@ -145,8 +145,7 @@ class AveragedNewton:
         references = estimate.get(ScoreCovariance)
         fresh = np.zeros_like(hessian) if references is None else np.nan_to_num(arrays.numpy(references.matrix))
         scale = coordinate_scales(estimate, state, parameters)
-        far = {key: _OF_LINEAR if key in self.linear else 1.0 for key in parameters}
-        region = scale * trees.repeat_per_element(far, parameters)
+        region = scale * self._reaches(parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
         noise, shares, counts = state.noise.copy(), state.shares.copy(), state.counts.copy()
         lengths, scatter, radii = np.zeros_like(x), state.scatter.copy(), state.radii.copy()
@@ -168,8 +167,7 @@ class AveragedNewton:
             shares[block] = (1.0 - weight) ** 2 * shares[block] + weight**2
             target[block] += weight * (hessian[both] @ x[block] - gradient[block] - target[block])
             own = region[block]
-            radius = self._radius(radii[block].min(), state.step[block] / own, own * gradient[block])
-            radii[block] = radius
+            radii[block] = radius = self._radius(radii[block].min(), state.step[block] / own, own * gradient[block])
             slope = matrix[both] @ x[block] - target[block]
             damped = matrix[both] + shares[block].max() * noise[both]
             moved = self._solve(own[:, None] * damped * own, own * slope, radius)
@@ -217,6 +215,11 @@ class AveragedNewton:
         known = state.matrix.any(axis=1)  # the others are in no model
         counts = trees.parts(np.where(known, state.counts, np.inf if known.any() else 0.0)[None], parameters)
         return {key: x[0] for key, x in split.items() if counts[key].min() >= _FEWEST_MODELS and x.all()}
+
+    def _reaches(self, parameters: Tree) -> np.ndarray:
+        """Return the factor of the trust region of each element, (n,)."""
+        factors = {key: _OF_LINEAR if key in self.linear else 1.0 for key in parameters}
+        return trees.repeat_per_element(factors, parameters)
 
     def _weight(self, count: float, length: float) -> float:
         """Return the weight of a model after `count` others and a step of this length."""
