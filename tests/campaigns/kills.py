@@ -14,7 +14,7 @@ from tests.campaigns.cuts import final_state, leftovers
 from tests.campaigns.machine import KILLED, Victims
 from unrender.runs.folder.schema import ENDED
 
-__all__ = ["COMMANDS", "campaign"]
+__all__ = ["COMMANDS", "campaign", "digest"]
 
 _COMMON = ["--threads", 1, "--variant", "llvm_ad_rgb", "--final-spp", 1, "--checkpoint-every", 4]
 _TOY = ["exponential", "--method", "plain", "--set", "spp=2", "--steps", 12, *_COMMON]
@@ -119,7 +119,7 @@ class _Export(_Case):
         self.must("export", self.run, "--out", self.old, "--variant", "llvm_ad_rgb")
         self.must("resume", self.run, "--steps", 8)
         self.must("export", self.run, "--out", self.new, "--variant", "llvm_ad_rgb")
-        self.digests = {_digest(self.old): "old", _digest(self.new): "new"}
+        self.digests = {digest(self.old): "old", digest(self.new): "new"}
         if len(self.digests) != 2:
             raise RuntimeError("both exports are the same")
 
@@ -130,13 +130,14 @@ class _Export(_Case):
         return "export", self.run, "--out", folder / "scene", "--overwrite", "--variant", "llvm_ad_rgb"
 
     def judge(self, folder: Path) -> str:
-        if _digest(folder / "scene") not in self.digests:
+        if digest(folder / "scene") not in self.digests:
             return "neither the old export nor the new one"
         self.must(*self.words(folder))
-        return "" if self.digests.get(_digest(folder / "scene")) == "new" else "not the new export"
+        return "" if self.digests.get(digest(folder / "scene")) == "new" else "not the new export"
 
 
-def _digest(folder: Path) -> str:
+def digest(folder: Path) -> str:
+    """Return a hash of the names and contents of all files of a folder."""
     state = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         state.update(f"{path.relative_to(folder)}\0".encode())

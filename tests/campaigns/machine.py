@@ -41,6 +41,8 @@ class Victims:
         if self._process.stdin is not None:
             self._process.stdin.close()
         self._process.wait(timeout=600)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
 
     def begin(self, *words: object, **order: Any) -> int:
         """Start a command. Returns its process id."""

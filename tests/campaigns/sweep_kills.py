@@ -17,7 +17,7 @@ from benchmarks.runner.catalogue import ROOT
 from tests.campaigns.cluster_machines import processes_below
 from tests.campaigns.cuts import leftovers
 
-__all__ = ["campaign"]
+__all__ = ["campaign", "is_running"]
 
 _KINDS = {
     "worker": ("ray::unrender", "ray::IDLE"),
@@ -94,12 +94,13 @@ def _judge(place: Path, row: dict[str, Any], expected: list[tuple[Any, ...]], be
     if _trials(place) != expected:
         return "other results"
     until = time.monotonic() + 30
-    while (alive := [pid for pid in beside if _runs(pid)]) and time.monotonic() < until:
+    while (alive := [pid for pid in beside if is_running(pid)]) and time.monotonic() < until:
         time.sleep(0.2)
     return f"left over: {leftovers(place)} {alive}" if alive or leftovers(place) else ""
 
 
-def _runs(pid: int) -> bool:
+def is_running(pid: int) -> bool:
+    """Return whether a process has not ended."""
     with contextlib.suppress(OSError):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     return False

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.campaigns import cuts, kills, sweep_kills, worker_kills
+from tests.campaigns import cuts, kills, signal_moments, sweep_kills, worker_kills
 from tests.campaigns.cluster_machines import Link, Machines
 from tests.campaigns.machine import Victims
 
@@ -66,4 +67,16 @@ def test_a_distributed_run_survives_kills_and_a_slow_worker(method: str, tmp_pat
 def test_a_sweep_on_workers_survives_kills(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     rows = sweep_kills.campaign(tmp_path, COUNT, random.Random(SEED))
+    assert [row for row in rows if row["wrong"]] == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("command", signal_moments.COMMANDS)
+def test_a_signal_at_any_moment_ends_a_command_in_one_line(
+    command: str, number: signal.Signals, tmp_path: Path
+) -> None:
+    if command == "distributed":
+        pytest.importorskip("ray")
+    rows = signal_moments.campaign(tmp_path / command, command, number, COUNT, random.Random(SEED))
+    assert len(rows) == COUNT
     assert [row for row in rows if row["wrong"]] == []

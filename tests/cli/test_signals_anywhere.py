@@ -44,7 +44,8 @@ COMMAND += "from unrender.app.cli.main import main; sys.exit(main())"
 def start(folder: Path, *words: str) -> subprocess.Popen[str]:
     folder.mkdir()
     line = [sys.executable, "-c", COMMAND, *words]
-    return subprocess.Popen(line, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    own = {**os.environ, "RAY_worker_niceness": "0"}  # Ray's own would starve them on a busy machine
+    return subprocess.Popen(line, cwd=folder, env=own, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def ended(process: subprocess.Popen[str], number: signal.Signals) -> float:

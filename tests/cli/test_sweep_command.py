@@ -170,7 +170,7 @@ def test_a_sweep_tells_once_of_seconds_that_allow_few_steps(
 ) -> None:
     monkeypatch.setattr(Budget, "on_update", lambda self, run, *_: run.stop("seconds"))
     answer = unrender(*SWEPT, "--out", "s", "--variant", mitsuba_variant)
-    assert answer.out.count("note: the budget of 1 s allows about 1 steps") == 1
+    assert answer.out.count("note: the budget of 1 s allows about 1 step;") == 1
 
 
 @pytest.mark.parametrize("command", [["sweep", *GRID], ["compare", "quad", "--seconds", 1]])

@@ -126,6 +126,27 @@ def test_an_object_without_an_id_is_not_taken_for_another_one() -> None:
     assert near_key("lmap.bsdf.reflectance.value", known) == "; did you mean lamp.bsdf.reflectance.value?"
 
 
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("ball.bsdf.roughness.value", "ball.bsdf.alpha.value"),  # of another plugin
+        ("steel.alpha", "ball.bsdf.alpha.value"),  # the material's id, which names no parameter
+        ("ball.albedo", "ball.bsdf.reflectance.value"),
+        ("lamp.intensity", "lamp.emitter.radiance.value"),
+        ("ball.bsdf.etta.value", "ball.bsdf.eta.value"),
+    ],
+)
+def test_the_same_quantity_under_another_name_is_suggested(given: str, meant: str) -> None:
+    names = ("cam.x_fov", "ball.bsdf.eta.value", "ball.bsdf.k.value", "ball.bsdf.alpha.value")
+    names += ("ball.bsdf.reflectance.value", "wall.bsdf.reflectance.value", "lamp.emitter.radiance.value")
+    assert near_key(given, dict.fromkeys(names, ABLE)) == f"; did you mean {meant}?"
+
+
+def test_an_option_of_other_methods_is_said_to_be_theirs() -> None:
+    with pytest.raises(InputError, match="method auto has no option differential_bsdf; .*; --method .*plain.* have it"):
+        method("auto").configure({"differential_bsdf": "true"})
+
+
 def test_a_transformation_leads_to_the_pose() -> None:
     known = {"box.bsdf.reflectance.value": ABLE, "box.to_world": NAMELESS, **POSES}
     assert instead_of("box.to_world", known) == (

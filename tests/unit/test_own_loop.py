@@ -314,6 +314,21 @@ def test_pytorch_has_the_gradients_of_numpy(name: str) -> None:
             np.testing.assert_allclose(value.grad.numpy(), found[key], rtol=1e-12)
 
 
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+def test_a_number_may_have_axes_of_length_one(shape: tuple[int, ...]) -> None:
+    """The output of a network is (1,) or (1, 1): its gradient has the same shape."""
+    torch = pytest.importorskip("torch")
+    number = AnalyticRenderer({"alpha": np.full((), 0.5)}, np.ones((48, 1)), 0.1, 0.0)
+    for optional in ({}, {"coupled": True}):
+        renderer = ur.Renderer(number, ["alpha"], **optional)
+        alpha = torch.full(shape, 0.4, requires_grad=True)
+        (renderer(alpha) ** 2).sum().backward()
+        assert alpha.grad is not None
+        assert alpha.grad.shape == shape
+        image = renderer.render(np.full(shape, 0.4))
+        assert renderer.backward(2 * image)["alpha"].shape == shape
+
+
 def test_pytorch_differentiates_what_comes_before_and_after() -> None:
     torch = pytest.importorskip("torch")
     x = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)

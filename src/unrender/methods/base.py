@@ -68,6 +68,8 @@ class Method:
         for name in settings:
             if name not in fields:
                 hint = did_you_mean(name, fields) or f"; it has {', '.join(fields)}"
+                others = ", ".join(other for other in methods() if name in method(other).options.model_fields)
+                hint += f"; --method {others} {'have' if ',' in others else 'has'} it" if others else ""
                 raise InputError(f"method {self.name} has no option {name}{hint}")
         none = {name: None for name, value in settings.items() if isinstance(value, str) and value.lower() == "none"}
         try:

@@ -317,12 +317,11 @@ class Renderer:
         from unrender.own_loop import graph_operations
 
         tensors = {key: value for key, value in inputs.values.items() if frameworks.is_torch(value)}
-        detached = {key: value.detach() for key, value in tensors.items()}
+        detached = Given("torch", {key: value.detach() for key, value in tensors.items()})
         device = images[0].device
 
         def gradients(derivatives: tuple[Any, ...]) -> list[Any]:
-            gradient = backward(derivatives)
-            return [frameworks.to_torch(arrays.numpy(gradient[key]), x).to("cpu") for key, x in detached.items()]
+            return [x.to("cpu") for x in self._exchange.gradient(backward(derivatives), detached).values()]
 
         on_host = tuple(image.to("cpu") for image in images)
         return tuple(x.to(device) for x in graph_operations.with_torch(gradients, on_host, list(tensors.values())))

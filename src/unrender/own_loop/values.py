@@ -161,18 +161,18 @@ class Exchange:
         return self._renderer.array(values)
 
     def gradient(self, gradient: Tree, inputs: Given) -> dict[str, Any]:
-        """Return a gradient as arrays of the loop, each of the type of its parameter."""
+        """Return a gradient as arrays of the loop, each of the type and shape of its parameter."""
         return {key: self._like(gradient[key], value, inputs) for key, value in inputs.values.items()}
 
     def _like(self, gradient: Array, value: Any, inputs: Given) -> Any:
         match inputs.framework:
             case "numpy":
-                return arrays.numpy(gradient)
+                return arrays.numpy(gradient).reshape(np.shape(value))
             case "torch":
                 like = (
                     value if frameworks.is_torch(value) else next(filter(frameworks.is_torch, inputs.values.values()))
                 )
-                return frameworks.to_torch(arrays.numpy(gradient), like)
+                return frameworks.to_torch(arrays.numpy(gradient).reshape(frameworks.shape(value)), like)
             case "drjit":
                 if not arrays.is_drjit(value):
                     return gradient

@@ -115,8 +115,8 @@ def few_steps(seconds: float, steps: int, most: int | None = None) -> str:
     if steps >= min(_FEW_STEPS, most or _FEW_STEPS):
         return ""
     return (
-        f"the budget of {seconds:g} s allows about {steps} steps; use fewer pixels a step (--set pixels=4096), fewer samples "
-        "(--set spp=1), a smaller picture (resolution), or more seconds"
+        f"the budget of {seconds:g} s allows about {steps} step{'s' if steps > 1 else ''}; use more seconds, fewer samples "
+        "(--set spp=1), a smaller picture (resolution), or fewer pixels a step of a large one (--set pixels=4096)"
     )
 
 

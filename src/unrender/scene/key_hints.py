@@ -29,6 +29,14 @@ _PLACES = (
 )
 """Names that users may try for the parameters of a pose."""
 _POSE = ("translation", "rotation", "scale")
+_SLOTS = frozenset({"bsdf", "data", "value", ""})
+"""Parts of keys that do not name a quantity."""
+_EQUIVALENTS = (
+    {"alpha", "roughness"},
+    {"reflectance", "base_color", "diffuse_reflectance", "albedo", "color", "colour"},
+    {"radiance", "intensity", "irradiance", "emission"},
+)
+"""Names of one quantity in different plugins and packages."""
 
 
 def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
@@ -54,10 +62,20 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     # Mitsuba may name the owner after its shape, where a user expects the material: the rest of the key then decides.
     similar = [name for name in able if name.endswith("." + rest) and not _is_nameless(name)] if rest else []
     named = [name for name in able if not _is_nameless(name)]
-    if near := did_you_mean(key, similar, 0.0) or did_you_mean(key, named) or did_you_mean(key, known):
+    alike = _same_quantity(key, named)
+    if near := did_you_mean(key, similar or alike, 0.0) or did_you_mean(key, named) or did_you_mean(key, known):
         return near
     shown = named or able
     return f"; it has {', '.join(shown[:6])}{' and others' if len(shown) > 6 else ''}" if shown else ""
+
+
+def _same_quantity(key: str, names: list[str]) -> list[str]:
+    """Return the names that contain a quantity of the key or an equivalent of it, of the key's own object if there are some."""
+    owner, *parts = key.split(".")
+    wanted = set(parts) - _SLOTS
+    wanted = wanted.union(*(group for group in _EQUIVALENTS if group & wanted))
+    same = [name for name in names if wanted & set(name.split(".")[1:])]
+    return [name for name in same if name.partition(".")[0] == owner] or same
 
 
 def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
