@@ -205,7 +205,7 @@ def test_what_has_no_such_pictures_is_refused() -> None:
     foggy = scene(**FOG)
     with pytest.raises(InputError, match="view 0: aov: depth is a property of surfaces, and the scene has media"):
         ur.Problem(foggy, [ur.Parameter(FLOOR)], views)
-    with pytest.raises(InputError, match="aov: not supported beside the unknown exposure"):
+    with pytest.raises(InputError, match="aov: not supported together with the unknown exposure"):
         problem(views, (FLOOR, "exposure"))
     made = problem(views, ("camera.rotation.y",))
     with pytest.raises(InputError, match="path gradients of moving sensors do not support depth"):

@@ -303,7 +303,7 @@ def test_after_a_full_disk_the_controls_are_alive(problem, tmp_path, monkeypatch
     result = descend(problem, [steps, Live(tmp_path)], steps=12)
     assert (result.stopped, result.steps) == ("interrupted", 8)
     (warning,) = result.warnings
-    assert "the run goes on, but cannot be watched until there is room" in warning
+    assert "the run continues, but cannot be watched until there is room" in warning
     (seen,) = states
     assert (seen.state, seen.problems) == (RUNNING, ())
     assert seen.run.record.steps == len(seen.run.history) == 6  # as the step before left it

@@ -148,7 +148,7 @@ def test_a_full_disk_costs_checkpoints_and_not_the_run(tmp_path: Path, monkeypat
 
     result = start(folder, callbacks=[At(5, fill), At(9, empty)])
     assert [line for line in result.warnings if "checkpoint" in line] == [
-        f"run folder {folder}: checkpoint not written: No space left on device; the run goes on"
+        f"run folder {folder}: checkpoint not written: No space left on device; the run continues"
     ]
     assert len([line for line in result.warnings if "history" in line]) == 1
     assert steps_of(folder) == list(range(12))

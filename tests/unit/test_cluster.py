@@ -214,7 +214,7 @@ def test_a_death_costs_its_task_alone_which_is_begun_again_twice() -> None:
 def test_a_lost_node_ends_the_command_and_fails_no_task() -> None:
     executor = OnWorkers(Cluster(FakeRay({}), "llvm_ad_rgb", Share(4, 1.0, 0.0), None), str)
     executor.start(1, "alone")
-    with pytest.raises(InputError, match=r"Ray's node on this machine is lost; .*unrender sweep DIR goes on"):
+    with pytest.raises(InputError, match=r"Ray's node on this machine is lost; .*continue with unrender sweep DIR"):
         executor.wait(0.1)
 
 

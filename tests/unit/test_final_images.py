@@ -113,7 +113,7 @@ def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypa
     made = problem()
     values = {"wall": np.full(3, 0.4, np.float32)}
     result = Result(values, values, [{}], 30.0, 0.0, "steps")
-    line = "whether wall arrived: there was no time to test it; use more seconds or fewer pixels"
+    line = "whether wall converged: no time was left to test it; use more seconds or fewer pixels"
     if tested:
         assert line not in final_images.render_final_images(made, result).undetermined
         monkeypatch.setattr(final_images, "slowdown", lambda: 1e-9)

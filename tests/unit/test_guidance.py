@@ -143,7 +143,9 @@ def test_the_same_quantity_under_another_name_is_suggested(given: str, meant: st
 
 
 def test_an_option_of_other_methods_is_said_to_be_theirs() -> None:
-    with pytest.raises(InputError, match=r"method auto has no option differential_bsdf; .*; --method .*plain.* have it"):
+    with pytest.raises(
+        InputError, match=r"method auto has no option differential_bsdf; .*; --method .*plain.* have it"
+    ):
         method("auto").configure({"differential_bsdf": "true"})
 
 

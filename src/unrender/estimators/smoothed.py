@@ -79,7 +79,7 @@ class SmoothedDerivatives:
     noise. Perturbed parameters are projected onto their bounds before they are rendered.
 
     A parameter with a preconditioner S is perturbed by S ε instead of ε, scaled to σ in the root mean square, so neighbouring vertices
-    or texels move alike. Derivatives are then by v, where the parameter is S v, of the loss smoothed by that Gaussian of covariance S².
+    or texels move together. Derivatives are then with respect to v, where the parameter is S v; the smoothing Gaussian has covariance S².
     Use it for meshes and textures of thousands of elements: the noise of a gradient grows with the number of directions, which S
     reduces.
 

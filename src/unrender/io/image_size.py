@@ -317,7 +317,7 @@ def _check_chunks(file: IO[bytes]) -> None:
         at += 12 + length
         if at > size:
             raise InputError(
-                f"cannot be read as a picture: a chunk of {length} bytes goes on behind the end of the file"
+                f"cannot be read as a picture: a chunk of {length} bytes extends beyond the end of the file"
             )
         file.seek(at)
     raise InputError(f"cannot be read as a picture: more than {_MOST_CHUNKS} chunks")

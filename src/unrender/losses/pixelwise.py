@@ -62,7 +62,7 @@ class L2(_WithLinearDerivative):
 @register(position=3)
 @dataclass(frozen=True)
 class RelativeL2(_WithLinearDerivative):
-    """(I − R)² / (R² + ε), which weights dark and bright pixels alike.
+    """(I − R)² / (R² + ε): squared relative error, independent of a pixel's brightness.
 
     The denominator contains the reference only, not the noisy image, so the derivative is linear. The estimators sample the image and the
     adjoint independently. The gradient is then that of the unbiased mean relative squared error (Deng et al. 2022; Pidhorskyi et al.

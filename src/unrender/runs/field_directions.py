@@ -32,7 +32,7 @@ _RIDGE = 0.3
 
 
 def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """Return the keys of textures, grids and lists beside the numbers.
+    """Return the keys of unknown textures, grids and lists.
 
     Those without a sensitivity or with a prior, and meshes, count as fixed. There are none if their states would need too much memory.
     """
@@ -60,8 +60,8 @@ def beside_fields(
 ) -> tuple[Numbers, Differences] | None:
     """Return numbers with directions of textures and grids that trade off against them, and the differences along both.
 
-    The first directions change the pictures as the numbers and the residual do, as far as one adjoint tells. The next ones change them
-    as the remainder does. There are none if the time is over, or no texture or grid changes the pictures.
+    The first directions approximate, by one adjoint, the picture changes of the numbers and of the residual. The next ones
+    approximate the remainder. There are none if the time is over, or if no texture or grid changes the pictures.
 
     Args:
         numbers: the numbers alone.

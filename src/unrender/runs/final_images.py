@@ -184,7 +184,7 @@ def _unchecked(keys: Sequence[str]) -> list[str]:
     """Return a line about numbers that there was no time to test."""
     if not keys:
         return []
-    return [f"whether {listed(keys)} arrived: there was no time to test it; use more seconds or fewer pixels"]
+    return [f"whether {listed(keys)} converged: no time was left to test it; use more seconds or fewer pixels"]
 
 
 def _chosen(problem: Problem) -> list[int]:

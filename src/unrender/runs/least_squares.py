@@ -177,7 +177,7 @@ def _directions(differences: Differences, limits: np.ndarray, change: float) -> 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Least squares of n numbers beside k factors.
+    """Joint least-squares fit of n numbers and k directions of textures and grids.
 
     Attributes:
         covariance: covariance from the references' noise, as the residual after the step shows it, (n + k, n + k).

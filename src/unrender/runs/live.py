@@ -241,9 +241,9 @@ class Live(Callback):
         self._disabled = self._live.is_symlink() or not (self._live.is_dir() or to_be_made)
         self._next_update = time.monotonic() + _RETRY_SECONDS
         if self._disabled:
-            line = f"the run goes on, but can no longer be watched: {reason}"
+            line = f"the run continues, but can no longer be watched: {reason}"
         else:
-            line = f"the run goes on, but cannot be watched until there is room: {reason}"
+            line = f"the run continues, but cannot be watched until there is room: {reason}"
         if (topic := f"{self._disabled} {reason[-40:]}") not in self._warned:
             self._warned.add(topic)
             run.warnings.append(line)

@@ -209,9 +209,7 @@ class Verify(Callback):
             if problem.has_truth and shared.mean_square <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
                 return []
         noise = math.sqrt(max(float((weights[:, None] * residual**2).sum()) / total - shared.mean_square, 0.0))
-        cause = (
-            "light, depth or something else that is not among the unknowns may be wrong, or another start leads further"
-        )
+        cause = "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
         if any(unknown.prior is not None for unknown in problem.unknowns.values()):
             cause = f"a prior may be too strong, or {cause}"
         times = f", {error / noise:.1f} times its noise" if noise > 0 else ""

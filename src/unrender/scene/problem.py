@@ -333,7 +333,7 @@ def _opened(
     for index, view in enumerate(views):
         if view.aov is not None and (beside := next((key for key in keys if key in OF_PHOTOGRAPHS), None)):
             raise FieldError(
-                ("views", index, "aov"), f"not supported beside the unknown {beside}; leave out one of them"
+                ("views", index, "aov"), f"not supported together with the unknown {beside}; leave out one of them"
             )
     try:
         return with_photographs(renderer, keys, sensors), located

@@ -51,7 +51,8 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     sensors = sensors_with_rows(problem.renderer)
     if sensors is not None and any(view.own_world for view in problem.given_views):
         raise InputError(
-            f"workers: {problem.name} has parameters of photographs beside views of different worlds; leave --workers out"
+            f"workers: {problem.name} has camera parameters of photographs and views of different scenes, which workers do not "
+            "support together; leave --workers out"
         )
     parts = _Parts(
         _scene(problem),

@@ -23,7 +23,7 @@ def sampler(traits: Traits) -> tuple[PixelSampler, str]:
     few = count <= constants.most_pixels
     if traits.meshes and problem.loss.pixelwise and views >= constants.many_views and few:
         batch = min(-(-views // 2), constants.most_views)
-        return pixels.Views(batch), f"{batch} of {views} views a step: moving borders cost each view alike"
+        return pixels.Views(batch), f"{batch} of {views} views a step: each view's boundary gradients cost the same"
     if few or not problem.loss.pixelwise:
         return pixels.All(), ""
     return pixels.Uniform(constants.batch_pixels), f"{constants.batch_pixels} of all {count} pixels a step"

@@ -311,7 +311,7 @@ class RunWriter(Callback):
             write()
         except (OSError, InputError, TypeError) as error:
             reason = (error.strerror if isinstance(error, OSError) else "") or str(error)
-            line = f"run folder {self.folder}: {what} not written: {reason}; the run goes on"
+            line = f"run folder {self.folder}: {what} not written: {reason}; the run continues"
             self._warn_once(line, f"{what} {reason[-60:]}")
 
     def _warn_once(self, line: str, topic: str = "") -> None:

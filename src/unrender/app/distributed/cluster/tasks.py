@@ -159,8 +159,8 @@ class OnWorkers:
             return Ended(task.key, None, _reason(error.cause or error), task.attempts)
         except errors.LocalRayletDiedError as error:  # nothing can be begun any more
             raise InputError(
-                "workers: Ray's node on this machine is lost; start the command again: what had ended is kept, and "
-                "unrender sweep DIR goes on"
+                "workers: Ray's node on this machine is lost; finished trials are kept: start the command again, or "
+                "continue with unrender sweep DIR"
             ) from error
         except errors.RayError as error:
             if task.attempts < _ATTEMPTS:
