@@ -16,7 +16,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from statistics import geometric_mean
 from typing import Any
@@ -26,12 +25,12 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.fixed_point import applies, fixed_point
-from benchmarks.internals import dr, hardly_seen, method
+from benchmarks.internals import dr, hardly_seen
 from benchmarks.races import Recorder, total_error
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
 from benchmarks.stock_loop import stock_loop
-from benchmarks.suite import scenes
+from benchmarks.suite import ablation, scenes
 
 GALLERY = (
     "indirect-room", "glossy-room", "sunlit-vase", "lamp", "spiral", "ajar", "chalice", "mirror-trio", "sun-glossy",
@@ -81,10 +80,9 @@ def error_of(problem: ur.Problem) -> Callable[[dict[str, Any]], float]:
 def ours(
     problem: ur.Problem, error: Callable[[dict[str, Any]], float], seconds: float, seed: int, option: str = ""
 ) -> tuple[Points, dict[str, Any]]:
-    """A run with no option given, or one of `auto`'s, as "spp=2"; its curve, and how many steps and seconds of compilation it took."""
+    """Run `auto`, with an option or without a part (`ablation.plan`); return its curve, its steps and its seconds of compilation."""
     curve = Recorder(lambda values: {"": error(values)}, {"": 1.0}, 1 / 100)
-    plan = method("auto").plan(problem, dict([option.split("=")]) if option else {})
-    result = ur.optimize(problem, plan, seconds=seconds, seed=seed, callbacks=[curve])
+    result = ur.optimize(problem, ablation.plan(problem, option), seconds=seconds, seed=seed, callbacks=[curve])
     points = [(at, found) for at, _, found in curve.points[""][1:]]
     return points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
 
@@ -135,10 +133,9 @@ def tune_ours(
     What `auto` chooses by itself is not tried again. Figures are of the median over `seeds` runs: the least of several single runs is
     that of the luckiest, where a problem has few numbers.
     """
-    tried, own = [], method("auto").plan(problem)
+    tried = []
     for option in ("", *options):
-        chosen = method("auto").plan(problem, dict([option.split("=")])) if option else None
-        if chosen and replace(chosen, reasons=()) == replace(own, reasons=()):
+        if option and not ablation.changes(problem, option):
             continue
         runs = [ours(problem, error, seconds, TUNING_SEED + seed, option)[0] for seed in range(seeds)]
         curve = middle(runs, seconds)
@@ -181,6 +178,10 @@ def compare(theirs: list[Points], found: list[Points], seconds: float) -> dict[s
     }
 
 
+def _ours_of(compared: dict[str, Any]) -> dict[str, Any]:
+    return {key: compared[key] for key in ("auto", "seconds_of_auto", "speed")}
+
+
 def _reached(curve: np.ndarray, error: float, seconds: float) -> float | None:
     """The first time at which a curve of `middle` is at an error."""
     reached = np.nonzero(curve <= error)[0]
@@ -204,6 +205,7 @@ def run(
     option: tuple[str, ...] = (),
     option_seeds: int = 1,
     retune: bool = True,
+    without: tuple[str, ...] = (),
 ) -> Iterator[dict[str, Any]]:
     """Every problem.
 
@@ -224,7 +226,10 @@ def run(
         option: of `auto`, as "spp=2 learning_rate=0.3", each a setting to tune it by as well; none for not to tune it
         option_seeds: runs of each of these settings, of which the median counts
         retune: the loop; else its settings are those of the record
+        without: parts of `auto` to leave out, one at a time: control-variate, sobolev, schedule-free, leave-one-out, damping
     """
+    if unknown := set(without) - set(ablation.PARTS):
+        raise ur.InputError(f"--without {', '.join(unknown)}: expected {', '.join(ablation.PARTS)}")
     record = None if retune else records.read(Path(__file__).parent)
     known = record["problems"] if record else {}
     made: dict[str, Callable[[], ur.Problem]] = {}
@@ -256,12 +261,14 @@ def run(
         if option:
             best, ways = tune_ours(opened, error, seconds, option, middle(theirs, seconds), option_seeds)
             runs = mine if not best else [ours(opened, error, seconds, seed, best)[0] for seed in range(seeds)]
-            compared = compare(theirs, runs, seconds)
-            entry["tuned"] = {
-                "option": best,
-                "tried": ways,
-                **{key: compared[key] for key in ("auto", "seconds_of_auto", "speed")},
-            }
+            entry["tuned"] = {"option": best, "tried": ways, **_ours_of(compare(theirs, runs, seconds))}
+        if without:
+            entry["without"] = {}
+        for part in without:
+            changed = ablation.changes(opened, part)
+            runs = [ours(opened, error, seconds, seed, part)[0] for seed in range(seeds)] if changed else mine
+            entry["without"][part] = {"changed": changed, **_ours_of(compare(theirs, runs, seconds))}
+            print(f"{name} without {part}: speed {entry['without'][part]['speed']}", flush=True)
         if applies(opened):
             hands = [fixed_point(opened, FIXED_POINT_SPP, seconds, seed, error) for seed in range(seeds)]
             entry["fixed_point"] = tenths(middle(hands, seconds))
@@ -348,6 +355,7 @@ def table(record: Record) -> str:
         f"Geometric mean over the {len(problems)} problems: **{mean:.2f}** times as fast, where `auto` never gets "
         f"there as if it did at the end. Lower final error on {sum(e['auto'][-1] < e['loop'][-1] for e in entries)}."
         + _of_tuning(entries, settings["seconds"]),
+        *filter(None, [ablation.table(entries, lambda speeds: _mean(speeds, entries, settings["seconds"]))]),
     )
 
 

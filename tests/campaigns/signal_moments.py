@@ -38,6 +38,8 @@ _DISTRIBUTED = [
     "--out",
     "run",
 ]
+_LONGEST = 90.0
+"""Seconds after which a process counts as left over: Ray's workers need some to notice that their node has ended."""
 
 
 class _Export:
@@ -110,7 +112,7 @@ def campaign(
 def _interrupt(
     process: subprocess.Popen[str], number: signal.Signals, case: Any, place: Path, expected: Any
 ) -> dict[str, Any]:
-    below = sorted(set(processes_below(process.pid)) - {process.pid})
+    below = {pid: words for pid, words in processes_below(process.pid).items() if pid != process.pid}
     wrong, waited = "", 0.0
     try:
         waited = ended(process, number)
@@ -127,9 +129,9 @@ def _must(*words: str) -> None:
         raise RuntimeError(f"{words}: exit status {done.returncode}: {done.stderr}")
 
 
-def _left(folder: Path, below: list[int]) -> str:
-    """Return files and processes that remain."""
-    until = time.monotonic() + 30
-    while (alive := [pid for pid in below if is_running(pid)]) and time.monotonic() < until:
+def _left(folder: Path, below: dict[int, str]) -> str:
+    """Return files that remain, and processes that remain for longer than `_LONGEST` seconds."""
+    until = time.monotonic() + _LONGEST
+    while (alive := [words for pid, words in below.items() if is_running(pid)]) and time.monotonic() < until:
         time.sleep(0.2)
     return f"left over: {leftovers(folder)} {alive}" if alive or leftovers(folder) else ""

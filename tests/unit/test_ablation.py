@@ -1,0 +1,44 @@
+"""The suite without one of the parts of `auto`."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.suite import ablation, run
+from tests.unit.test_auto import problem
+from unrender import InputError, losses, optimizers
+from unrender.images import Plain
+
+
+def test_each_part_is_left_out_alone() -> None:
+    made = problem(losses.L1())
+    own = ablation.plan(made)
+    plans = {part: ablation.plan(made, part) for part in ablation.PARTS}
+    assert all(ablation.changes(made, part) for part in plans)
+    assert isinstance(plans["control-variate"].estimator.image, Plain)
+    assert not plans["sobolev"].optimizer.preconditioned
+    assert plans["schedule-free"].optimizer == optimizers.Adam(own.optimizer.learning_rate)
+    assert plans["schedule-free"].estimator == own.estimator
+    assert (plans["leave-one-out"].estimator.adjoint_spp, own.estimator.adjoint_spp) == (own.estimator.spp, None)
+    assert plans["leave-one-out"].optimizer == own.optimizer
+    assert plans["damping"].estimator.tolerance == 0.0 < own.estimator.tolerance
+    assert ablation.plan(made, "spp=3").estimator.spp == 3
+    assert not ablation.changes(problem(losses.L2()), "damping")  # only losses that noise biases have it
+    for plan in plans.values():
+        result = run.ur.optimize(made, plan, steps=2)
+        assert result.steps == 2
+
+
+def test_the_table_has_the_geometric_mean_without_each_part() -> None:
+    entries = [
+        {"speed": 2.0, "seconds_of_loop": 4.0, "without": {"sobolev": {"speed": 1.0, "changed": True}}},
+        {"speed": 8.0, "seconds_of_loop": 2.0, "without": {"sobolev": {"speed": None, "changed": False}}},
+    ]
+    rows = ablation.table(entries, lambda speeds: run._mean(speeds, entries, 4.0)).splitlines()
+    assert rows[2:] == ["|  | 4.00 | 1 |  |", "| sobolev | 0.71 | 0.18 | 1 |"]  # sqrt(1 * 2 / 4)
+    assert ablation.table([*entries, {"speed": 1.0, "seconds_of_loop": 4.0}], lambda _: 1.0) == ""
+
+
+def test_an_unknown_part_is_refused_before_any_run() -> None:
+    with pytest.raises(InputError, match="--without caches: expected control-variate, sobolev"):
+        next(run.run(without=("caches",)))
