@@ -33,7 +33,7 @@ class Recorder(ur.protocols.Callback):
         """Keep a step."""
         self.image = np.asarray(run.estimate.info["images"][0])
         error = run.problem.parameter_error(run.parameters)[KEY]
-        self.curve.append((self.curve[-1][0] + record["samples"], error))
+        self.curve.append((record["samples"], error))
         if self.curve[-1][0] >= PATHS:
             run.stop()
 
@@ -42,7 +42,7 @@ def main() -> None:
     """Run both loops and write the picture."""
     ur.use()
     problem = ur.gallery.problem("indirect-room", resolution=96, texture_resolution=64, reference_spp=1024)
-    figure = plt.figure(figsize=(11, 4.6), layout="constrained")
+    figure = plt.figure(figsize=(11, 4.1), layout="constrained")
     axes = figure.subplot_mosaic([["reference", "stock", "auto", "curve"], ["truth", "stock texture", "auto texture", "curve"]],
                                  width_ratios=[1, 1, 1, 1.3])  # fmt: skip
     _show(axes["reference"], problem.given_views[0].reference, "reference")
@@ -62,7 +62,7 @@ def main() -> None:
     axes["curve"].grid(visible=True, which="both", alpha=0.3)
     axes["curve"].legend()
     drawn = io.BytesIO()
-    figure.savefig(drawn, dpi=110)
+    figure.savefig(drawn, dpi=120)
     Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(
         ROOT / "docs" / "images" / "demo.png", optimize=True
     )

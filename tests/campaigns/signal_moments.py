@@ -17,7 +17,7 @@ from tests.campaigns.cluster_machines import processes_below
 from tests.campaigns.cuts import final_state, leftovers
 from tests.campaigns.kills import digest
 from tests.campaigns.sweep_kills import is_running
-from tests.cli.test_signals_anywhere import await_package, ended, start
+from tests.cli.test_signals_anywhere import ENVIRONMENT, await_package, ended, start
 from unrender.runs.folder.schema import ENDED
 
 __all__ = ["COMMANDS", "campaign"]
@@ -124,7 +124,8 @@ def _interrupt(
 
 
 def _must(*words: str) -> None:
-    done = subprocess.run([sys.executable, "-m", "unrender", *words], capture_output=True, text=True, timeout=600)
+    command = [sys.executable, "-m", "unrender", *words]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=600)
     if done.returncode:
         raise RuntimeError(f"{words}: exit status {done.returncode}: {done.stderr}")
 

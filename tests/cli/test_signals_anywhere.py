@@ -40,12 +40,16 @@ COMMAND = "import sys; sys.argv[0] = 'unrender'; import unrender; print('loading
 COMMAND += "from unrender.app.cli.main import main; sys.exit(main())"
 """As the command's script, and it tells when the package is there: until then, what happens is Python's own affair."""
 
+ENVIRONMENT = {**os.environ, "RAY_worker_niceness": "0"}
+"""Ray's own niceness would starve its workers on a busy machine."""
+
 
 def start(folder: Path, *words: str) -> subprocess.Popen[str]:
     folder.mkdir()
     line = [sys.executable, "-c", COMMAND, *words]
-    own = {**os.environ, "RAY_worker_niceness": "0"}  # Ray's own would starve them on a busy machine
-    return subprocess.Popen(line, cwd=folder, env=own, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        line, cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def ended(process: subprocess.Popen[str], number: signal.Signals) -> float:

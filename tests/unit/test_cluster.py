@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickletools
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -273,3 +274,17 @@ def test_tasks_are_data_and_functions_go_by_name() -> None:
     assert {"on_worker", "Job", "RunTask"} <= set(words)
     by_value = cloudpickle.dumps(lambda: run)
     assert b"cloudpickle" in by_value, "a function that goes by value is told apart"
+
+
+def test_signals_are_handled_after_ray_has_shut_down() -> None:
+    """Its compiled code sets the default action of SIGTERM, which Python does not notice: the command would end without a line."""
+    code = textwrap.dedent("""
+        import ctypes, os, signal, types
+        from unrender.app.distributed.cluster import connection
+        signal.signal(signal.SIGTERM, lambda *_: print("handled", flush=True))
+        shutdown = lambda: ctypes.CDLL(None).signal(signal.SIGTERM, None)
+        connection._leave(types.SimpleNamespace(shutdown=shutdown))
+        os.kill(os.getpid(), signal.SIGTERM)
+    """)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "handled\n", "")

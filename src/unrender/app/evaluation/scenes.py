@@ -32,7 +32,9 @@ def find(run: Path, problem: Problem) -> Path:
     candidate = None if origin is None else Path(origin).parent / HELD_OUT
     if candidate is None or not candidate.is_file():
         where = "" if candidate is None else f", and there is none at {candidate}"
-        raise InputError(f"{run}: give --held-out FILE, a problem file with other views{where}")
+        raise InputError(
+            f"{run}: give --held-out FILE, a problem file with other views{where} (unrender import --hold-out N makes one)"
+        )
     return candidate
 
 

@@ -232,13 +232,13 @@ def _check_answers(address: str) -> None:
 
 
 def _leave(ray: Any) -> None:
-    with contextlib.suppress(UnrenderError, Exception):
+    with _own_signals(), contextlib.suppress(UnrenderError, Exception):
         ray.shutdown()
 
 
 @contextlib.contextmanager
 def _own_signals() -> Iterator[None]:
-    """Restore the signal handlers afterwards, since Ray installs its own for SIGTERM."""
+    """Restore the signal handlers afterwards: Ray installs its own for SIGTERM, and its shutdown sets the system's default action."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
