@@ -20,6 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 KEY = "back.bsdf.reflectance.data"
 PATHS = 4_000_000
 LOOPS: dict[str, dict[str, Any]] = {"stock": {"spp": 16, "learning_rate": 0.05}, "auto": {}}
+"""Settings of each loop. Errors of the tutorial loop at this budget: 0.103 with these, 0.148 with 8 samples, 0.46 with 4, 0.41 with 4 and
+the rate 0.02, 0.75 with 1."""
 TITLES = {"stock": "tutorial loop", "auto": "unrender, auto"}
 
 

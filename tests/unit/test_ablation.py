@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from benchmarks.suite import ablation, run
@@ -12,8 +14,8 @@ from unrender.images import Plain
 
 def test_each_part_is_left_out_alone() -> None:
     made = problem(losses.L1())
-    own = ablation.plan(made)
-    plans = {part: ablation.plan(made, part) for part in ablation.PARTS}
+    own: Any = ablation.plan(made)
+    plans: dict[str, Any] = {part: ablation.plan(made, part) for part in ablation.PARTS}
     assert all(ablation.changes(made, part) for part in plans)
     assert isinstance(plans["control-variate"].estimator.image, Plain)
     assert not plans["sobolev"].optimizer.preconditioned
@@ -22,7 +24,8 @@ def test_each_part_is_left_out_alone() -> None:
     assert (plans["leave-one-out"].estimator.adjoint_spp, own.estimator.adjoint_spp) == (own.estimator.spp, None)
     assert plans["leave-one-out"].optimizer == own.optimizer
     assert plans["damping"].estimator.tolerance == 0.0 < own.estimator.tolerance
-    assert ablation.plan(made, "spp=3").estimator.spp == 3
+    tuned: Any = ablation.plan(made, "spp=3")
+    assert tuned.estimator.spp == 3
     assert not ablation.changes(problem(losses.L2()), "damping")  # only losses that noise biases have it
     for plan in plans.values():
         result = run.ur.optimize(made, plan, steps=2)
