@@ -26,6 +26,8 @@ COMMAND = re.compile(r"^- (.*?): (`python -m benchmarks ([\w.]+).*`)$", re.MULTI
 """A figure, and a command that made it."""
 LONGEST_CELL = 120
 """Characters of a cell of a figure or a goal."""
+MOST_SHORT = 16
+"""Figures that may be short."""
 TABLE_2 = ("QUAD", "BOX2", "BOX10", "MUG", "SHADOW", "BUNNY", "TEXTURE", "CNN", "CNN5")
 PAPERS: dict[str, tuple[int, list[str]]] = {
     "Recursive control variates": (
@@ -264,6 +266,11 @@ CHECKS = (left_out, wrong_names, unknown_benchmarks, wrong_verdicts, wrong_numbe
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 def test_the_page_is_true(check: Any) -> None:
     assert not list(check(PAGE))
+
+
+def test_few_figures_are_short() -> None:
+    """A figure that falls short of the paper's again must be seen."""
+    assert sum(row[4].startswith("short because") for _, row in figures_of(PAGE)) <= MOST_SHORT
 
 
 def test_the_commands_of_figures_are_those_of_their_benchmarks() -> None:

@@ -15,8 +15,6 @@ torch: Any = importlib.import_module("torch")
 nn = torch.nn
 
 RESOLUTION = 64
-PARAMETERS = {1: 267_745, 5: 268_773}
-"""Of the paper, by the number of outputs."""
 
 
 class PoseNetwork(nn.Module):

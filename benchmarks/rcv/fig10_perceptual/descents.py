@@ -19,7 +19,6 @@ ADJOINT_SPP = 4
 RATES = (0.03, 0.06, 0.12)
 FLOOR = 0.02
 """Of the falling rate, at the end."""
-"""Of a run that are kept."""
 
 
 @dataclass(frozen=True)
