@@ -23,6 +23,13 @@ FLOORS = (
 """From low to high: a floor imports itself and what is below it. The library comes first, the application last."""
 
 LONGEST_FILE, LONGEST_FUNCTION = 400, 60
+SHORTEST_HELPER = 60
+"""Lines of a module that one other alone imports, unless it has a registered component."""
+APART = {
+    "app.capture.formats.llff": "a format of captures like its neighbours",
+    "app.cli.app": "imports all commands, and the entry point must work where they cannot be imported",
+}
+"""Shorter modules, and why they are modules of their own."""
 
 
 @cache
@@ -129,3 +136,28 @@ def test_files_and_functions_stay_small(module: str) -> None:
     functions = [x for x in ast.walk(parsed(text)) if isinstance(x, (ast.FunctionDef, ast.AsyncFunctionDef))]
     long = {x.name: x.end_lineno - x.lineno + 1 for x in functions if x.end_lineno is not None}
     assert {name: lines for name, lines in long.items() if lines > LONGEST_FUNCTION} == {}
+
+
+def slivers(sources: dict[str, str]) -> set[str]:
+    """Short modules that one other module alone imports, without a registered component."""
+    known = {name: Path(name) for name in sources}
+    importers: dict[str, set[str]] = {name: set() for name in sources}
+    for name, text in sources.items():
+        for target, _, _ in imports(parsed(text), known):
+            importers.get(target, set()).add(name)
+    short = {name for name, text in sources.items() if len(text.splitlines()) < SHORTEST_HELPER}
+    return {name for name in short if len(importers[name] - {name}) == 1 and "\n@register" not in sources[name]}
+
+
+def test_short_modules_have_more_than_one_user() -> None:
+    known = modules()
+    assert (
+        slivers({name: path.read_text() for name, path in known.items() if path.stem != "__init__"}) - {*APART} == set()
+    )
+
+
+def test_a_sliver_is_found() -> None:
+    user = "from unrender.core import tiny\n" + "x = 1\n" * SHORTEST_HELPER
+    assert slivers({"core.tiny": "y = 2\n", "core.user": user}) == {"core.tiny"}
+    assert slivers({"core.tiny": "y = 2\n", "core.user": user, "core.other": user}) == set()
+    assert slivers({"core.tiny": "\n@register\nclass Y: ...\n", "core.user": user}) == set()

@@ -38,7 +38,7 @@ from unrender.estimators.smoothing.options import SamplingOptions
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 from unrender.schedules.functions import Schedule
-from unrender.statistics import diagonal_curvature
+from unrender.statistics import hessian_updates
 
 _MAX_STORED = 4096
 """Maximum number of parameters for which a Hessian is stored between steps."""
@@ -120,7 +120,7 @@ class SmoothedDerivatives:
             biases products, not the gradient.
         hessian_form: "full", or "diagonal": with `hessian_rate`, only the diagonal is stored, (n,), for many weakly coupled parameters.
             Each sample determines one sum of its elements: zᵀ B z if joint, zᵀ B v otherwise. A step moves the diagonal by ω towards
-            the nearest one that satisfies all sums; the first is a multiple of the identity (`statistics/diagonal_curvature.py`).
+            the nearest one that satisfies all sums; the first is a multiple of the identity (`statistics/hessian_updates.py`).
             Products use this diagonal with elements of at least 0.15 times their mean magnitude, so that it is positive definite.
         orthogonal: see `smoothed.gradient`: with `aggregate` or `joint`, sample orthogonal directions. Use it for many parameters and
             samples: 2 n of them (4 n for products that are not joint) determine the full gradient of a linear loss.
@@ -222,7 +222,7 @@ class SmoothedDerivatives:
             gradient, error, hessian = self._stored_hessian(record_losses, *point, seed, hessian, self.hessian_rate)
             width = point[1]
             if self.hessian_form == "diagonal":
-                used, multiply = diagonal_curvature.positive(hessian), np.multiply
+                used, multiply = hessian_updates.positive(hessian), np.multiply
             else:
                 used, multiply = hessian, np.matmul
             curvature = self._curvature(lambda: used, lambda v: multiply(used, v / width) / width, parameters)
@@ -278,7 +278,7 @@ class SmoothedDerivatives:
             derivatives = smoothed.joint(f, theta, sigma, self.samples, seed, self.low_discrepancy, self.orthogonal)
             if self.hessian_form == "diagonal":
                 rows, values = derivatives.draws * derivatives.draws, derivatives.curvatures
-                return *derivatives.gradient(), diagonal_curvature.updated(stored, rows, values, rate)
+                return *derivatives.gradient(), hessian_updates.updated(stored, rows, values, rate)
             hessian = derivatives.hessian()[0] * np.outer(sigma, sigma)
             return *derivatives.gradient(), hessian if stored is None else stored + rate * (hessian - stored)
         v = np.random.default_rng([seed, _DIRECTIONS]).standard_normal(theta.size)
@@ -286,12 +286,10 @@ class SmoothedDerivatives:
         both = estimate_gradient_and_product(f, theta, sigma * v, sigma, self._options(seed))
         gradient, error, product = both.gradient, both.error, sigma * both.product
         if self.hessian_form == "diagonal":
-            return gradient, error, diagonal_curvature.updated(stored, both.draws * v, both.changes, rate)
+            return gradient, error, hessian_updates.updated(stored, both.draws * v, both.changes, rate)
         if stored is None:
             stored, rate = float(v @ product) * np.eye(theta.size), 1.0
-        missing = product - stored @ v
-        update = np.outer(missing, v) + np.outer(v, missing) - float(v @ missing) * np.outer(v, v)
-        return gradient, error, stored + rate * update
+        return gradient, error, hessian_updates.symmetric(stored, v, product, rate)
 
     def _options(self, seed: int) -> SamplingOptions:
         return SamplingOptions(

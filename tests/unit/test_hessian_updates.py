@@ -1,11 +1,11 @@
-"""The diagonal of a Hessian from curvatures along directions."""
+"""A Hessian, and its diagonal, from curvatures along directions."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from unrender.statistics.diagonal_curvature import LEAST, corrected, isotropic, positive
+from unrender.statistics.hessian_updates import LEAST, corrected, isotropic, positive, symmetric
 
 N = 40
 TRUTH = np.random.default_rng(1).uniform(0.2, 2.0, N)
@@ -70,3 +70,18 @@ def test_what_is_used_is_positive() -> None:
     used = positive(np.array([1.0, 3.0, -1.0, 0.0]))
     np.testing.assert_allclose(used, [1.0, 3.0, LEAST * 1.25, LEAST * 1.25])
     np.testing.assert_array_equal(positive(TRUTH[TRUTH > 0.5]), TRUTH[TRUTH > 0.5])
+
+
+def test_products_along_directions_determine_a_symmetric_matrix() -> None:
+    rng = np.random.default_rng(4)
+    half = rng.standard_normal((6, 6))
+    truth, matrix = half + half.T, np.zeros((6, 6))
+    for step in range(400):
+        v = rng.standard_normal(6)
+        v /= np.linalg.norm(v)
+        matrix = symmetric(matrix, v, truth @ v, rate=1.0)
+        if step == 0:
+            np.testing.assert_allclose(matrix @ v, truth @ v, atol=1e-12)
+        np.testing.assert_allclose(matrix, matrix.T, atol=1e-12)
+    np.testing.assert_allclose(matrix, truth, atol=1e-6)
+    np.testing.assert_allclose(symmetric(matrix, v, np.zeros(6), rate=0.0), matrix)

@@ -1,4 +1,7 @@
-"""Estimate of a Hessian's diagonal from curvatures along random directions.
+"""Estimates of a Hessian, or of its diagonal, from curvatures along random directions.
+
+A full matrix B moves towards the nearest symmetric matrix with B v = h, where h is the product of the Hessian with a direction v: Powell's
+symmetric Broyden update; Gower and Richtárik 2017 on random directions.
 
 For a diagonal H, zᵀ H v = Σᵢ zᵢ vᵢ Hᵢᵢ is linear in the diagonal, so each pair of directions gives one equation. A step moves the
 diagonal by a fraction ω of the smallest change, in the Euclidean norm, that satisfies all its equations. With one equation and v = z this
@@ -14,6 +17,16 @@ LEAST = 0.15
 """Smallest usable element of a diagonal, relative to the mean magnitude of its elements."""
 RIDGE = 0.01
 """Regularisation of the equations, relative to their mean squared row length. It damps equations that nearly repeat others."""
+
+
+def symmetric(matrix: np.ndarray, v: np.ndarray, product: np.ndarray, rate: float) -> np.ndarray:
+    """Return the symmetric B (n, n) moved by the fraction `rate` in (0, 1] toward the nearest symmetric matrix with B v = `product`.
+
+    v is a unit vector (n,).
+    """
+    missing = product - matrix @ v
+    update = np.outer(missing, v) + np.outer(v, missing) - float(v @ missing) * np.outer(v, v)
+    return matrix + rate * update
 
 
 def isotropic(rows: np.ndarray, values: np.ndarray) -> float:
