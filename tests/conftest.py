@@ -64,6 +64,15 @@ def mitsuba_variant() -> str:
     return name
 
 
+@pytest.fixture(scope="module")
+def spectral_variant(mitsuba_variant: str) -> Iterator[str]:
+    """The spectral variant of the same device, for all tests of a module."""
+    gc.collect()
+    yield variant.use(mitsuba_variant.replace("rgb", "spectral"))
+    gc.collect()
+    variant.use(mitsuba_variant)
+
+
 @pytest.fixture
 def one_thread(mitsuba_variant: str, threads_as_before: None) -> None:
     """Threads add up gradients in whatever order they come (with three or more, seen often): bits repeat with one."""

@@ -23,8 +23,9 @@ from unrender.core.text import did_you_mean, reason_of
 
 CUDA = "cuda_ad_rgb"
 LLVM = "llvm_ad_rgb"
-VARIANTS = (CUDA, LLVM)
-"""Supported variants: RGB, differentiable, unpolarised."""
+VARIANTS = (CUDA, LLVM, "cuda_ad_spectral", "llvm_ad_spectral")
+"""Supported variants: RGB or spectral, differentiable, unpolarised."""
+_EXPECTED = f"expected 'auto', {', '.join(map(repr, VARIANTS[:-1]))} or {VARIANTS[-1]!r}"
 
 _INITIALISATION = 0.5
 """Maximum time in seconds that Dr.Jit takes to reject a library."""
@@ -91,8 +92,8 @@ def use(variant: str = "auto") -> str:
     A later call may select another variant. Existing scenes and arrays stay with the old variant and cannot be mixed with new ones.
 
     Args:
-        variant: "cuda_ad_rgb", "llvm_ad_rgb" or "auto", which is CUDA if a GPU works and LLVM otherwise. A GPU is tested once per
-            process, in a separate process. The test takes a few seconds, and only runs if a driver is installed.
+        variant: one of `VARIANTS`, or "auto", which is "cuda_ad_rgb" if a GPU works and "llvm_ad_rgb" otherwise. A GPU is tested once
+            per process, in a separate process. The test takes a few seconds, and only runs if a driver is installed.
 
     Returns:
         The selected variant.
@@ -102,15 +103,15 @@ def use(variant: str = "auto") -> str:
             that it would abort the process. The message contains the command that installs what is missing.
     """
     if variant not in ("auto", *VARIANTS):
-        raise VariantError(f"{_unsupported(variant)}expected 'auto', {CUDA!r} or {LLVM!r}")
+        raise VariantError(f"{_unsupported(variant)}{_EXPECTED}")
     mi = _mitsuba()
     chosen = variant
     if variant == "auto":
         chosen = CUDA if gpu_problem() is None else LLVM
-    if chosen == LLVM:
+    if not is_on_gpu(chosen):
         _check_llvm()
-    elif mi.variant() != CUDA and (problem := gpu_problem()):
-        raise VariantError(f"{CUDA} cannot run here: {problem}; {LLVM!r} runs on the CPU")
+    elif not is_on_gpu(mi.variant()) and (problem := gpu_problem()):
+        raise VariantError(f"{chosen} cannot run here: {problem}; {on_cpu(chosen)!r} runs on the CPU")
     with _setting:
         if mi.variant() != chosen:
             try:
@@ -121,12 +122,22 @@ def use(variant: str = "auto") -> str:
     return chosen
 
 
+def is_on_gpu(variant: str | None) -> bool:
+    """Return whether a variant runs on a GPU. False for None."""
+    return variant is not None and variant.startswith("cuda")
+
+
+def on_cpu(variant: str) -> str:
+    """Return the variant for the CPU that renders the same colours."""
+    return variant.replace("cuda", "llvm", 1)
+
+
 def _unsupported(variant: str) -> str:
     """Return what a variant lacks, for a message."""
     parts = variant.split("_")
     if parts[0] not in ("scalar", "llvm", "cuda", "metal"):
         return f"unknown variant {variant!r}{did_you_mean(variant, VARIANTS, likeness=0.3)}: "
-    what = {"spectral": "spectral rendering", "polarized": "polarised rendering", "mono": "monochromatic rendering"}
+    what = {"polarized": "polarised rendering", "mono": "monochromatic rendering"}
     lacks = [name for part, name in what.items() if part in parts] or [f"variants of {parts[0]!r}"]
     return f"{variant!r} is not supported, since unrender has no {' and no '.join(lacks)}: "
 
@@ -205,9 +216,7 @@ def ensure() -> str:
     if name is None:
         return use()
     if name not in VARIANTS:
-        raise VariantError(
-            f"Mitsuba's variant: {_unsupported(name)}expected {CUDA!r} or {LLVM!r}; call unrender.use() instead"
-        )
+        raise VariantError(f"Mitsuba's variant: {_unsupported(name)}{_EXPECTED}; call unrender.use() instead")
     return use(name)
 
 

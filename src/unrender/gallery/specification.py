@@ -28,6 +28,7 @@ from unrender.core.random import Key
 from unrender.io import bounded_files, files
 from unrender.losses import Loss
 from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba.film_response import FilmResponse, response_table
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.pixel_filter import PixelFilters, is_box
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -219,9 +220,9 @@ def _render(
             radiance = AovKernel(aov).value(scene.ray_intersect(ray), ray, True)
         else:
             radiance, _, _ = integrator.sample(scene, sampler, ray, camera.get_medium())
-        radiance *= weight
-        dr.eval(radiance)
-        total += take * film.develop(radiance, take, 1, total.shape).numpy()[0]
+        values = FilmResponse(weight, ray.wavelengths, response_table()).film(radiance)
+        dr.eval(values)
+        total += take * film.develop(values, take, 1, total.shape).numpy()[0]
         done += take
         advance(min(1.0, done / spp))
     return (total / done).astype(np.float32)

@@ -1,6 +1,7 @@
 """Images as textures: photographs from scikit-image's installation, and procedural patterns.
 
-Textures are float32, linear, and stored unchanged (`raw`), because Mitsuba does not differentiate 8-bit bitmaps.
+Textures are float32, linear, and stored unchanged, because Mitsuba does not differentiate 8-bit bitmaps. They are `raw` in RGB variants;
+spectral variants upsample colours, and cannot use raw ones.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.io.images import srgb_to_linear
+from unrender.rendering.mitsuba.film_response import is_spectral
 
 Photograph = Literal["astronaut", "chelsea", "coffee", "rocket", "brick", "gravel", "grass"]
 """Photographs in scikit-image's wheel, which need no download."""
@@ -86,4 +88,4 @@ def bitmap(values: np.ndarray, repeat: tuple[float, float] | None = None) -> dic
         wrap, to_uv = "clamp", mi.ScalarTransform4f().translate([0, 1, 0]) @ mi.ScalarTransform4f().scale([1, -1, 1])
     else:
         wrap, to_uv = "mirror", mi.ScalarTransform4f().scale([*repeat, 1])
-    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "wrap_mode": wrap, "to_uv": to_uv}
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": not is_spectral(), "wrap_mode": wrap, "to_uv": to_uv}

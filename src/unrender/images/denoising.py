@@ -52,7 +52,8 @@ def choose(by: Denoiser = "auto") -> Denoiser:
 
 def optix_problem() -> str | None:
     """Return why OptiX cannot denoise here, in one line; None if it can. Tested once per process."""
-    return f"it needs the variant {variant.CUDA}" if variant.current() != variant.CUDA else _failure_of_optix()
+    on_gpu = variant.is_on_gpu(variant.current())
+    return _failure_of_optix() if on_gpu else f"it needs the variant {variant.CUDA}"
 
 
 @functools.cache

@@ -40,7 +40,7 @@ ProblemSettings = Annotated[
         help="An option of a gallery problem, such as resolution=64. Repeatable.",
     ),
 ]
-Variant = Annotated[str, typer.Option(help="Mitsuba's variant: auto, cuda_ad_rgb or llvm_ad_rgb.")]
+Variant = Annotated[str, typer.Option(help=f"Mitsuba's variant: auto, {', '.join(variant.VARIANTS)}.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run in the folder.")]
 Threads = Annotated[
     int | None,

@@ -40,10 +40,10 @@ def check(workers: str | None, compress: bool, insecure: bool = False) -> Worker
 
 def variant_again(typed: str | None, record: RunRecord) -> str:
     """Return the Mitsuba variant of the workers of a resumed run: the typed one, else the run's, else `auto`."""
-    from unrender.backend.variant import CUDA, LLVM
+    from unrender.backend.variant import VARIANTS
 
     before = record.problem.description.get("workers")
-    return typed or (before if before in (CUDA, LLVM) else "auto")
+    return typed or (before if before in VARIANTS else "auto")
 
 
 @contextlib.contextmanager

@@ -181,7 +181,7 @@ def _fill(
     described = renderer.pair.as_described()
     scene = described.scene
     moved = {key: value for key, value in values.items() if key in poses.keys(scene)}
-    own = {key: value for key, value in values.items() if key not in moved}
+    own = {key: described.colours.clipped(key, value) for key, value in values.items() if key not in moved}
     places = graph.places(described.parameters)
     if deformed := next((key for key in own if key not in places), None):
         raise InputError(f"parameter {deformed} cannot be exported: the scene has a sphere there, without vertices")
@@ -192,7 +192,7 @@ def _fill(
             if mesh.uv is not None:
                 graph.live[f"{name}{mesh_layout.TEXCOORDS}"] = mi.Float(mesh.uv.ravel().astype(np.float32))
         live = graph.live[places[key].key]
-        graph.live[places[key].key] = from_tensor(renderer.array(value), live)
+        graph.live[places[key].key] = from_tensor(described.colours.native(key, renderer.array(value)), live)
     graph.live.update()
     for key, value in own.items():
         try:

@@ -18,6 +18,7 @@ __all__ = ["store"]
 
 _REFRACTING = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
 _METALS = ("conductor", "roughconductor")
+_SPECTRA = ("regular", "irregular")
 _VERTEX = ("vertex_", "face_")
 
 
@@ -120,7 +121,9 @@ def _number(props: Any, name: str, value: np.ndarray) -> None:
         _forget(props, "specular" if name == "eta" else "eta")
     elif name == "position":
         _forget(props, "to_world")
-    if value.size == 1:
+    if props.plugin_name() in _SPECTRA:
+        props[name] = ", ".join(repr(float(x)) for x in value.reshape(-1))
+    elif value.size == 1:
         props[name] = float(value.reshape(-1)[0])
     elif value.shape == (3,):
         props[name] = mi.ScalarPoint3d(*map(float, value)) if name != "color" else _native(value)

@@ -13,6 +13,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
+from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.light_paths import LightPaths
@@ -49,6 +50,8 @@ def obstacles(pair: ScenePair, targets: Iterable[str]) -> dict[str, str]:
 def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     if pair.volumetric:
         return "path gradients of moving shapes do not support media"
+    if is_spectral():
+        return "path gradients of moving shapes do not support spectral variants"
     if any(sensor.film().sample_border() and not is_box(sensor.film()) for sensor in pair.current.sensors()):
         return "path gradients of moving shapes do not support sample_border: leave it out of the film"
     if shape is None:

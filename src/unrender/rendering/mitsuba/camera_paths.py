@@ -9,6 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.film_response import FilmResponse, film_samples, with_film
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.base import ConnectionRecord, ReplayState, total
 from unrender.rendering.mitsuba.integrators.path import PathPair
@@ -32,6 +33,9 @@ class CameraPaths:
         kernel: kernel that traces the paths.
         scene, tables, sampler, ray, pair, geometry: arguments of `PathKernel.sample`.
         weight: the sensor's weight per ray and channel.
+
+    Attributes:
+        response: the film's response to the radiance of each ray.
     """
 
     def __init__(
@@ -46,29 +50,30 @@ class CameraPaths:
         geometry: Any = None,
     ):
         self._kernel, self._pair, self._geometry = kernel, pair, geometry
-        self.scene, self.tables, self.sampler, self.ray, self.weight = scene, tables, sampler, ray, weight
+        self.scene, self.tables, self.sampler, self.ray = scene, tables, sampler, ray
+        self.response = FilmResponse(weight, ray.wavelengths, tables)
 
     def primal(self) -> Callable[[], tuple[Any, Any]]:
         """Return the kernel with the arguments of these paths. `weighted` converts its result to the sensor's radiance."""
         return self._sample(dr.ADMode.Primal)
 
     def weighted(self, L: Any, Lₚ: Any) -> tuple[Any, Any]:
-        """Return the weighted radiance per lane of the current and, for a pair, of the previous state, else None.
+        """Return the stored radiance (`FilmResponse.stored`) of the current and, for a pair, of the previous state, else None.
 
         A lane that is not finite in one state is NaN in both, so both images drop the same samples.
         """
         if Lₚ is None:
-            return L * self.weight, None
-        return dropped_together(L * self.weight, Lₚ * self.weight)
+            return self.response.stored(L), None
+        return dropped_together(self.response.stored(L), self.response.stored(Lₚ))
 
     def backward(self, *states: tuple[Any, Any]) -> Callable[[], Any]:
         """Return the kernel with the arguments of the backward replay of these paths.
 
         Args:
-            states: (derivative of the loss by the weighted radiance, weighted radiance of the primal pass) per lane, for the current
+            states: (derivative of the loss by the sample of the film, stored radiance of the primal pass) per lane, for the current
                 and, for a pair, the previous state. The derivative is None if the state's gradient is not requested.
         """
-        replay = [ReplayState(None if δ is None else δ * self.weight, self._replayed(L)) for δ, L in states]
+        replay = [ReplayState(None if δ is None else self.response.pull_back(δ), self._replayed(L)) for δ, L in states]
         return self._sample(dr.ADMode.Backward, tuple(replay), is_finite(*(L for _, L in states)))
 
     def forward(self, radiance: Any) -> Callable[[], tuple[Any, Any]]:
@@ -82,7 +87,7 @@ class CameraPaths:
     def connections(self, radiance: Any, weights: Any, noise: Any, bounces: int) -> Callable[[], ConnectionRecord]:
         """Return the kernel with the arguments that record each lane's connections to emitters. `radiance`: as for `forward`."""
         assert isinstance(self._kernel, PathPair)
-        record = ConnectionRecord(weights * self.weight, noise * self.weight, bounces)
+        record = ConnectionRecord(weights, noise, self.response, bounces)
         replay = ReplayState(None, self._replayed(radiance))
         camera = self.scene, self.tables, self.sampler, self.ray
         return functools.partial(self._kernel.record_connections, *camera, replay, record, is_finite(radiance))
@@ -95,7 +100,7 @@ class CameraPaths:
     def _replayed(self, radiance: Any) -> Any:
         """Return the unweighted radiance of the kernel, which is the remaining radiance at the start of a replay; 0 for dropped
         samples."""
-        return dr.select((self.weight != 0) & is_finite(radiance), radiance / self.weight, 0)
+        return self.response.replayed(radiance, is_finite(radiance))
 
     def _sample(
         self, mode: dr.ADMode, replay: tuple[ReplayState, ...] = (), active: Any = True
@@ -106,10 +111,10 @@ class CameraPaths:
 
 def is_finite(*states: Any) -> Any:
     """Return which lanes have a finite radiance in every channel of every state. The other lanes are dropped samples."""
-    return dr.isfinite(total([dr.sum(radiance) for radiance in states]))
+    return dr.isfinite(total([dr.sum(film_samples(radiance)) for radiance in states]))
 
 
 def dropped_together(*states: Any) -> tuple[Any, ...]:
     """Return the radiance of each state, NaN in all states for a lane that is not finite in one of them."""
     finite = is_finite(*states)
-    return tuple(dr.select(finite, radiance, dr.nan) for radiance in states)
+    return tuple(with_film(state, dr.select(finite, film_samples(state), dr.nan)) for state in states)

@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
+from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.integrators.camera_motion import CameraMotion
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import ParameterTraits
@@ -51,8 +52,8 @@ def moving_geometry(
 
 def sensor_obstacle(pair: ScenePair, target: str) -> str:
     """Return the reason why there is no derivative by a sensor's parameters; "" if there is one."""
-    if pair.volumetric:
-        return "path gradients of moving sensors do not support media"
+    if pair.volumetric or is_spectral():
+        return f"path gradients of moving sensors do not support {'media' if pair.volumetric else 'spectral variants'}"
     kind = next(sensor.class_name() for sensor in pair.current.sensors() if sensor.id() == target)
     if kind != "PerspectiveCamera":
         return f"path gradients of sensors are limited to perspective sensors; {target} is another ({kind})"

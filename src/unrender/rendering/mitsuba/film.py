@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.core.errors import InputError
+from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 
 
@@ -88,6 +89,7 @@ class CameraSamples:
         aperture: `mi.Point2f` in [0, 1).
         spp: rays per pixel.
         weight: `mi.Float`, weight of the reconstruction filter; None if all weights are 1.
+        wavelength: number in [0, 1) that the wavelengths are sampled with; not used in RGB variants.
     """
 
     sensor: Any
@@ -96,6 +98,7 @@ class CameraSamples:
     aperture: Any
     spp: int
     weight: Any = None
+    wavelength: Any = 0.5
 
 
 def camera_samples(
@@ -144,7 +147,11 @@ def camera_samples(
     )
     aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
     position = mi.Point2f(position.x / width, position.y / height)
-    return CameraSamples(sensor, mi.Float(time), position, aperture, spp, weight)
+    return CameraSamples(sensor, mi.Float(time), position, aperture, spp, weight, _wavelength(sampler))
+
+
+def _wavelength(sampler: Any) -> Any:
+    return sampler.next_1d() if is_spectral() else 0.5
 
 
 def _positions(
@@ -187,12 +194,15 @@ def camera_samples_of_many(
         time = dr.gather(mi.Float, opening, which) + sampler.next_1d() * dr.gather(mi.Float, open_time, which)
     aperture = sampler.next_2d() if films.aperture else mi.Point2f(0.5)
     position = mi.Point2f(position.x / width, position.y / height)
-    return CameraSamples(dr.gather(mi.SensorPtr, sensors, which), time, position, aperture, spp, weight)
+    sensor = dr.gather(mi.SensorPtr, sensors, which)
+    return CameraSamples(sensor, time, position, aperture, spp, weight, _wavelength(sampler))
 
 
 def rays(samples: CameraSamples, hidden_in: Any = None) -> tuple[Any, Any]:
     """Return `mi.RayDifferential3f` and its weight per lane. If `hiding` is a scene, its directly visible emitters are skipped."""
-    ray, weight = samples.sensor.sample_ray_differential(samples.time, 0.5, samples.position, samples.aperture)
+    ray, weight = samples.sensor.sample_ray_differential(
+        samples.time, samples.wavelength, samples.position, samples.aperture
+    )
     ray.scale_differential(samples.spp**-0.5)
     weight = weight if samples.weight is None else weight * samples.weight
     return (ray, weight) if hidden_in is None else _past_emitters(hidden_in, ray, weight)
@@ -276,7 +286,7 @@ def develop(radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> Any
     """Return the mean of each pixel's samples, per group.
 
     Args:
-        radiance: `mi.Spectrum`, evaluated, lanes in the order of `camera_samples`.
+        radiance: `mi.Color3f`, samples of the film, evaluated, lanes in the order of `camera_samples`.
         spp: samples per pixel, in all groups.
         groups: number of equal, contiguous groups that a pixel's samples are split into.
         shape: shape of one image, (H, W, 3) or (N, 3).
@@ -304,10 +314,10 @@ def film_adjoint(weights: Any, spp: int, count: int) -> Any:
         count: number of pixels.
 
     Returns:
-        `mi.Spectrum` per lane: weights[group, pixel] / spp.
+        `mi.Color3f` per lane: weights[group, pixel] / spp.
     """
     lane = dr.arange(mi.UInt32, count * spp)
     pixel = lane // spp
     group = (lane - pixel * spp) // (spp // weights.shape[0])
     index = (group * count + pixel) * 3
-    return mi.Spectrum(*(dr.gather(mi.Float, weights.array, index + c) for c in range(3))) / spp
+    return mi.Color3f(*(dr.gather(mi.Float, weights.array, index + c) for c in range(3))) / spp

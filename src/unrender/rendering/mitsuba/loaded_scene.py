@@ -23,10 +23,11 @@ from unrender.core import arrays, memory
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.core.trees import Tree
-from unrender.rendering.mitsuba import gpu
+from unrender.rendering.mitsuba import gpu, spectral_colours
 from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.parameters import normals_key
 from unrender.rendering.mitsuba.ranges import SlotReaders
+from unrender.rendering.mitsuba.recordable import build_distributions
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, refusal, replace_meshes
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
@@ -63,7 +64,8 @@ class _Registry:
         self.any_new = True
 
     def scenes(self) -> list[LoadedScene]:
-        return [scene for reference in list(self._scenes.values()) if (scene := reference()) is not None]
+        alive = [scene for reference in list(self._scenes.values()) if (scene := reference()) is not None]
+        return [scene for scene in alive if scene.variant == mi.variant()]  # kernels cannot mix variants
 
     def collect(self) -> None:
         """Free the objects of dead scenes, which virtual calls would still see."""
@@ -76,7 +78,7 @@ _registry = _Registry()
 
 
 def loaded_scenes() -> list[LoadedScene]:
-    """Return all loaded scenes of this process, in the order of loading."""
+    """Return all loaded scenes of this process and of the active variant, in the order of loading."""
     return _registry.scenes()
 
 
@@ -137,10 +139,12 @@ class LoadedScene:
 
     Attributes:
         scene: the `mitsuba.Scene`.
+        variant: Mitsuba's variant that it was loaded in.
         source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps.
         equal: names of objects that are equal (`equal_objects`).
         meshed: ids of spheres that became meshes.
         readers: slots that read the parameters' values.
+        colours: parameters whose values are RGB although the scene holds coefficients of spectra.
         parameters: parameters of the scene. Write to them through `set_parameters` only.
         leaves: {key: native value} of the parameters that are set and attached to the derivative graph.
     """
@@ -152,19 +156,21 @@ class LoadedScene:
         replaced: Mapping[str, ReplacedMesh] | None = None,
     ):
         self.scene, self.source, self.equal = load_resolved(description)
+        self.variant = mi.variant()
         self._shared = is_loaded(description)
         self.meshed: list[str] = []
         if moving and not self._shared:
             self.scene, self.meshed = meshed(self.scene, moving)
         replace_meshes(self.scene, replaced or {})
         self.graph = ObjectGraph(self.scene)
-        if reason := refusal(self.scene, self.graph.nodes):
+        if reason := refusal(self.scene, self.graph.nodes) or spectral_colours.refusal(self.scene, self.graph.slots):
             del self.scene, self.graph
             gc.collect()  # remaining objects would be called from other scenes' kernels
             raise InputError(f"scene: {reason}")
         self.readers = SlotReaders(self.graph.slots)
-        _make_distributions(self.scene)
+        build_distributions(self.scene)
         self.parameters: mi.SceneParameters = self.graph.parameters()
+        self.colours = spectral_colours.SpectralColours(self.parameters, self.readers)
         self.leaves: dict[str, Any] = {}
         self._own: dict[str, Any] = {}
         for key in self.parameters.keys():  # noqa: SIM118 (iterating gives pairs)
@@ -180,7 +186,7 @@ class LoadedScene:
 
     def value(self, key: str) -> mi.TensorXf:
         """Return the scene's own value of a parameter, as loaded."""
-        return to_tensor(self._own[key] if key in self._own else self.parameters[key])
+        return self.colours.value(key, to_tensor(self._own[key] if key in self._own else self.parameters[key]))
 
     def share_values(self, other: LoadedScene) -> None:
         """Replace own large arrays by equal ones of another load of the description, to save memory."""
@@ -211,10 +217,12 @@ class LoadedScene:
         changed = [key for key, value in values.items() if not self._is_set(key, value, key in attached)]
         # If the user changes a shared scene between two passes, leaves are created within the backward pass of a custom operation.
         # Then all are created: Dr.Jit 1.5 loses gradients if some leaves were created within it and some before.
+        written: dict[str, Any] = {}
         for key in values if self._shared and attached and changed else changed:
             value = values[key]
             # Mitsuba ignores an assignment of the array that the scene already holds, so assign a copy.
-            leaf = from_tensor(value if key in changed else _copy(value), self._own[key])
+            native = self.colours.native(key, value if key in changed else _copy(value))
+            leaf = written[key] = from_tensor(native, self._own[key])
             self.leaves.pop(key, None)
             if key in attached:
                 dr.enable_grad(leaf)
@@ -227,7 +235,7 @@ class LoadedScene:
         plain = [key for key in changed if key not in self.poses]
         if plain:
             self._update(plain)
-            self._hold({key: self.leaves.get(key, self._settings[key].value) for key in plain})
+            self._hold({key: written[key] for key in plain})
         # Unsetting one pose of a target restores the target, so its other poses have to be written again.
         if self._posed and any(key in self.poses for key in (*changed, *unset)):
             self.poses.write(self.parameters, self._posed)
@@ -313,7 +321,10 @@ class LoadedScene:
 
     def take_gradients(self) -> Tree:
         """Return the gradients of all leaves as evaluated tensors, and clear them to free the memory of large arrays."""
-        gradients = {key: to_tensor(dr.grad(leaf)) for key, leaf in self.leaves.items()}
+        gradients = {
+            key: self.colours.pull_back(key, self._settings[key].value, to_tensor(dr.grad(leaf)))
+            for key, leaf in self.leaves.items()
+        }
         dr.eval(gradients)
         self.clear_gradients()
         if gpu.is_gpu():  # a texture's copy gives a leaf one gradient only
@@ -337,7 +348,8 @@ class LoadedScene:
             if key not in tangents:
                 raise InputError(f"parameter {key}: its tangent is missing")
             dr.clear_grad(leaf)
-            dr.set_grad(leaf, from_tensor(tangents[key], self._own[key]))
+            tangent = self.colours.push_forward(key, values[key], tangents[key])
+            dr.set_grad(leaf, from_tensor(tangent, self._own[key]))
         for leaf in self.leaves.values():
             dr.enqueue(dr.ADMode.Forward, leaf)
         dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearEdges | dr.ADFlag.ClearInterior)
@@ -345,17 +357,6 @@ class LoadedScene:
 
     def _spend(self) -> None:
         self._settings = {key: replace(setting, spent=True) for key, setting in self._settings.items()}
-
-
-def _make_distributions(scene: mi.Scene) -> None:
-    """Make textured emitters build the distributions of their texels, which they otherwise build at their first sample.
-
-    A distribution that is built within a recorded kernel is not one of its inputs, and Dr.Jit refuses to record the kernel.
-    """
-    somewhere = dr.zeros(mi.Interaction3f)
-    for emitter in scene.emitters():
-        if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
-            dr.eval(emitter.sample_direction(somewhere, mi.Point2f(0.5)))
 
 
 @contextlib.contextmanager

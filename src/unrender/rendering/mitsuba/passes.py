@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.camera_paths import CameraPaths, Kernel, Tables, dropped_together
+from unrender.rendering.mitsuba.film_response import FilmResponse, response_table
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -75,7 +76,7 @@ class Pass:
 
     def tables(self, pair: ScenePair, delta: mi.UInt32, sensor: int | None) -> Tables:
         """Return the tables that the kernel looks up. `sensor` is None if each pixel has its own."""
-        tables = self._surface_tables(pair, delta)
+        tables = {**self._surface_tables(pair, delta), **response_table()}
         if pair.volumetric:
             tables = {**tables, **pair.media(self.previous, sensor), **pair.majorants(self.previous, self.pair)}
         return tables
@@ -265,9 +266,9 @@ class TangentPass(Pass):
         return paths.forward(radiance)
 
     def result(self, paths: CameraPaths, output: Any) -> Any:
-        derivative = output[0] * paths.weight
+        derivative = paths.response.film(output[0])
         return dr.square(
-            derivative if self.combined is None else mi.Spectrum(dr.dot(mi.Spectrum(*self.combined), derivative))
+            derivative if self.combined is None else mi.Color3f(dr.dot(mi.Color3f(*self.combined), derivative))
         )
 
 
@@ -303,8 +304,8 @@ class VerticesPass(Pass):
         return paths.vertices()
 
     def result(self, paths: CameraPaths, output: Any) -> Any:
-        """Return the number of vertices in each channel of a spectrum, to be developed like radiance."""
-        return mi.Spectrum(output)
+        """Return the number of vertices in each channel of a colour, to be developed like samples of the film."""
+        return mi.Color3f(output)
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,7 +345,7 @@ class PosesPass(Pass):
         del posed
 
         def launch(scenes, loaded, tables, seeds, pixels, films, rays, numbers):
-            del loaded, tables
+            del loaded
             seed, positions = seeds
             lanes = size.pixels * size.spp
             batch = dr.arange(mi.UInt32, self.copies * lanes) // lanes
@@ -358,7 +359,7 @@ class PosesPass(Pass):
                 if camera.id() in assembly.poses:
                     ray = assembly.poses[camera.id()].ray_outside(ray)
                 L, _ = kernel.sample(dr.ADMode.Primal, assembly.static, {}, repeating, ray, geometry=assembly)
-                return L * ray_weight
+                return FilmResponse(ray_weight, ray.wavelengths, tables).film(L)
 
         return launch
 

@@ -40,6 +40,17 @@ def build_emitter_tables() -> None:
                 emitter.sample_direction(vertex, mi.Point2f(0.5), True)
 
 
+def build_distributions(scene: Any) -> None:
+    """Make textured emitters of a scene build the distributions of their texels, which they otherwise build at their first sample.
+
+    A distribution that is built within a recorded kernel is not one of its inputs, and Dr.Jit refuses to record the kernel.
+    """
+    somewhere: Any = dr.zeros(mi.Interaction3f)
+    for emitter in scene.emitters():
+        if mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying):
+            dr.eval(emitter.sample_direction(somewhere, mi.Point2f(0.5)))
+
+
 def _registered(kind: Any) -> Iterator[Any]:
     """Yield the objects of the process that pointers of a type can refer to."""
     number, missing = 1, 0

@@ -12,6 +12,7 @@ from unrender.core.dropped import DropReport
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.camera_paths import is_finite
+from unrender.rendering.mitsuba.film_response import film_samples
 from unrender.rendering.renderer import SampleRequest, Space
 
 
@@ -21,8 +22,8 @@ class Paths:
 
     Attributes:
         request: request of the rendering.
-        radiance: radiance per lane.
-        radiance_previous: radiance of the previous state; None unless a pair was rendered.
+        radiance: radiance per lane (`FilmResponse.stored`).
+        radiance_previous: that of the previous state; None unless a pair was rendered.
         space: sample space of the pair.
         previous: parameters of the previous state; None unless a pair was rendered.
         vertices: result of `TracePass` if paths are cached; else None.
@@ -30,8 +31,8 @@ class Paths:
     """
 
     request: SampleRequest
-    radiance: mi.Spectrum
-    radiance_previous: mi.Spectrum | None = None
+    radiance: Any
+    radiance_previous: Any = None
     space: Space = "path"
     previous: Tree | None = None
     vertices: dict[str, Any] | None = None
@@ -59,8 +60,9 @@ class DroppedSamples:
     def develop(self, radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> mi.TensorXf:
         """Return the image that `film.develop` makes of the finite samples, and count the dropped ones."""
         self.read()
-        finite, lanes = is_finite(radiance), dr.width(radiance)
-        finite_radiance = mi.Spectrum(dr.select(finite, radiance, 0))
+        samples = film_samples(radiance)
+        finite, lanes = is_finite(samples), dr.width(samples)
+        finite_radiance = mi.Color3f(dr.select(finite, samples, 0))
         dropped = dr.count(~finite)
         dr.eval(finite_radiance, dropped)
         self._pending.append((dropped, lanes))

@@ -19,6 +19,7 @@ from unrender.rendering.mitsuba import gpu, poses
 from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle, translation_obstacle
 from unrender.rendering.mitsuba.equal_objects import merge_notices
+from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
@@ -159,7 +160,7 @@ class MitsubaRenderer:
         self, session: MitsubaSession, keys: list[str], derivatives: AbstractSet[str]
     ) -> MitsubaSession | CachingSession:
         """Return a session that caches its paths if the parameters allow it, else the session itself."""
-        if self._differential_bsdf or self.light_paths.aov:
+        if self._differential_bsdf or self.light_paths.aov or is_spectral():
             return session
         try:
             return CachingSession(self.pair, session, keys, sorted(derivatives), self.light_paths)
@@ -182,6 +183,8 @@ class MitsubaRenderer:
         """Return a renderer of the same loaded scenes with an AOV in place of radiance. Raise `InputError` for scenes with media."""
         if self.pair.volumetric:
             raise InputError(f"{name} is a property of surfaces, and the scene has media; leave it out")
+        if is_spectral():
+            raise InputError(f"{name}: spectral variants render radiance only; leave it out, or use an RGB variant")
         if name not in self._aovs:
             made = self._aovs[name] = copy.copy(self)
             made.light_paths = LightPaths(1, hide_emitters=self.light_paths.hide_emitters, aov=name)

@@ -251,8 +251,11 @@ def refusal(scene: Any, objects: Iterable[Any]) -> str:
     spectral = "" if str(mi.variant()).endswith("_spectral") else next(iter(names & _SPECTRAL_ONLY.keys()), "")
     if spectral:
         plugin = _SPECTRAL_ONLY[spectral]
-        instead = "a sunsky" if plugin == "timed_sunsky" else "an rgb colour"
-        return f"Mitsuba cannot evaluate the plugin {plugin} in the variant {mi.variant()}; give {instead} in its place"
+        variant = str(mi.variant())
+        instead = "give a sunsky in its place"
+        if plugin != "timed_sunsky":
+            instead = f"use the variant {variant.replace('rgb', 'spectral')}, or give an rgb colour in its place"
+        return f"Mitsuba cannot evaluate the plugin {plugin} in the variant {variant}; {instead}"
     if type(scene.integrator()).__name__ == _PRIMITIVE_FIELD:
         return (
             "the integrator volprim_rf_basic renders ellipsoids as a radiance field, but path tracing treats them as surfaces; "

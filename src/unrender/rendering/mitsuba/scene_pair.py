@@ -83,8 +83,7 @@ class ScenePair:
         self.single = is_loaded(description)
         if self.single and self.replaced:
             raise InputError("meshes of a loaded scene cannot be replaced; give the .xml file or the dictionary")
-        self._current = LoadedScene(description, moving, self.replaced)
-        self._previous: LoadedScene | None = None
+        self._current, self._previous = LoadedScene(description, moving, self.replaced), None
         self.volumetric = bool(media(self.current))
         known = self.volumetric and not self.single
         self._grid_transforms = extinction_transforms(self._current.source) if known else {}
@@ -351,21 +350,20 @@ class ScenePair:
         if isinstance(value, (int, float)):
             reason = "it is a plain number, which Mitsuba compiles into its kernels"
             return ParameterInfo(shape, False, False, reason, perturbable=False, compiled=True)
-        if reason := "it holds no values" if 0 in shape else update_obstacle(self.current_parameters, key):
+        if reason := "it holds no values" if 0 in shape else self._obstacle(key):
             return ParameterInfo(shape, False, False, reason, perturbable=False)
+        limits = self.physical_range(key)
         if flags & (mi.ParamFlags.NonDifferentiable | mi.ParamFlags.ReadOnly):
             reason = "Mitsuba marks it as not differentiable"
             if key.endswith(".data") and dr.is_tensor_v(value):
                 reason += '; its texture is stored with 8 bits: load it with format="variant" or from a float file'
             able = dr.is_float_v(value) and not flags & mi.ParamFlags.ReadOnly
-            limits = self.physical_range(key)
             return ParameterInfo(
                 shape, False, False, reason, limits.low, limits.high, perturbable=able, singular=limits.singular
             )
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
         traits = self.parameter_traits(key)
-        limits = self.physical_range(key)
         if not traits.replayable:
             return ParameterInfo(shape, False, False, traits.reason, limits.low, limits.high, singular=limits.singular)
         return ParameterInfo(
@@ -381,10 +379,13 @@ class ScenePair:
             welded=key.endswith(f".{mesh_layout.POSITIONS}"),
         )
 
+    def _obstacle(self, key: str) -> str:
+        """Return the reason why a parameter cannot be set to another value; "" if it can."""
+        return update_obstacle(self.current_parameters, key) or self._current.colours.obstacle(key)
+
     def _mesh(self, key: str) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and faces of the mesh at whose vertices a parameter has values, as loaded."""
-        owner, _, name = key.rpartition(".")
-        mesh = self.current_parameters.properties[key][2]
+        (owner, _, name), mesh = key.rpartition("."), self.current_parameters.properties[key][2]
         moved = name == mesh_layout.POSITIONS
         faces = mesh_layout.faces(mesh) if moved else self.current_parameters[f"{owner}.{mesh_layout.FACES}"]
         points = self._current.value(f"{owner}.{mesh_layout.POSITIONS}").numpy().reshape(-1, 3)

@@ -164,13 +164,13 @@ def connect(
     address = workers.address or os.environ.get("RAY_ADDRESS") or None
     with contextlib.ExitStack() as stack:
         if address is None:
-            gpu = name == variant.CUDA or (name == "auto" and variant.gpu_problem() is None)
+            gpu = variant.is_on_gpu(name) or (name == "auto" and variant.gpu_problem() is None)
             init_options = stack.enter_context(private_cluster(ray))
             init_options |= {"num_cpus": limits.cores(), "include_dashboard": False, "object_store_memory": store_bytes}
             init_options |= {} if gpu else {"num_gpus": 0}
             most = most_by_memory(most)
         else:
-            gpu = name == variant.CUDA
+            gpu = variant.is_on_gpu(name)
             init_options = {"address": address}
             _check_answers(address)
             if not workers.insecure:
@@ -189,7 +189,7 @@ def connect(
             gpu = any(gpus >= 1 for _, gpus in machines)
         yield Cluster(
             ray,
-            variant.CUDA if gpu else variant.LLVM,
+            name if name != "auto" else variant.CUDA if gpu else variant.LLVM,
             share(machines, workers.count, gpu, most),
             workers.address or address,
             HeadNode(gcs_address),

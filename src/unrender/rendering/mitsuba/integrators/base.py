@@ -145,6 +145,7 @@ class ConnectionRecord:
 
     Args:
         weights, noise: w / S and n / S of the lanes.
+        response: `FilmResponse` of the camera rays.
         bounces: maximum number of connections per path, >= 1.
 
     Attributes:
@@ -152,8 +153,8 @@ class ConnectionRecord:
         emitters: registry ids of the sampled emitters, of the same shape.
     """
 
-    def __init__(self, weights: Spectrum, noise: Spectrum, bounces: int):
-        self._weights, self._noise, self._bounces = weights, noise, bounces
+    def __init__(self, weights: Any, noise: Any, response: Any, bounces: int):
+        self._weights, self._noise, self._response, self._bounces = weights, noise, response, bounces
         self._lanes = dr.width(weights)
         self.values = dr.zeros(mi.Float, self._lanes * bounces)
         self.emitters = dr.zeros(mi.UInt32, self._lanes * bounces)
@@ -161,7 +162,8 @@ class ConnectionRecord:
 
     def write(self, depth: UInt32, emitter: UInt32, f: Spectrum, tangent: Spectrum, active: Bool) -> None:
         """Record a connection of each lane that adds f, with its derivative along the tangents, at a vertex of the given depth, from 0."""
-        value = dr.square(dr.sum(self._weights * tangent)) + dr.sum(dr.square(self._noise * f))
+        derivative, sample = self._response.film(tangent), self._response.film(f)
+        value = dr.square(dr.sum(self._weights * derivative)) + dr.sum(dr.square(self._noise * sample))
         index = dr.arange(mi.UInt32, self._lanes) * self._bounces + depth
         dr.scatter(self.values, value, index, active)
         dr.scatter(self.emitters, emitter, index, active)

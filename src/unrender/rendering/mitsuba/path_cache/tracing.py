@@ -85,7 +85,7 @@ class TracePass(Pass):
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         context = PathContext(dr.ADMode.Primal, paths.scene, paths.tables, (), False)
         lanes = paths.sampler.wavefront_size()  # a sensor's rays may all be equal, of width 1
-        record = _Record(self._empty(lanes), lanes, mi.Color3f(paths.weight))
+        record = _Record(self._empty(lanes), lanes, mi.Color3f(paths.response.weight))
         return functools.partial(self._trace, context, record, paths.ray, paths.sampler)
 
     def result(self, paths: CameraPaths, output: Any) -> Any:
