@@ -91,17 +91,30 @@ def test_a_gpu_that_does_not_work_is_refused_with_the_reason(fake: FakeMitsuba, 
     assert fake.name is None
 
 
-@pytest.mark.parametrize("name", ["llvm", "scalar_rgb", "llvm_ad_spectral", "cuda_ad_rgb ", ""])
+def test_spectral_variants_are_checked_as_those_of_rgb(fake: FakeMitsuba, monkeypatch: pytest.MonkeyPatch):
+    assert variant.use("cuda_ad_spectral") == variant.current() == variant.ensure() == "cuda_ad_spectral"
+    assert variant.use() == "cuda_ad_rgb"
+    assert variant.use("llvm_ad_spectral") == variant.ensure() == "llvm_ad_spectral"
+    monkeypatch.setattr(variant, "gpu_problem", lambda: "the driver is broken")
+    with pytest.raises(VariantError, match=r"cuda_ad_spectral cannot run here.*'llvm_ad_spectral' runs on the CPU"):
+        variant.use("cuda_ad_spectral")
+    monkeypatch.setattr(variant, "_check_llvm", lambda: (_ for _ in ()).throw(VariantError("old LLVM")))
+    with pytest.raises(VariantError, match="old LLVM"):
+        variant.ensure()
+
+
+@pytest.mark.parametrize("name", ["llvm", "scalar_rgb", "llvm_ad_spectral_polarized", "cuda_ad_rgb ", ""])
 def test_an_unknown_variant_is_refused(name: str):
-    with pytest.raises(VariantError, match="expected 'auto', 'cuda_ad_rgb' or 'llvm_ad_rgb'"):
+    expected = "expected 'auto', 'cuda_ad_rgb', 'llvm_ad_rgb', 'cuda_ad_spectral' or 'llvm_ad_spectral'"
+    with pytest.raises(VariantError, match=expected):
         variant.use(name)
 
 
 @pytest.mark.parametrize(
     ("name", "what"),
     [
-        ("llvm_ad_spectral", "no spectral rendering"),
-        ("cuda_ad_spectral_polarized", "no spectral rendering and no polarised rendering"),
+        ("llvm_ad_spectral_polarized", "no polarised rendering"),
+        ("cuda_ad_mono_polarized", "no polarised rendering and no monochromatic rendering"),
         ("llvm_ad_mono", "no monochromatic rendering"),
         ("scalar_rgb", "no variants of 'scalar'"),
     ],

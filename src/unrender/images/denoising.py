@@ -36,13 +36,8 @@ def choose(by: Denoiser = "auto") -> Denoiser:
     if by not in ("auto", *_DENOISERS):
         known = ("auto", *_DENOISERS)
         raise InputError(f"denoiser {by!r}: expected {', '.join(known)}{did_you_mean(str(by), known)}")
-    on_gpu = variant.current() == variant.CUDA
-    if by == "optix" and not on_gpu:
-        raise InputError(
-            f"denoiser optix: it needs the variant {variant.CUDA}, which is not in use; oidn runs on the CPU"
-        )
     if by == "auto":
-        by = "optix" if on_gpu and optix_problem() is None else "oidn"
+        by = "oidn" if optix_problem() else "optix"
     elif by == "optix" and (problem := optix_problem()):
         raise InputError(f"denoiser optix: {problem}; oidn runs on the CPU")
     if by == "oidn" and importlib.util.find_spec("pyoidn") is None:

@@ -298,7 +298,7 @@ class PathPair:
         with dr.resume_grad():
             Lo = [e + d + L * relative(value) for e, d, L, value in zip(Le, Ld, path.L, values, strict=True)]
             if context.forward:
-                path.δL += dr.forward_to(Lo[0])
+                path.δL += mi.Spectrum(dr.forward_to(Lo[0]))
             else:
                 flags = KEEP if path.branches else dr.ADFlag.Default
                 dr.backward_from(context.adjoint_sum(Lo), flags=flags)
@@ -316,7 +316,7 @@ class PathPair:
         with dr.resume_grad():
             # Le is not needed, but Dr.Jit requires that everything attached within an iteration is traversed in it.
             tangents: Any = dr.forward_to(Le, Ld, relative(value))
-            _, δLd, δlogf = tangents
+            _, δLd, δlogf = (mi.Spectrum(tangent) for tangent in tangents)
         Ld = dr.detach(Ld)
         record.write(path.depth, connection.emitter, Ld, δLd + Ld * path.δlogβ, connection.active)
         path.δlogβ += δlogf
@@ -346,7 +346,7 @@ class PathPair:
         contribution = differential.contribution(context, branch, numbers, self._incident(context))
         with dr.resume_grad():
             if context.forward:
-                path.δL += dr.forward_to(contribution)
+                path.δL += mi.Spectrum(dr.forward_to(contribution))
             else:
                 dr.backward_from(context.adjoint_sum([contribution]))
 
