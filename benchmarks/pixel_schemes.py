@@ -1,29 +1,19 @@
-"""The pixel samplers that are compared: uniform, in proportion to the loss derivative, adaptive."""
+"""The pixel samplers that are compared, uniform, in proportion to the loss derivative, adaptive, and the variance of their gradients."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 import unrender as ur
-from benchmarks.internals import PixelSampler
+from benchmarks.internals import Key, PixelSampler
 
 SCHEMES: dict[str, Callable[..., PixelSampler]] = {
     "uniform": ur.pixels.Uniform,
     "loss": ur.pixels.LossProportional,
     "adaptive": ur.pixels.Adaptive,
-}
-COLOURS = {
-    "all": "#999999",
-    "uniform": "#555555",
-    "loss": "#c8781e",
-    "adaptive": "#1f6fb4",
-    "adaptive, five levels": "#7fb2dd",
-    "adaptive, as the paper": "#1fa6b4",
-    "adaptive, rcv": "#8a3fa8",
-    "all, rcv": "#cf9fe0",
-    "adaptive, coupled": "#1a8f4c",
-    "all, coupled": "#8fd3aa",
 }
 
 
@@ -31,3 +21,24 @@ def pixels(scheme: str, count: int, **options: Any) -> PixelSampler:
     """The sampler of that name; options that a scheme does not have are left out."""
     known = {"uniform": {"stratified"}, "loss": {"stratified", "samples", "refresh", "uniform"}}.get(scheme)
     return SCHEMES[scheme](count, **{k: v for k, v in options.items() if known is None or k in known})
+
+
+def gradients(
+    problem: ur.Problem, estimator: ur.PathGradient, runs: int, seed: int = 0
+) -> tuple[np.ndarray, int, dict[int, np.ndarray]]:
+    """(runs, n) independent estimates at the start, paths of one, and the pixel probabilities they used."""
+    at = problem.initial()
+    state = estimator.init(problem, at)
+    first, state = estimator.estimate(problem, at, state, Key(2 * seed))
+    rows, samples = [], 0
+    for run in range(runs):
+        found, state = estimator.estimate(problem, at, state, Key(2 * seed + 1, run))
+        rows.append(np.concatenate([np.array(g).ravel() for g in found.gradient.values()]))
+        samples = found.info["samples"]
+    return np.array(rows), samples, first.info.get("pixel_probability", {})
+
+
+def spread(rows: np.ndarray) -> tuple[float, float]:
+    """The variance summed over parameters, and its standard error, from four parts."""
+    parts = [np.var(part, axis=0, ddof=1).sum() for part in np.array_split(rows, 4)]
+    return float(np.var(rows, axis=0, ddof=1).sum()), float(np.std(parts, ddof=1) / 2)

@@ -18,8 +18,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.gradient_variance import gradients, spread
-from benchmarks.pixel_schemes import SCHEMES, pixels
+from benchmarks.pixel_schemes import SCHEMES, gradients, pixels, spread
 from benchmarks.runner.records import Record
 
 FIVE_LEVELS = "adaptive, five levels"

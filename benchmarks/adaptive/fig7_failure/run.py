@@ -14,8 +14,8 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.gradient_variance import gradients, spread
 from benchmarks.internals import Key, PixelSampler, pixel_probability
+from benchmarks.pixel_schemes import gradients, spread
 from benchmarks.runner.records import Record
 
 PROBLEMS = ("caustic", "plain-and-textured", "mirror-trio")
