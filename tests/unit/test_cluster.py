@@ -276,15 +276,22 @@ def test_tasks_are_data_and_functions_go_by_name() -> None:
     assert b"cloudpickle" in by_value, "a function that goes by value is told apart"
 
 
-def test_signals_are_handled_after_ray_has_shut_down() -> None:
-    """Its compiled code sets the default action of SIGTERM, which Python does not notice: the command would end without a line."""
+@pytest.mark.parametrize("when", ["meanwhile", "afterwards"])
+def test_signals_are_handled_while_and_after_ray_changes_their_action(when: str) -> None:
+    """Its compiled code does, which Python does not notice: the command would end without a line, or with a stack trace."""
     code = textwrap.dedent("""
-        import ctypes, os, signal, types
+        import ctypes, os, signal, sys, time, types
         from unrender.app.distributed.cluster import connection
         signal.signal(signal.SIGTERM, lambda *_: print("handled", flush=True))
-        shutdown = lambda: ctypes.CDLL(None).signal(signal.SIGTERM, None)
+        end = lambda: os.kill(os.getpid(), signal.SIGTERM)
+        def shutdown():
+            ctypes.CDLL(None).signal(signal.SIGTERM, None)
+            if sys.argv[1] == "meanwhile":
+                time.sleep(0.5)
+                end()
         connection._leave(types.SimpleNamespace(shutdown=shutdown))
-        os.kill(os.getpid(), signal.SIGTERM)
+        if sys.argv[1] == "afterwards":
+            end()
     """)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code, when], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (0, "handled\n", "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import logging
 import os
 import signal
@@ -238,14 +239,15 @@ def _leave(ray: Any) -> None:
 
 @contextlib.contextmanager
 def _own_signals() -> Iterator[None]:
-    """Restore the signal handlers afterwards: Ray installs its own for SIGTERM, and its shutdown sets the system's default action."""
+    """Keep the signal handlers: Ray installs its own for SIGTERM, and its shutdown sets the system's default action."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     received = 0
     try:
-        yield
+        with _kept_action(signal.SIGTERM):
+            yield
     except SystemExit as end:  # raised by Ray's handler
         received = end.code if end.code == signal.SIGTERM else 0
         if not received:
@@ -257,6 +259,32 @@ def _own_signals() -> Iterator[None]:
     if received:
         signal.raise_signal(signal.SIGTERM)
         raise KeyboardInterrupt
+
+
+_EVERY = 0.01
+"""Seconds between restorations of a signal's action."""
+_LARGEST_ACTION = 1024
+"""Bytes, more than `struct sigaction` has on any system."""
+
+
+@contextlib.contextmanager
+def _kept_action(number: int) -> Iterator[None]:
+    """Keep the system's action of a signal. Ray's compiled code sets one that prints a stack trace, and Python does not notice."""
+    library, action = ctypes.CDLL(None), ctypes.create_string_buffer(_LARGEST_ACTION)
+    library.sigaction(number, None, action)
+    ended = threading.Event()
+
+    def restore() -> None:
+        while not ended.wait(_EVERY):
+            library.sigaction(number, action, None)
+
+    thread = threading.Thread(target=restore, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 _HOW = "; or give --insecure if no other user can reach this machine"
