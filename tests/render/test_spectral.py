@@ -96,6 +96,24 @@ def test_an_adjoint_without_the_weight_of_the_wavelengths_is_found_out(monkeypat
     assert np.abs(found - expected).max() > 0.05 * np.abs(expected).max()
 
 
+@pytest.mark.slow
+def test_differential_sampling_of_roughness_agrees_with_the_standard_adjoint():
+    bsdf = {"type": "roughconductor", "alpha": 0.2}
+    plain = MitsubaRenderer(lambda: scene(shiny={**scene()["shiny"], "bsdf": bsdf}), DEPTH)
+    key = next(name for name in plain.parameters() if name.endswith("alpha.value"))
+    weight = plain.array(np.full((1, SIZE, SIZE, 3), 1 / SIZE**2))
+    slopes = []
+    for renderer in (plain, plain.with_differential_bsdf()):
+        session, values = renderer.prepare([key], None), renderer.values([key])
+        slopes.append([])
+        for number in range(16):
+            paths = session.image(values, SampleRequest(0, 256, number)).paths
+            slopes[-1].append(float(session.adjoint(values, paths, weight)[key].array[0]))
+    means, errors = np.mean(slopes, axis=1), np.std(slopes, axis=1, ddof=1) / 4
+    assert abs(means[0] - means[1]) < 4 * np.hypot(*errors)
+    assert errors[1] < errors[0]
+
+
 def test_the_response_of_the_film_is_that_of_mitsuba():
     λ = np.random.default_rng(3).uniform(360, 830, (4, 32)).astype(np.float32)
     L, weight = (np.random.default_rng(n).uniform(0.2, 2, (4, 32)).astype(np.float32) for n in (4, 5))

@@ -18,7 +18,8 @@ class PictureFormat:
 
     Attributes:
         colour: "rgb" (linear), "luminance" or "xyz". Images of the renderer are RGB; "luminance" makes all three channels equal.
-        signed: whether pixels may be negative, because of negative lobes of the filter or because the images are not radiance.
+        signed: whether pixels may be negative, because of negative lobes of the filter, colours of spectra outside sRGB, or
+            because the images are not radiance.
         aov: property of the first surface in place of radiance, one of `AOVS`; "" for radiance.
     """
 

@@ -12,6 +12,7 @@ import mitsuba as mi
 
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
+from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_filter import has_negative_lobes
 from unrender.rendering.mitsuba.session import MitsubaSession
@@ -30,7 +31,9 @@ def formats(sensors: Sequence[Any]) -> list[PictureFormat]:
     for sensor in sensors:
         match = re.search(r"pixel_format = (\w+)", str(sensor.film()))
         colour = _COLOURS.get(match[1] if match else "", "rgb")
-        result.append(PictureFormat(colour, has_negative_lobes(sensor.film())))  # pyright: ignore[reportArgumentType]
+        # Colours of some spectra are outside sRGB, and so are samples of few wavelengths.
+        signed = has_negative_lobes(sensor.film()) or is_spectral()
+        result.append(PictureFormat(colour, signed))  # pyright: ignore[reportArgumentType]
     if len({form.colour == "luminance" for form in result}) > 1:
         raise InputError("some films have the pixel_format luminance and others store colour; give all films the same")
     return result

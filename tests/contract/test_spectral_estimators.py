@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy import stats
-from test_estimators import ESTIMATORS
+from test_estimators import ESTIMATORS as OF_ANALYTIC_PROBLEMS
 
 import unrender as ur
 from spectral_scenes import COLOUR, DEPTH, SIZE, SPECTRUM, TEXTURE, scene
@@ -18,6 +18,10 @@ pytestmark = pytest.mark.usefixtures("spectral_variant")
 
 COUNT, COUNT_OF_DEAR = 20, 4
 NAMES = {"map": TEXTURE, "colour": COLOUR, "spectrum": SPECTRUM}
+ESTIMATORS = {
+    **OF_ANALYTIC_PROBLEMS,
+    "adaptive emitters": lambda: ur.PathGradient(spp=2, emitters="adaptive"),
+}
 DEAR = ("Gauss-Newton",)
 """Estimators with a rendering per element."""
 OTHER_EXPECTATION = {name for name in ESTIMATORS if name.startswith(("smoothed", "loss values")) or "denoised" in name}
