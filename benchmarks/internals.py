@@ -31,16 +31,19 @@ from unrender.gallery.specification import build_problem
 from unrender.images import denoising
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
-from unrender.methods import method
+from unrender.methods import auto, method
 from unrender.methods.plan import Plan
+from unrender.methods.rules import newton
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
+from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.ranges import Range, SlotReaders
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.mitsuba.scene_loading import media
 from unrender.rendering.numpy.one_pixel import RATE
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
+from unrender.rendering.wrapper import RendererWrapper
 from unrender.runs import loop
 from unrender.runs.budget import Budget
 from unrender.runs.image_sensitivity import hardly_seen

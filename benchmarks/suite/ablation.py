@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
+from unittest.mock import patch
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.internals import Plan, method
+from benchmarks.internals import CachingSession, Plan, RendererWrapper, auto, method, newton
 from benchmarks.runner.records import Record
 
 
@@ -25,22 +27,43 @@ def _with_separate_adjoints(plan: Plan) -> Plan:
     return replace(plan, estimator=replace(plan.estimator, adjoint_spp=plan.estimator.spp))
 
 
+class _Uncached(RendererWrapper):
+    """A renderer whose sessions trace the paths of each image and adjoint."""
+
+    def prepare(self, *arguments: Any, **named: Any) -> Any:
+        session = self.inner.prepare(*arguments, **named)
+        return session._inner if isinstance(session, CachingSession) else session
+
+
+def _without_cache(plan: Plan) -> Plan:
+    return replace(plan, problem=plan.problem.with_parts(renderer=_Uncached(plan.problem.renderer)))
+
+
+def _without_newton(plan: Plan) -> Plan:
+    """Return the plan without the rules that take Gauss-Newton steps for all unknowns."""
+    rules = tuple(rule for rule in auto.RULES if rule.__module__ != newton.__name__)
+    with patch.object(auto, "RULES", rules):
+        return method("auto").plan(plan.problem)
+
+
 PARTS: dict[str, dict[str, str] | Callable[[Plan], Plan]] = {
+    "kept-paths": _without_cache,
     "control-variate": {"image": "plain"},
     "sobolev": {"smooth": "false"},
     "schedule-free": _with_adam,
     "leave-one-out": _with_separate_adjoints,
     "damping": {"tolerance": "0"},
+    "model-steps": _without_newton,
 }
 """{part: options of `auto` that leave it out, or the change of its plan}."""
 
 
 def plan(problem: ur.Problem, option: str = "") -> Plan:
     """Return the plan of `auto` with an option such as "spp=2", or without one of `PARTS`."""
-    auto, part = method("auto"), PARTS.get(option, {})
+    own, part = method("auto"), PARTS.get(option, {})
     if callable(part):
-        return part(auto.plan(problem))
-    return auto.plan(problem, part or (dict([option.split("=")]) if option else {}))
+        return part(own.plan(problem))
+    return own.plan(problem, part or (dict([option.split("=")]) if option else {}))
 
 
 def changes(problem: ur.Problem, part: str) -> bool:

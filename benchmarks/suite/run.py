@@ -82,7 +82,8 @@ def ours(
 ) -> tuple[Points, dict[str, Any]]:
     """Run `auto`, with an option or without a part (`ablation.plan`); return its curve, its steps and its seconds of compilation."""
     curve = Recorder(lambda values: {"": error(values)}, {"": 1.0}, 1 / 100)
-    result = ur.optimize(problem, ablation.plan(problem, option), seconds=seconds, seed=seed, callbacks=[curve])
+    plan = ablation.plan(problem, option)
+    result = ur.optimize(plan.problem, plan, seconds=seconds, seed=seed, callbacks=[curve])
     points = [(at, found) for at, _, found in curve.points[""][1:]]
     return points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
 
@@ -226,7 +227,7 @@ def run(
         option: of `auto`, as "spp=2 learning_rate=0.3", each a setting to tune it by as well; none for not to tune it
         option_seeds: runs of each of these settings, of which the median counts
         retune: the loop; else its settings are those of the record
-        without: parts of `auto` to leave out, one at a time: control-variate, sobolev, schedule-free, leave-one-out, damping
+        without: parts of `auto` to leave out, one at a time, by the names of `ablation.PARTS`
     """
     if unknown := set(without) - set(ablation.PARTS):
         raise ur.InputError(f"--without {', '.join(unknown)}: expected {', '.join(ablation.PARTS)}")

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
+from benchmarks.internals import CachingSession, prepare
 from benchmarks.suite import ablation, run
 from tests.unit.test_auto import problem
-from unrender import InputError, losses, optimizers
+from unrender import InputError, gallery, losses, optimize, optimizers
 from unrender.images import Plain
 
 
@@ -16,7 +17,7 @@ def test_each_part_is_left_out_alone() -> None:
     made = problem(losses.L1())
     own: Any = ablation.plan(made)
     plans: dict[str, Any] = {part: ablation.plan(made, part) for part in ablation.PARTS}
-    assert all(ablation.changes(made, part) for part in plans)
+    assert {part for part in plans if not ablation.changes(made, part)} == {"model-steps"}
     assert isinstance(plans["control-variate"].estimator.image, Plain)
     assert not plans["sobolev"].optimizer.preconditioned
     assert plans["schedule-free"].optimizer == optimizers.Adam(own.optimizer.learning_rate)
@@ -28,8 +29,19 @@ def test_each_part_is_left_out_alone() -> None:
     assert tuned.estimator.spp == 3
     assert not ablation.changes(problem(losses.L2()), "damping")  # only losses that noise biases have it
     for plan in plans.values():
-        result = run.ur.optimize(made, plan, steps=2)
-        assert result.steps == 2
+        assert optimize(plan.problem, plan, steps=2).steps == 2
+
+
+@pytest.mark.mitsuba
+def test_paths_and_model_steps_are_left_out(mitsuba_variant: str) -> None:
+    room = gallery.problem("indirect-room", resolution=8, texture_resolution=4, reference_spp=4)
+    plan = ablation.plan(room, "kept-paths")
+    kinds = [isinstance(prepare(one, list(one.unknowns)), CachingSession) for one in (room, plan.problem)]
+    assert kinds == [True, False]
+    assert optimize(plan.problem, plan, steps=1).steps == 1
+    camera = gallery.problem("camera", resolution=8, reference_spp=4)
+    names = [type(ablation.plan(camera, part).optimizer).__name__ for part in ("", "model-steps")]
+    assert names == ["AveragedNewton", "NewtonCG"]
 
 
 def test_the_table_has_the_geometric_mean_without_each_part() -> None:
@@ -43,5 +55,5 @@ def test_the_table_has_the_geometric_mean_without_each_part() -> None:
 
 
 def test_an_unknown_part_is_refused_before_any_run() -> None:
-    with pytest.raises(InputError, match="--without caches: expected control-variate, sobolev"):
+    with pytest.raises(InputError, match="--without caches: expected kept-paths, control-variate, sobolev"):
         next(run.run(without=("caches",)))
