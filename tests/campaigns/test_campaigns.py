@@ -1,4 +1,4 @@
-"""Long campaigns of power cuts, kills and signals. `UNRENDER_CAMPAIGN=N` sets the number of faults of each kind; without it they are skipped.
+"""Long campaigns of power cuts, kills and signals. `UNRENDER_CAMPAIGN=N` sets the number of faults of each kind; else they are skipped.
 
     UNRENDER_CAMPAIGN=50 python -m pytest -o faulthandler_timeout=0 tests/campaigns -s
 
