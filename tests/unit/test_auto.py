@@ -315,7 +315,9 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     formed = dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: formed)
     plan = method("auto").plan(made)
-    expected = GaussNewton(CONSTANTS.number_spp[1], CONSTANTS.difference_spp[1], noise_limit=CONSTANTS.noise_limit)
+    expected = GaussNewton(
+        CONSTANTS.number_spp[1], CONSTANTS.difference_spp[1], noise_limit=CONSTANTS.noise_limit, remember=True
+    )
     assert plan.estimator == expected
     assert isinstance(plan.optimizer, optimizers.AveragedNewton)
     assert "4 numbers" in plan.reasons[0]

@@ -13,7 +13,7 @@ from unrender.core.random import Key
 from unrender.estimators import derivative_images
 from unrender.estimators import gauss_newton as module
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Hessian, HessianNoise, Smoothing
+from unrender.estimators.capabilities import GradientNoise, Hessian, HessianNoise, Smoothing
 from unrender.optimizers import AveragedNewton, averaged_newton
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder import reader
@@ -299,6 +299,48 @@ def test_a_direction_that_hardly_shows_has_an_infinite_standard_error(ratio: flo
     assert errors.keys() == {"x", "y"}
 
 
+@pytest.mark.parametrize("stays", [True, False])
+def test_others_take_the_minimum_for_an_element_that_its_bound_stops(
+    stays: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """x₀ >= 0 with the minimum of the model at x₀ = −1: the other is 1 / 2 there, and 1.5 without it. The planted fault is the step of a
+    model without bounds, which ends at 1.5."""
+    hessian, minimum = np.array([[1.0, 1.0], [1.0, 2.0]]), np.array([-1.0, 1.5])
+    if not stays:
+        monkeypatch.setattr(averaged_newton, "_outwards", lambda state, x: np.zeros_like(x))
+    optimizer, tree = AveragedNewton(trust_radius=None), {"x": np.array([1.0, 0.0])}
+    state = optimizer.init(tree)
+    for _ in range(6):
+        gradient = hessian @ (tree["x"] - minimum)
+        steps, state = optimizer.update(Estimate(0.0, {"x": gradient}, (Hessian(hessian),)), state, tree)
+        tree = {"x": np.maximum(tree["x"] + steps["x"], [0.0, -np.inf])}
+    expected = [0.0, 1.0] if stays else [0.0, 1.5]
+    np.testing.assert_allclose(tree["x"], expected, atol=1e-6)
+
+
+def test_a_bound_is_left_where_the_loss_falls_inside() -> None:
+    optimizer, tree = AveragedNewton(trust_radius=None), {"x": np.array([1.0, 0.0])}
+    state, hessian = optimizer.init(tree), np.array([[1.0, 0.2], [0.2, 2.0]])
+    for step in range(12):
+        minimum = np.array([-1.0 if step < 3 else 0.5, 1.0])
+        gradient = hessian @ (tree["x"] - minimum)
+        noise = GradientNoise(1e-8 * np.eye(2))
+        steps, state = optimizer.update(Estimate(0.0, {"x": gradient}, (Hessian(hessian), noise)), state, tree)
+        tree = {"x": np.maximum(tree["x"] + steps["x"], [0.0, -np.inf])}
+    np.testing.assert_allclose(tree["x"], [0.5, 1.0], atol=0.05)
+
+
+def test_noise_damps_the_directions_that_it_dominates() -> None:
+    """Curvatures 1 and 0.01, noise of variance 4 and Δ = 2 of both: the first step is g / (a + s / (a Δ²))."""
+    hessian, optimizer, x = np.diag([1.0, 0.01]), AveragedNewton(), np.zeros(2)
+    hessian[0, 1] = hessian[1, 0] = 1e-9  # one block
+    noise = GradientNoise(np.diag([0.04, 0.04]))
+    steps, _ = optimizer.update(
+        Estimate(0.0, {"x": np.array([-0.5, -0.5])}, (Hessian(hessian), noise)), optimizer.init({"x": x}), {"x": x}
+    )
+    np.testing.assert_allclose(steps["x"], [0.5 / 1.01, 0.5 / 1.01], rtol=1e-6)
+
+
 def test_directions_of_noise_alone_hardly_move_until_enough_steps_tell_more() -> None:
     """Step 1: (H + N)⁻¹ of the gradient; after k models at one place, (H + σ N)⁻¹, with the sum σ of their squared weights."""
     optimizer, noise, x = AveragedNewton(trust_radius=None), 4.0 * HESSIAN, np.zeros(3)
@@ -358,13 +400,17 @@ def test_a_region_that_shrank_grows_again_while_the_loss_falls() -> None:
     assert state.radii[0] == 2.0
 
 
+def noise_of(covariance: np.ndarray, references: np.ndarray | None = None) -> derivative_images.NoiseMean:
+    """Return the noise of many images with this covariance, (H, W, 3, 3)."""
+    return derivative_images.NoiseMean(covariance, np.zeros((3, 3)) if references is None else references, 1e9)
+
+
 def test_few_noisy_pixels_do_not_outweigh_the_others() -> None:
     """Noise of √c times the usual halves the weight; a noisier half of the gradient has less scatter than with equal weights."""
-    variance = np.array([[0.0, 1.0, 1.0, 1.0, 3.0, 300.0]])[..., None]
-    np.testing.assert_allclose(
-        derivative_images.noise_weights(variance, 3.0)[0, :, 0], [1.0, 0.75, 0.75, 0.75, 0.5, 1 / 101], rtol=1e-12
-    )
-    assert (derivative_images.noise_weights(np.zeros((1, 2, 1)), 3.0) == 1.0).all()
+    variance = np.array([[0.0, 1.0, 1.0, 1.0, 3.0, 300.0]])[..., None, None]
+    weights = derivative_images.noise_weights(noise_of(variance * np.eye(3)), 3.0)
+    np.testing.assert_allclose(weights[0, :, 0, 0], [1.0, 0.75, 0.75, 0.75, 0.5, 1 / 101], rtol=1e-6)
+    assert (derivative_images.noise_weights(noise_of(np.zeros((1, 2, 3, 3))), 3.0) == np.eye(3)).all()
     lamp = np.ones(MATRIX.shape)
     lamp[:6] = 40.0
     made = problem_of(lamp * MATRIX)
@@ -380,6 +426,71 @@ def test_few_noisy_pixels_do_not_outweigh_the_others() -> None:
         away = np.concatenate([START[key] - TRUTH[key] for key in START])
         scatter[limit] = float(np.median(np.abs(np.stack(found[8:]) - away)))
     assert scatter[3.0] < 0.8 * scatter[None]
+
+
+def test_colour_counts_where_all_channels_share_their_noise() -> None:
+    """Σ = 1 1ᵀ: grey has the eigenvalue 3, other colours 0. References with noise of their own, R = m c 1, halve the difference."""
+    weights = derivative_images.noise_weights(noise_of(np.ones((2, 2, 3, 3))), 0.5)
+    np.testing.assert_allclose(np.linalg.eigvalsh(weights[0, 0]), [1 / 7, 1.0, 1.0], rtol=1e-6)
+    weights = derivative_images.noise_weights(noise_of(np.ones((2, 2, 3, 3)), 0.5 * np.eye(3)), 0.5)
+    np.testing.assert_allclose(np.linalg.eigvalsh(weights[0, 0]), [1 / 8, 0.5, 0.5], rtol=1e-6)
+
+
+def test_noise_of_residuals_is_that_of_images_and_references() -> None:
+    """Over 400 images: Σ of rendering noise, without the references' noise R, and R without the rendering's. 4.5 standard errors."""
+    rng, mean = np.random.default_rng(0), None
+    rendering, shape = np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 1.0]]), (24, 24, 3)
+    root = np.linalg.cholesky(rendering)
+    references = rng.normal(0.0, 0.5, shape)
+    for _ in range(400):
+        one, other = (references + rng.normal(0.0, np.sqrt(2.0), shape) @ root.T for _ in range(2))
+        mean = derivative_images.NoiseMean.of(np.full(shape, 1.0), one, other, mean)
+    assert mean is not None
+    error = 2.0 * np.sqrt(2.0 / derivative_images._MOST_IMAGES / (24 * 24))
+    np.testing.assert_allclose(mean.rendering.mean(axis=(0, 1)), rendering, atol=4.5 * error)
+    np.testing.assert_allclose(mean.references, 0.25 * np.eye(3), atol=4.5 * 2.0 * 2.0 / 24)
+
+
+def test_gradient_noise_is_the_scatter_of_gradients() -> None:
+    """Mean of the estimates over the variance of 300 gradients, within 4.5 standard errors of a variance. Half of it is seen."""
+    made, estimator = problem(), ur.GaussNewton(2, 2)
+    state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
+    found = [estimator.estimate(made, START, state, Key(seed))[0] for seed in range(300)]
+    gradients = np.stack([np.concatenate([one.gradient[key] for key in START]) for one in found])
+    told = np.mean([np.diag(one.require("test", GradientNoise).matrix) for one in found], axis=0)
+    ratio, error = told / gradients.var(axis=0, ddof=1), np.sqrt(2.0 / 300)
+    assert (np.abs(ratio - 1.0) < 4.5 * error).all()
+    assert (np.abs(0.5 * ratio - 1.0) > 4.5 * error).all()
+
+
+@pytest.mark.parametrize("remember", [True, False])
+def test_derivatives_of_many_steps_leave_the_gradient_less_noise(remember: bool) -> None:
+    """An element that hardly changes the picture, with ten times as much noise in its differences."""
+    renderer = AnalyticRenderer(TRUTH, MATRIX * np.array([1.0, 1.0, 0.01]), 0.1, 0.0, grain=0.3, shape=(4, 5))
+    truth_of = [ur.Parameter(key, initial=value) for key, value in TRUTH.items()]
+    made = ur.Problem(renderer, truth_of, [ur.View(renderer.exact(TRUTH))], ur.losses.L2())
+    estimator, rng = ur.GaussNewton(2, 2, remember=remember), np.random.default_rng(0)
+
+    def noisy(images: np.ndarray, distances: np.ndarray) -> np.ndarray:
+        return differences(images, distances) + rng.normal(0.0, 0.1, (len(distances), *images.shape[1:]))
+
+    differences, states = module.differences, []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "differences", noisy)
+        state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
+        for seed in range(200):
+            estimate, state = estimator.estimate(made, TRUTH, state, Key(seed))
+            states.append(float(estimate.gradient["b"][0]))
+    assert bool(np.std(states[40:]) < 0.4 * np.std(states[:8])) is remember
+
+
+def test_widths_stay_within_the_bounds() -> None:
+    """An element that hardly changes the picture has no wider differences than an eighth of its range."""
+    renderer = AnalyticRenderer(TRUTH, MATRIX * np.array([1.0, 1.0, 1e-4]), 0.1, 0.1, shape=(4, 5))
+    unknown = [ur.Parameter("a"), ur.Parameter("b", bounds=(0.0, 1.0))]
+    made = ur.Problem(renderer, unknown, [ur.View(renderer.exact(TRUTH))], ur.losses.L2())
+    _, state = ur.GaussNewton(2, 2).estimate(made, TRUTH, module.GaussNewtonState({}), Key(0))
+    assert state.widths["b"] == pytest.approx(0.125)
 
 
 @pytest.mark.parametrize("earlier", [True, False])
@@ -400,7 +511,7 @@ def test_weights_leave_skewed_noise_without_bias(earlier: bool, monkeypatch: pyt
     for seed in range(300):
         key = Key(seed)
         if not earlier:
-            _, state = estimator.estimate(made, TRUTH, replace(state, variances=()), key)
+            _, state = estimator.estimate(made, TRUTH, replace(state, noise=()), key)
         estimate, state = estimator.estimate(made, TRUTH, state, key)
         found.append(np.concatenate([estimate.gradient[name] for name in TRUTH]))
     assert (off(np.stack(found), np.zeros(3)) < 4.0) is earlier

@@ -17,6 +17,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.capabilities import (
     Capability,
     FreshGradient,
+    GradientNoise,
     Hessian,
     HessianNoise,
     HessianProduct,
@@ -105,7 +106,7 @@ def as_numpy(estimate: Estimate) -> Estimate:
                 return FreshGradient(trees.numpy(values))
             case Hessian(matrix):
                 return Hessian(arrays.numpy(matrix))
-            case HessianNoise(matrix) | ScoreCovariance(matrix):
+            case GradientNoise(matrix) | HessianNoise(matrix) | ScoreCovariance(matrix):
                 return replace(capability, matrix=arrays.numpy(matrix))
         return capability
 

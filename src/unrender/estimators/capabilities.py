@@ -94,6 +94,18 @@ class HessianNoise(Capability):
 
 
 @dataclass(frozen=True)
+class GradientNoise(Capability):
+    """Covariance of the gradient from this step's samples. Trust-region steps are damped along directions that noise dominates.
+
+    Attributes:
+        matrix: (n, n), positive semidefinite.
+    """
+
+    name: ClassVar[str] = "gradient_noise"
+    matrix: Array
+
+
+@dataclass(frozen=True)
 class ScoreCovariance(Capability):
     """Covariance of the loss gradient from the references' noise, as the residual shows it.
 

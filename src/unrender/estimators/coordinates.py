@@ -14,6 +14,7 @@ from unrender.estimators.capabilities import (
     BlockEstimate,
     Capability,
     FreshGradient,
+    GradientNoise,
     Hessian,
     HessianNoise,
     HessianProduct,
@@ -73,7 +74,7 @@ def _second_order(
             J, term = _flat(slopes, parameters), _curvature_term(gradient, problem, parameters)
             full = J[:, None] * arrays.numpy(matrix).astype(np.float64) * J + np.diag(term)
             return Hessian(full)
-        case HessianNoise(matrix) | ScoreCovariance(matrix):
+        case GradientNoise(matrix) | HessianNoise(matrix) | ScoreCovariance(matrix):
             J = _flat(slopes, parameters)
             return replace(capability, matrix=J[:, None] * arrays.numpy(matrix).astype(np.float64) * J)
         case HessianProduct(apply):

@@ -18,12 +18,21 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
     Capabilities,
     Gradient,
+    GradientNoise,
     Hessian,
     HessianNoise,
     ScoreCovariance,
     Smoothing,
 )
-from unrender.estimators.derivative_images import LossWeights, noise_weights, products, running_mean, squared_slope
+from unrender.estimators.derivative_images import (
+    DerivativeMean,
+    LossWeights,
+    NoiseMean,
+    differences,
+    noise_weights,
+    products,
+    squared_slope,
+)
 from unrender.estimators.gradient_sum import damping, smoothed_variance
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
@@ -31,6 +40,8 @@ from unrender.scene.upsampling import Upsampler
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
+_OF_RANGE = 0.125
+"""Largest width relative to the range between a parameter's bounds."""
 _SETTLED = 0.5
 """Maximum step, in units of the widths, after which the shift is halved."""
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
@@ -47,13 +58,15 @@ class GaussNewtonState:
         widths: widths of the differences, {key: in units of the parameter}; {} before the first estimate.
         shift: target image shift of the differences in pixels.
         point: parameters of the last estimate, (n,); None before the first.
-        variances: running mean of the variance of each view's image, (H, W, 1); () without `noise_limit` and before the first estimate.
+        noise: mean noise of each view's residuals; () without `noise_limit` and before the first estimate.
+        derivatives: mean derivative images of each view; () without `remember` and before the first estimate.
     """
 
     widths: dict[str, float]
     shift: float = 0.0
     point: np.ndarray | None = None
-    variances: tuple[np.ndarray, ...] = ()
+    noise: tuple[NoiseMean, ...] = ()
+    derivatives: tuple[DerivativeMean, ...] = ()
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
         """Return an empty state: widths are estimated again."""
@@ -93,8 +106,12 @@ class GaussNewton:
             little noise, and a start several pixels away takes few steps.
         largest: {key: maximum width, > 0}; no limit for the others. The pose of one shape needs it: the shape covers a part of the
             image, so it may never differ from the image as much as a shift of the full image would.
-        noise_limit: a pixel of variance σ² in earlier images has the weight 1 / (1 + σ² / (c m)), with this c and the median m over pixels
-            with noise, so a few noisy pixels, such as those of a visible lamp, do not outweigh the others; > 0. None for equal weights.
+        noise_limit: residuals are weighted by the inverse covariance of their noise in earlier images, of the rendering and of the
+            references, as in generalised least squares. This times the median variance is added to the covariance; > 0. Colour then
+            counts where all channels share their noise, and a few noisy pixels, such as those of a visible lamp, do not outweigh the
+            others. None for equal weights.
+        remember: whether derivative images are averaged over steps while steps are short relative to the widths. Their noise is then
+            small relative to the derivatives also for elements that hardly change the image. Not for large pictures of many elements.
     """
 
     spp: int = 256
@@ -105,6 +122,7 @@ class GaussNewton:
     coarse: float | None = None
     largest: Mapping[str, float] = field(default_factory=dict)
     noise_limit: float | None = None
+    remember: bool = False
 
     def __post_init__(self):
         for key, width in self.largest.items():
@@ -120,8 +138,8 @@ class GaussNewton:
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient and its covariance, a Hessian and its noise."""
-        return Capabilities(Gradient, Hessian, HessianNoise, ScoreCovariance)
+        """A gradient and its covariances, a Hessian and its noise."""
+        return Capabilities(Gradient, GradientNoise, Hessian, HessianNoise, ScoreCovariance)
 
     def init(self, problem: Problem, parameters: Tree) -> GaussNewtonState:
         """Return the state before the first step. Raise `InputError` for a parameter that cannot be perturbed or has a preconditioner,
@@ -140,46 +158,56 @@ class GaussNewton:
         point = _Point(self, problem, parameters)
         if not state.widths:
             widths = {key: self.width * (float(np.abs(arrays.numpy(x)).max()) or 1.0) for key, x in parameters.items()}
-            widths = {key: min(width, self.largest.get(key, math.inf)) for key, width in widths.items()}
+            widths = {key: min(width, point.largest[key]) for key, width in widths.items()}
             state = GaussNewtonState(widths, self.coarse or self.shift, point.theta)
             for index in range(_PASSES):
                 system = point.system(state, key.fold(1 + index), derivatives=False)
-                state = self._next(state, system, parameters, _FIRST_CHANGE)
-        state = self._sharpened(state, parameters)
-        system = point.system(state, key.fold(0))
+                state = self._next(state, system, point, _FIRST_CHANGE)
+        moved = _moved(state, point.theta, parameters)
+        state = self._sharpened(state, point.theta, moved)
+        system = point.system(state, key.fold(0), moved=moved)
         estimate = Estimate(
             system.loss,
             trees.unravel(system.gradient, parameters),
             (
                 Hessian(system.hessian),
                 HessianNoise(system.noise),
+                GradientNoise(system.gradient_noise),
                 ScoreCovariance(system.scores),
                 Smoothing(dict(state.widths)),
             ),
             {"samples": point.samples, "images": system.images},
         )
-        return estimate, self._next(state, system, parameters, _CHANGE)
+        return estimate, self._next(state, system, point, _CHANGE)
 
-    def _sharpened(self, state: GaussNewtonState, parameters: Tree) -> GaussNewtonState:
-        """Return the state with half the shift if the last step was short relative to the widths."""
-        point = trees.ravel(parameters)
-        if state.point is None:
-            return GaussNewtonState(state.widths, state.shift or self.coarse or self.shift, point)
-        moved = np.abs(point - state.point) / trees.repeat_per_element(state.widths, parameters)
-        settled = 0.0 < moved.max(initial=0.0) < _SETTLED
-        shift = max(0.5 * state.shift, self.shift) if settled else state.shift
-        return replace(state, shift=shift, point=point)
+    def _sharpened(self, state: GaussNewtonState, point: np.ndarray, moved: float) -> GaussNewtonState:
+        """Return the state at a point, with half the shift if the last step was short relative to the widths."""
+        shift = state.shift or self.coarse or self.shift
+        settled = 0.0 < moved < _SETTLED
+        return replace(state, shift=max(0.5 * shift, self.shift) if settled else shift, point=point)
 
-    def _next(self, state: GaussNewtonState, system: _System, parameters: Tree, change: float) -> GaussNewtonState:
+    def _next(self, state: GaussNewtonState, system: _System, point: _Point, change: float) -> GaussNewtonState:
         """Return the state with updated widths, at which renders differ from the image as much as the target shift, in the root mean
         square over the elements of a parameter. Widths change by at most the factor `change`."""
-        squares, slopes = trees.parts(system.squares, parameters), trees.parts(system.slopes, parameters)
+        squares, slopes = (trees.parts(x, point.parameters) for x in (system.squares, system.slopes))
         widths = {}
         for key, width in state.widths.items():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
             target = state.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
-            widths[key] = float(np.clip(target, width / change, min(width * change, self.largest.get(key, math.inf))))
-        return replace(state, widths=widths, variances=tuple(system.variances) or state.variances)
+            widths[key] = float(np.clip(target, width / change, min(width * change, point.largest[key])))
+        return replace(
+            state,
+            widths=widths,
+            noise=tuple(system.residual_noise) or state.noise,
+            derivatives=tuple(system.derivatives) or state.derivatives,
+        )
+
+
+def _moved(state: GaussNewtonState, point: np.ndarray, parameters: Tree) -> float:
+    """Return the largest change of an element since the last estimate, in units of the widths; 0 before the first."""
+    if state.point is None:
+        return 0.0
+    return float(np.max(np.abs(point - state.point) / trees.repeat_per_element(state.widths, parameters), initial=0.0))
 
 
 def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
@@ -216,27 +244,30 @@ class _System:
 
     Attributes:
         loss: loss at the parameters.
-        gradient, hessian, noise, scores: (n,), (n, n), (n, n), (n, n).
+        gradient, hessian, noise, gradient_noise, scores: (n,), then (n, n) each.
         squares: squared derivative images, summed over their pixels, (n,).
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
         images: images by view.
-        variances: running mean of the variance of each view's image.
+        residual_noise: mean noise of each view's residuals.
+        derivatives: mean derivative images of each view.
     """
 
     loss: float
     gradient: np.ndarray
     hessian: np.ndarray
     noise: np.ndarray
+    gradient_noise: np.ndarray
     scores: np.ndarray
     squares: np.ndarray
     slopes: np.ndarray
     images: dict[int, Array]
-    variances: list[np.ndarray] = field(default_factory=list)
+    residual_noise: list[NoiseMean] = field(default_factory=list)
+    derivatives: list[DerivativeMean] = field(default_factory=list)
 
     @classmethod
     def zero(cls, n: int) -> _System:
-        hessian, noise, scores = (np.zeros((n, n)) for _ in range(3))
-        return cls(0.0, np.zeros(n), hessian, noise, scores, np.zeros(n), np.zeros(n), {})
+        hessian, noise, gradient_noise, scores = (np.zeros((n, n)) for _ in range(4))
+        return cls(0.0, np.zeros(n), hessian, noise, gradient_noise, scores, np.zeros(n), np.zeros(n), {})
 
 
 @dataclass(frozen=True)
@@ -254,6 +285,7 @@ class _Point:
 
     Attributes:
         samples: number of paths traced so far.
+        largest: largest width of each parameter, infinite if there is none.
     """
 
     def __init__(self, options: GaussNewton, problem: Problem, parameters: Tree):
@@ -261,13 +293,21 @@ class _Point:
         self.session: RenderSession = problem.renderer.prepare(list(parameters), None, derivatives=False)
         self.theta = trees.ravel(parameters)
         self.samples = 0
+        ranges = {key: (unknown.bounds[0], unknown.bounds[1]) for key, unknown in problem.unknowns.items()}
+        self.largest = {
+            key: min(
+                options.largest.get(key, math.inf),
+                math.inf if low is None or high is None else _OF_RANGE * (high - low),
+            )
+            for key, (low, high) in ranges.items()
+        }
         known = problem.renderer.parameters()
         sensors = {key: -1 if known[key].sensor is None else known[key].sensor for key in parameters}
         self._sensors = trees.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
 
-    def system(self, state: GaussNewtonState, key: Key, derivatives: bool = True) -> _System:
-        """Return gradient and Hessian for the state's widths. Without `derivatives`, only compute the quantities that the next widths
-        need."""
+    def system(self, state: GaussNewtonState, key: Key, derivatives: bool = True, moved: float = 0.0) -> _System:
+        """Return gradient and Hessian for the state's widths, after a step of length `moved`. Without `derivatives`, only compute the
+        quantities that the next widths need."""
         total = _System.zero(self.theta.size)
         steps = trees.repeat_per_element(state.widths, self.parameters)
         for view, sensor_view in enumerate(self.problem.views):
@@ -276,26 +316,41 @@ class _Point:
             images = self._images(view, own) if derivatives else None
             if images:
                 total.images[view] = images.mean
-                if self.options.noise_limit is not None:
-                    total.variances.append(running_mean(state.variances, view, arrays.numpy(images.variance)))
                 total.loss += arrays.number(self.problem.loss_value(view, images.mean))
             if not elements.size:
                 continue
+            weights = self._noise_weighted(view, images, state, total) if images else None
             points, distances = self._points(elements, steps)
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
-            weights = self._weights(view, images) if images else None
-            if weights is not None and state.variances:
-                # Of earlier images only. A bright outlier has a large residual and a large variance, so weights by this image's variance
-                # would shift the solution to darker images.
-                weights = weights.times(noise_weights(state.variances[view], self.options.noise_limit or math.inf))
-            found, pairs = products(halves, distances, weights, int(state.shift)), np.ix_(elements, elements)
+            mean = DerivativeMean(differences(halves[0], distances), differences(halves[1], distances))
+            if images and self.options.remember:
+                if state.derivatives:
+                    mean = state.derivatives[len(total.derivatives)].and_one(mean, moved)
+                total.derivatives.append(mean)
+            found, pairs = products([mean.one, mean.other], weights, int(state.shift)), np.ix_(elements, elements)
             total.gradient[elements] += found.gradient
             total.hessian[pairs] += found.hessian
             total.noise[pairs] += found.noise
+            total.gradient_noise[pairs] += found.gradient_noise
             total.scores[pairs] += found.scores
             total.squares[elements] += found.squares
             total.slopes[elements] += squared_slope(halves)
         return total
+
+    def _noise_weighted(self, view: int, images: _Images, state: GaussNewtonState, total: _System) -> LossWeights:
+        """Return the derivatives of the loss with the weights of the noise, and add the image's noise to `total`.
+
+        The weights are of earlier images only. A bright outlier has a large residual and a large variance, so weights by this image's
+        variance would shift the solution to darker images.
+        """
+        weights = self._weights(view, images)
+        if self.options.noise_limit is None:
+            return weights
+        reference = arrays.numpy(self.problem.reference(view)).astype(np.float64)
+        one, other = (arrays.numpy(half) - reference for half in (images.one, images.other))
+        before = state.noise[len(total.residual_noise)] if state.noise else None
+        total.residual_noise.append(NoiseMean.of(weights.second.astype(np.float64), one, other, before))
+        return weights if before is None else weights.times(noise_weights(before, self.options.noise_limit))
 
     def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the parameters with one element increased, then decreased, by its step, (2 m, n), within bounds, and the distances of

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -11,7 +12,14 @@ from unrender.core import arrays, checks, trees
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianNoise, ScoreCovariance
+from unrender.estimators.capabilities import (
+    Capabilities,
+    Gradient,
+    GradientNoise,
+    Hessian,
+    HessianNoise,
+    ScoreCovariance,
+)
 from unrender.optimizers import rates
 from unrender.optimizers.directions import coordinate_scales
 from unrender.optimizers.newton import trust_region_step
@@ -22,6 +30,11 @@ _FEWEST_MODELS = 8.0
 _USED, _SHRINK, _GROW = 0.5, 0.7, 1 / 0.7
 """Share of the radius from which a step counts as one that used the region, and the factors of the radius after such steps. Their product
 is 1, so noise alone neither closes the region nor opens it."""
+_LEAST_NOISE, _SURPRISE_ERRORS = 1e-6, 6.0
+"""Relative eigenvalue of the gradient's noise below which a direction has none, and standard errors of a mean square of 1 that noise may
+reach."""
+_STOPPED = 1e-3
+"""Share of a step by which the parameters miss its end from which bounds stopped it."""
 _WEAK_SHARE = 0.01
 """Squared share of an element in damped directions above which its standard error is infinite."""
 _OF_LINEAR = 1e4
@@ -42,6 +55,7 @@ class AveragedNewtonState:
         matrix: A, the mean of the Hessians, (n, n), double precision on the host.
         target: b, the mean of H x − g, (n,). The mean model has its minimum where A x = b.
         noise: mean contribution of noise to squared derivatives, (n, n), see `HessianNoise`.
+        gradient_noise: mean covariance of the models' gradients, (n, n), see `GradientNoise`.
         shares: fraction of that contribution in the mean, (n,): the sum of the squared weights of the models.
         counts: effective number of models in each element's mean, (n,); long steps reduce it.
         lengths: length of the last step of the elements that moved together, in units of the trust region, (n,).
@@ -49,6 +63,7 @@ class AveragedNewtonState:
             the model's gradient and that of the previous mean.
         radii: radius of the trust region of each element, (n,), in its units.
         step: last step, in units of the parameters, (n,).
+        end: where it should have led, (n,). The parameters differ from it where their bounds are.
         scores: mean covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; 0 if there is none.
         score_variances: variance of the diagonal of `scores`, (n,).
     """
@@ -57,12 +72,14 @@ class AveragedNewtonState:
     matrix: np.ndarray
     target: np.ndarray
     noise: np.ndarray
+    gradient_noise: np.ndarray
     shares: np.ndarray
     counts: np.ndarray
     lengths: np.ndarray
     scatter: np.ndarray
     radii: np.ndarray
     step: np.ndarray
+    end: np.ndarray
     scores: np.ndarray
     score_variances: np.ndarray
 
@@ -87,6 +104,10 @@ class AveragedNewton:
     (`Estimate.sigma`).
 
     Where images are linear in a parameter (`linear`), a model is exact at any distance, so Δ hardly limits its steps.
+
+    Directions along which noise (`GradientNoise`) moves the minimum by more than Δ are damped, by s / (a Δ²) for the curvature a and the
+    variance s of the mean gradient. Elements at a bound beyond which the model falls stay there, and the others take their minimum for
+    that. A gradient that differs from the mean model's by more than noise allows reduces k.
 
     Δ shrinks after a long step if the new gradient shows that the loss rises along it, and grows while the loss falls. So averaging
     begins even where noise moves the minimum by more than the region.
@@ -125,7 +146,9 @@ class AveragedNewton:
         n = trees.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
         radii = np.full(n, np.inf if self.trust_radius is None else self.trust_radius)
-        return AveragedNewtonState(own, square, row, square, row, row, row, square, radii, row, square, row)
+        return AveragedNewtonState(
+            own, square, row, square, square, row, row, row, square, radii, row, row, square, row
+        )
 
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
@@ -136,30 +159,29 @@ class AveragedNewton:
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
             return trees.unravel(np.zeros_like(x), parameters), state
         hessian = 0.5 * (hessian + hessian.T)
-        noise_estimate = estimate.get(HessianNoise)
-        added = (
-            np.zeros_like(hessian) if noise_estimate is None else arrays.numpy(noise_estimate.matrix).astype(np.float64)
+        added, fluctuation, fresh = (
+            _finite(estimate.get(kind), hessian) for kind in (HessianNoise, GradientNoise, ScoreCovariance)
         )
-        if not np.isfinite(added).all():
-            added = np.zeros_like(hessian)
-        references = estimate.get(ScoreCovariance)
-        fresh = np.zeros_like(hessian) if references is None else np.nan_to_num(arrays.numpy(references.matrix))
         scale = coordinate_scales(estimate, state, parameters)
         region = scale * self._reaches(parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
-        noise, shares, counts = state.noise.copy(), state.shares.copy(), state.counts.copy()
+        noise, gradient_noise = state.noise.copy(), state.gradient_noise.copy()
+        shares, counts = state.shares.copy(), state.counts.copy()
         lengths, scatter, radii = np.zeros_like(x), state.scatter.copy(), state.radii.copy()
+        outwards = _outwards(state, x)
         scores, score_variances = state.scores.copy(), state.score_variances.copy()
         for block in _blocks((matrix != 0.0) | (hessian != 0.0)):
             both = np.ix_(block, block)
-            weight = self._weight(counts[block].min(), state.lengths[block].max())
+            news = gradient[block] - (matrix[both] @ x[block] - target[block])
+            surprise = _surprise(news, fluctuation[both] + shares[block].max() * gradient_noise[both])
+            weight = self._weight(counts[block].min() / surprise, state.lengths[block].max())
             scatter[both] *= (1.0 - weight) ** 2
             if counts[block].min() > 0.0:
-                news = gradient[block] - (matrix[both] @ x[block] - target[block])
                 scatter[both] += weight**2 * np.outer(news, news) / (1.0 + shares[block].max())
             counts[block] = (1.0 + self.averaging) * (1.0 / weight - 1.0) + 1.0
             matrix[both] += weight * (hessian[both] - matrix[both])
             noise[both] += weight * (added[both] - noise[both])
+            gradient_noise[both] += weight * (fluctuation[both] - gradient_noise[both])
             recent = max(weight, _LEAST_WEIGHT)
             change = np.diag(fresh)[block] - np.diag(scores)[block]
             score_variances[block] = (1.0 - recent) ** 2 * score_variances[block] + (recent * change) ** 2
@@ -170,23 +192,15 @@ class AveragedNewton:
             radii[block] = radius = self._radius(radii[block].min(), state.step[block] / own, own * gradient[block])
             slope = matrix[both] @ x[block] - target[block]
             damped = matrix[both] + shares[block].max() * noise[both]
-            moved = self._solve(own[:, None] * damped * own, own * slope, radius)
-            step[block] = own * moved
+            rough = shares[block].max() * gradient_noise[both]
+            step[block] = own * self._step(
+                own[:, None] * damped * own, own * slope, own[:, None] * rough * own, outwards[block], radius
+            )
             lengths[block] = _length(x[block], step[block], scale[block], own > scale[block])
         return trees.unravel(step, parameters), AveragedNewtonState(
-            state.learning_rates,
-            matrix,
-            target,
-            noise,
-            shares,
-            counts,
-            lengths,
-            scatter,
-            radii,
-            step,
-            scores,
-            score_variances,
-        )
+            state.learning_rates, matrix, target, noise, gradient_noise, shares, counts, lengths, scatter, radii, step, x + step,
+            scores, score_variances,
+        )  # fmt: skip
 
     def averages(self, keys: Iterable[str]) -> frozenset[str]:
         """Return all keys."""
@@ -237,8 +251,29 @@ class AveragedNewton:
         change = _SHRINK if float(step @ gradient) > 0.0 else _GROW
         return min(change * radius, self.trust_radius)
 
-    def _solve(self, matrix: np.ndarray, gradient: np.ndarray, radius: float) -> np.ndarray:
-        """Return the step of one block, in units of the trust region."""
+    def _step(
+        self,
+        matrix: np.ndarray,
+        gradient: np.ndarray,
+        noise: np.ndarray,
+        outwards: np.ndarray,
+        radius: float,
+    ) -> np.ndarray:
+        """Return the step of one block, in units of the trust region. Elements at a bound that would leave it stay there."""
+        step, free = np.zeros_like(gradient), np.full(gradient.size, True)
+        while free.any():
+            both = np.ix_(free, free)
+            step[:] = 0.0
+            step[free] = self._solve(matrix[both], gradient[free], noise[both], radius)
+            leaving = free & (step * outwards > 0.0)
+            if not leaving.any():
+                break
+            free &= ~leaving
+            step[leaving] = 0.0
+        return step
+
+    def _solve(self, matrix: np.ndarray, gradient: np.ndarray, noise: np.ndarray, radius: float) -> np.ndarray:
+        """Return the minimum of the model in the trust region."""
         units = np.sqrt(np.abs(np.diag(matrix)))
         if not units.all():
             return np.zeros_like(gradient)
@@ -247,8 +282,12 @@ class AveragedNewton:
         curvatures = np.maximum(curvatures, self.damping * curvatures.max())
         hessian = units[:, None] * (eigenvectors * curvatures) @ eigenvectors.T * units
         curvatures, eigenvectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+        curvatures = np.maximum(curvatures, 0.0)
+        if self.trust_radius is not None and curvatures.all():
+            variances = np.einsum("ki,kl,li->i", eigenvectors, noise, eigenvectors)
+            curvatures = curvatures + variances / (curvatures * self.trust_radius**2)
         return eigenvectors @ trust_region_step(
-            np.maximum(curvatures, 0.0), eigenvectors.T @ gradient, None if np.isinf(radius) else radius
+            curvatures, eigenvectors.T @ gradient, None if np.isinf(radius) else radius
         )
 
 
@@ -260,6 +299,35 @@ def _length(x: np.ndarray, step: np.ndarray, scale: np.ndarray, linear: np.ndarr
     """
     relative = step[linear] / (np.abs(x + step) + _OF_WIDTH * scale)[linear]
     return max(float(np.linalg.norm(step / scale)), float(np.linalg.norm(relative)))
+
+
+def _surprise(news: np.ndarray, noise: np.ndarray) -> float:
+    """Return the factor by which a gradient differs from that of the mean model by more than noise (n, n) allows, squared; at least 1.
+
+    The scene is then less quadratic than the mean model, whose oldest parts are to be forgotten.
+    """
+    units = np.sqrt(np.diag(noise))
+    if not (np.isfinite(noise).all() and units.all()):
+        return 1.0
+    inverse = np.linalg.pinv(noise / np.outer(units, units), rcond=_LEAST_NOISE, hermitian=True)
+    square = float((news / units) @ inverse @ (news / units)) / news.size
+    return max(square - _SURPRISE_ERRORS * math.sqrt(2.0 / news.size), 1.0)
+
+
+def _finite(capability: GradientNoise | HessianNoise | ScoreCovariance | None, like: np.ndarray) -> np.ndarray:
+    """Return the matrix of a capability in double precision, or 0 if there is none, or it is not finite."""
+    matrix = np.zeros_like(like) if capability is None else arrays.numpy(capability.matrix).astype(np.float64)
+    return matrix if np.isfinite(matrix).all() else np.zeros_like(like)
+
+
+def _outwards(state: AveragedNewtonState, x: np.ndarray) -> np.ndarray:
+    """Return the directions, -1 or 1, in which bounds stopped the last step, and 0 for elements that they did not stop, (n,).
+
+    If all elements missed the end, the step was not taken, and no other element could make up for the bounds.
+    """
+    missed, step = state.end - x, state.step
+    stopped = (np.abs(missed) > _STOPPED * np.abs(step)) & (missed * step > 0.0)
+    return np.where(stopped & ~stopped[step != 0.0].all(), np.sign(missed), 0.0)
 
 
 def _significant(scores: np.ndarray, variances: np.ndarray, units: np.ndarray) -> np.ndarray:

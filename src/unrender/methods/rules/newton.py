@@ -73,8 +73,9 @@ def few_numbers(traits: Traits) -> Plan | None:
     if not (nonlinear or traits.lights) or mixed or not traits.newton_suits or not _few(traits, keys):
         return None
     estimator = _estimator(traits, keys, constants.pose_images)
+    estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.remembered)
     if traits.poses:
-        trial = replace(estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None)
+        trial = replace(estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None, remember=False)
         trial = replace(trial, largest=widths_of(traits.options.sigma, problem, traits.poses))
         least = constants.explained if shapes else constants.explained_light
         if not problem.loss.linear or not explained(problem, trial) > least:
