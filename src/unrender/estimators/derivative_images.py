@@ -12,22 +12,20 @@ from unrender.statistics import scores
 __all__ = [
     "DerivativeMean",
     "LossWeights",
-    "NoiseMean",
     "Products",
     "differences",
     "noise_weights",
     "products",
+    "running_mean",
     "squared_slope",
 ]
 
 _VALUES = 1 << 22
 """Maximum number of image values that are converted to double precision at once."""
-_CHANNELS = 3
+_MEMORY = 0.3
+"""Weight of the latest image in the running mean of the variance."""
 _GROWTH = 1.0
 """Weights of derivative images in their mean grow as this power of their number."""
-_MOST_IMAGES, _RECENT = 40.0, 0.3
-"""Number of images that the mean of the noise remembers, and least weight of the latest in that of the references, which contains what the
-scene does not explain yet."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class LossWeights:
     """Derivatives of the loss by the pixels, (H, W, 3) each.
 
     Attributes:
-        first, second: ℓ' and ℓ'' at the image; `second` is (H, W, 3, 3) with weights that mix channels.
+        first, second: ℓ' and ℓ'' at the image.
         one, other: ℓ' at two independent halves of the image.
     """
 
@@ -44,63 +42,9 @@ class LossWeights:
     one: np.ndarray
     other: np.ndarray
 
-    def times(self, matrices: np.ndarray) -> LossWeights:
-        """Return the weights for residuals √ℓ'' r that are multiplied by a symmetric matrix per pixel, (H, W, 3, 3)."""
-        roots = np.sqrt(self.second)
-        over = np.divide(1.0, roots, out=np.zeros_like(roots), where=roots > 0.0)
-        first, one, other = (
-            roots * np.einsum("hwcd,hwd->hwc", matrices, over * x) for x in (self.first, self.one, self.other)
-        )
-        return LossWeights(first, roots[..., None] * matrices * roots[..., None, :], one, other)
-
-
-@dataclass(frozen=True)
-class NoiseMean:
-    """Mean noise of the residuals √ℓ'' r of a view's images, over steps.
-
-    Attributes:
-        rendering: covariance of each pixel's channels, (H, W, 3, 3).
-        references: mean of r rᵀ over all pixels without rendering noise, (3, 3): the noise of the reference, and what the scene at the
-            current parameters does not explain.
-        images: effective number of images in the mean.
-    """
-
-    rendering: np.ndarray
-    references: np.ndarray
-    images: float
-
-    @classmethod
-    def of(cls, second: np.ndarray, one: np.ndarray, other: np.ndarray, before: NoiseMean | None = None) -> NoiseMean:
-        """Return the mean with the noise of one more image.
-
-        Args:
-            second: ℓ'', (H, W, 3).
-            one, other: residuals r of its two halves, (H, W, 3).
-            before: mean of earlier images, in which recent ones have more weight; None for the first image.
-        """
-        roots = np.sqrt(second)
-        one, other = roots * one, roots * other
-        half = 0.5 * (one - other)
-        rendering = half[..., :, None] * half[..., None, :]
-        counted = roots.any(axis=-1).astype(np.float64)
-        if before is not None and (median := _median(before.variance())) > 0.0:
-            counted /= (
-                1.0 + before.variance() / median
-            ) ** 2  # few noisy pixels tell little about the others' references
-        product = np.einsum("hw,hwc,hwd->cd", counted, one, other) / max(float(counted.sum()), 1e-300)
-        references = 0.5 * (product + product.T)
-        if before is None:
-            return cls(rendering, references, 1.0)
-        share = 2.0 / (min(before.images, _MOST_IMAGES) + 2.0)
-        return cls(
-            before.rendering + share * (rendering - before.rendering),
-            before.references + max(share, _RECENT) * (references - before.references),
-            before.images + 1.0,
-        )
-
-    def variance(self) -> np.ndarray:
-        """Return the mean variance of each pixel's channels, (H, W)."""
-        return np.trace(self.rendering, axis1=-2, axis2=-1) / _CHANNELS
+    def times(self, factor: np.ndarray) -> LossWeights:
+        """Return the weights times a factor per pixel, (H, W, 1)."""
+        return LossWeights(self.first * factor, self.second * factor, self.one * factor, self.other * factor)
 
 
 @dataclass(frozen=True)
@@ -151,25 +95,19 @@ class Products:
     squares: np.ndarray
 
 
-def noise_weights(noise: NoiseMean, limit: float) -> np.ndarray:
-    """Return the weight (1 + (Σ + R) / (c m))⁻¹ of each pixel, (H, W, 3, 3).
+def noise_weights(variance: np.ndarray, limit: float) -> np.ndarray:
+    """Return the weight 1 / (1 + σ² / (c m)) of each pixel, with c = `limit` and the median m of the variances σ² above 0.
 
-    Σ is the covariance of its channels, R the noise of the references, c = `limit`, and m the median of the variances above 0, a third
-    of the trace of Σ. A few images tell little about nine numbers, so Σ is mixed with its mean variance by their number. The weights
-    are 1 where no pixel has noise.
+    It is 1 where no pixel has noise.
     """
-    unit, variance = np.eye(_CHANNELS), noise.variance()
-    if not variance.any():
-        return np.broadcast_to(unit, noise.rendering.shape)
-    known = noise.images / (noise.images + _CHANNELS)
-    covariance = known * noise.rendering + (1.0 - known) * variance[..., None, None] * unit
-    return np.linalg.inv(unit + (covariance + scores.positive_part(noise.references)) / (limit * _median(variance)))
-
-
-def _median(variance: np.ndarray) -> float:
-    """Return the median of the variances above 0; 0 if there is none."""
     noisy = variance[variance > 0.0]
-    return float(np.median(noisy)) if noisy.size else 0.0
+    return 1.0 / (1.0 + variance / (limit * float(np.median(noisy)))) if noisy.size else np.ones_like(variance)
+
+
+def running_mean(before: tuple[np.ndarray, ...], view: int, variance: np.ndarray) -> np.ndarray:
+    """Return the running mean of a view's variance (H, W, 1), from those of all views and the new one (H, W, 3)."""
+    new = variance.astype(np.float64).mean(axis=-1, keepdims=True)
+    return before[view] + _MEMORY * (new - before[view]) if before else new
 
 
 def squared_slope(halves: list[np.ndarray]) -> float:
@@ -213,26 +151,17 @@ def products(halves: list[np.ndarray], weights: LossWeights | None, block: int =
         )
         if block > 1:
             one, other, first, at_one, at_other = (_pooled(x, block) for x in (one, other, first, at_one, at_other))
-            flat = second.reshape(*second.shape[:2], -1)
-            second = (_pooled(flat, block) / _pooled(np.ones_like(flat), block)).reshape(
-                *first.shape[:2], *second.shape[2:]
-            )
+            second = _pooled(second, block) / _pooled(np.ones_like(second), block)
         of_halves = [(part * at).sum(axis=3) for part, at in ((one, at_one), (other, at_other))]
         total.scores += scores.covariance(of_halves[0], of_halves[1])
         half = 0.5 * (of_halves[0] - of_halves[1]).reshape(m, -1)
         total.gradient_noise += half @ half.T
         noise_of_halves = 0.5 * (one - other)
         total.gradient += 0.5 * ((one + other).reshape(m, -1) @ first.reshape(-1))
-        total.hessian += _times(one, second) @ other.reshape(m, -1).T
-        total.noise += _times(noise_of_halves, second) @ noise_of_halves.reshape(m, -1).T
+        total.hessian += (one * second).reshape(m, -1) @ other.reshape(m, -1).T
+        total.noise += (noise_of_halves * second).reshape(m, -1) @ noise_of_halves.reshape(m, -1).T
     total.hessian = 0.5 * (total.hessian + total.hessian.T)
     return total
-
-
-def _times(images: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return derivative images times ℓ'', (m, values)."""
-    mixed = second.ndim == images.ndim
-    return (np.einsum("mhwc,hwcd->mhwd", images, second) if mixed else images * second).reshape(len(images), -1)
 
 
 def _pooled(images: np.ndarray, block: int) -> np.ndarray:

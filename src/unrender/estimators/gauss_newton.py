@@ -27,10 +27,10 @@ from unrender.estimators.capabilities import (
 from unrender.estimators.derivative_images import (
     DerivativeMean,
     LossWeights,
-    NoiseMean,
     differences,
     noise_weights,
     products,
+    running_mean,
     squared_slope,
 )
 from unrender.estimators.gradient_sum import damping, smoothed_variance
@@ -58,14 +58,14 @@ class GaussNewtonState:
         widths: widths of the differences, {key: in units of the parameter}; {} before the first estimate.
         shift: target image shift of the differences in pixels.
         point: parameters of the last estimate, (n,); None before the first.
-        noise: mean noise of each view's residuals; () without `noise_limit` and before the first estimate.
+        variances: running mean of the variance of each view's image, (H, W, 1); () without `noise_limit` and before the first estimate.
         derivatives: mean derivative images of each view; () without `remember` and before the first estimate.
     """
 
     widths: dict[str, float]
     shift: float = 0.0
     point: np.ndarray | None = None
-    noise: tuple[NoiseMean, ...] = ()
+    variances: tuple[np.ndarray, ...] = ()
     derivatives: tuple[DerivativeMean, ...] = ()
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
@@ -106,10 +106,8 @@ class GaussNewton:
             little noise, and a start several pixels away takes few steps.
         largest: {key: maximum width, > 0}; no limit for the others. The pose of one shape needs it: the shape covers a part of the
             image, so it may never differ from the image as much as a shift of the full image would.
-        noise_limit: residuals are weighted by the inverse covariance of their noise in earlier images, of the rendering and of the
-            references, as in generalised least squares. This times the median variance is added to the covariance; > 0. Colour then
-            counts where all channels share their noise, and a few noisy pixels, such as those of a visible lamp, do not outweigh the
-            others. None for equal weights.
+        noise_limit: a pixel of variance σ² in earlier images has the weight 1 / (1 + σ² / (c m)), with this c and the median m over pixels
+            with noise, so a few noisy pixels, such as those of a visible lamp, do not outweigh the others; > 0. None for equal weights.
         remember: whether derivative images are averaged over steps while steps are short relative to the widths. Their noise is then
             small relative to the derivatives also for elements that hardly change the image. Not for large pictures of many elements.
     """
@@ -198,7 +196,7 @@ class GaussNewton:
         return replace(
             state,
             widths=widths,
-            noise=tuple(system.residual_noise) or state.noise,
+            variances=tuple(system.variances) or state.variances,
             derivatives=tuple(system.derivatives) or state.derivatives,
         )
 
@@ -248,7 +246,7 @@ class _System:
         squares: squared derivative images, summed over their pixels, (n,).
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
         images: images by view.
-        residual_noise: mean noise of each view's residuals.
+        variances: running mean of the variance of each view's image.
         derivatives: mean derivative images of each view.
     """
 
@@ -261,7 +259,7 @@ class _System:
     squares: np.ndarray
     slopes: np.ndarray
     images: dict[int, Array]
-    residual_noise: list[NoiseMean] = field(default_factory=list)
+    variances: list[np.ndarray] = field(default_factory=list)
     derivatives: list[DerivativeMean] = field(default_factory=list)
 
     @classmethod
@@ -317,9 +315,9 @@ class _Point:
             if images:
                 total.images[view] = images.mean
                 total.loss += arrays.number(self.problem.loss_value(view, images.mean))
+            weights = self._noise_weighted(view, images, state, total) if images else None
             if not elements.size:
                 continue
-            weights = self._noise_weighted(view, images, state, total) if images else None
             points, distances = self._points(elements, steps)
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
             mean = DerivativeMean(differences(halves[0], distances), differences(halves[1], distances))
@@ -338,19 +336,16 @@ class _Point:
         return total
 
     def _noise_weighted(self, view: int, images: _Images, state: GaussNewtonState, total: _System) -> LossWeights:
-        """Return the derivatives of the loss with the weights of the noise, and add the image's noise to `total`.
+        """Return the derivatives of the loss with the weights of the noise, and add the image's variance to `total`.
 
         The weights are of earlier images only. A bright outlier has a large residual and a large variance, so weights by this image's
         variance would shift the solution to darker images.
         """
-        weights = self._weights(view, images)
-        if self.options.noise_limit is None:
+        weights, limit = self._weights(view, images), self.options.noise_limit
+        if limit is None:
             return weights
-        reference = arrays.numpy(self.problem.reference(view)).astype(np.float64)
-        one, other = (arrays.numpy(half) - reference for half in (images.one, images.other))
-        before = state.noise[len(total.residual_noise)] if state.noise else None
-        total.residual_noise.append(NoiseMean.of(weights.second.astype(np.float64), one, other, before))
-        return weights if before is None else weights.times(noise_weights(before, self.options.noise_limit))
+        total.variances.append(running_mean(state.variances, view, arrays.numpy(images.variance)))
+        return weights.times(noise_weights(state.variances[view], limit)) if state.variances else weights
 
     def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the parameters with one element increased, then decreased, by its step, (2 m, n), within bounds, and the distances of
