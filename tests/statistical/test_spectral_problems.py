@@ -24,6 +24,7 @@ RUNS, SPP, STEP = 16, 256, 0.01
 
 def gallery(name: str) -> tuple[MitsubaRenderer, list[str]]:
     problem = ur.gallery.problem(name, resolution=16, texture_resolution=8, reference_spp=1)
+    assert isinstance(problem.renderer, MitsubaRenderer)
     return problem.renderer, list(problem.truth)
 
 
