@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
@@ -49,6 +50,73 @@ def test_the_image_is_that_of_mitsuba(renderer: MitsubaRenderer, stock: np.ndarr
     assert right, figures
     assert ours.std(axis=0).mean() < 1.3 * stock.std(axis=0).mean()
     assert not agree(1.02 * ours, stock, 2)[0]
+
+
+def _camera(**changes: Any) -> dict[str, Any]:
+    given = scene()["camera"]
+    return {"camera": {**given, **changes, "film": {**given["film"], **changes.get("film", {})}}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "others",
+    [
+        lambda: _camera(type="thinlens", aperture_radius=0.1, focus_distance=3.0),
+        lambda: {"camera": {key: x for key, x in scene()["camera"].items() if key != "fov"} | {"type": "orthographic"}},
+        lambda: _camera(film={"rfilter": {"type": "gaussian"}}),
+        lambda: _camera(film={"rfilter": {"type": "mitchell"}}),
+        lambda: _camera(film={"pixel_format": "luminance"}),
+        lambda: {"integrator": {"type": "path", "max_depth": DEPTH, "hide_emitters": True}},
+        lambda: {"sky": {"type": "envmap", "bitmap": mi.Bitmap(np.full((4, 8, 3), [1.5, 0.5, 0.1], np.float32))}},
+        lambda: {"sky": {"type": "point", "position": [1, 1, 3], "intensity": spectrum(0.01, 0.05, 0.02)}},
+        lambda: {"ball": {**scene()["ball"], "bsdf": {"type": "roughconductor", "material": "Au", "alpha": 0.3}}},
+        lambda: {"ball": {**scene()["ball"], "bsdf": {"type": "dielectric"}}},
+        lambda: {"ball": {**scene()["ball"], "bsdf": {"type": "plastic", "diffuse_reflectance": spectrum(0.1, 0.8)}}},
+    ],
+    ids=[
+        "thinlens", "orthographic", "gaussian", "mitchell", "luminance", "hidden", "envmap", "point", "gold", "glass",
+        "plastic",
+    ],
+)  # fmt: skip
+def test_images_of_other_sensors_lights_and_materials(others: Callable[[], dict[str, Any]]):
+    renderer = MitsubaRenderer(lambda: scene(**others()), DEPTH)
+    hidden = renderer.light_paths.hide_emitters
+    path = mi.load_dict({"type": "path", "max_depth": DEPTH, "hide_emitters": hidden})
+    loaded = mi.load_dict(scene(**others()))
+    stock = np.stack([np.array(mi.render(loaded, integrator=path, spp=SPP, seed=n)) for n in range(RUNS)])
+    right, figures = agree(images(renderer), stock * np.ones(3), 2)
+    assert right, figures
+
+
+@pytest.mark.slow
+def test_images_of_moved_shapes(stock: np.ndarray):
+    """Perturbed renders of poses: at the identity they are the scene's image, and a moved ball changes it."""
+    renderer = MitsubaRenderer(scene, DEPTH)
+    session = renderer.prepare(["ball.translation"], None, derivatives=False)
+    at = np.zeros((2, 3), np.float32)
+    at[1, 0] = 0.3
+    found = [session.image_batch({"ball.translation": at}, SampleRequest(0, SPP, 70 + n)) for n in range(RUNS)]
+    both = np.stack([np.array(images) for images in found])
+    right, figures = agree(both[:, 0], stock, 2)
+    assert right, figures
+    assert not agree(both[:, 1], stock, 2)[0]
+
+
+def test_pixels_of_several_sensors_in_one_launch():
+    description = {**scene(), "other": {**scene()["camera"], "fov": 30}}
+    renderer = MitsubaRenderer(description, DEPTH)
+    session, pixels = renderer.prepare([], None), np.arange(SIZE * SIZE)
+    request = SampleRequest(0, SPP, 3, pixels=mi.UInt32(pixels), sensors=mi.UInt32(pixels % 2))
+    together = np.stack(
+        [np.array(session.image({}, replace(request, seed=n)).images[0]).reshape(SIZE, SIZE, 3) for n in range(RUNS)]
+    )
+    alone = [
+        np.stack([np.array(session.image({}, SampleRequest(s, SPP, 50 + n)).images[0]) for n in range(RUNS)])
+        for s in (0, 1)
+    ]
+    chosen = np.where((pixels % 2).reshape(SIZE, SIZE, 1) == 0, *alone)
+    right, figures = agree(together, chosen, 2)
+    assert right, figures
 
 
 @functools.cache
