@@ -159,12 +159,14 @@ class Effort:
         rate: learning rate over the start's distance from the truth.
         pictures: how many pictures make one half of the reference, and of a picture whose error counts.
         widths: distances of the start, in `_scale`; the first one that the pictures show is taken.
+        newton: Gauss-Newton steps from perturbed renders instead of Adam's, as `auto` takes for few numbers.
     """
 
     spp: int
     rate: float
     pictures: int
     widths: tuple[float, ...]
+    newton: bool = False
 
 
 _EFFORTS = (
@@ -172,21 +174,24 @@ _EFFORTS = (
     Effort(8 * DESCENT_SPP, 0.08, 32, (8.0,)),
 )
 """The second one where the first one does not suffice."""
+_NEWTON, _FEW = Effort(8 * DESCENT_SPP, 0.08, 32, (8.0,), newton=True), 24
+"""Where both do not suffice, for at most so many numbers: their slopes are small relative to the noise of one render."""
 
 
 def descent(renderer: Any, key: str, info: Any) -> dict[str, Any]:
-    """Descend from a perturbed start by Adam: on path gradients, or on perturbed renders where there are none.
+    """Descend from a perturbed start by Adam: on path gradients, or on perturbed renders where there are none. Few numbers that noise hides
+    take Gauss-Newton steps.
 
     Returns:
         Mean squares of the pictures' differences "before" and "after", without the noise of their rendering, and the standard
         "deviation" of the first; the parameter's error after over before as "error"; "ok", or None where the pictures hardly differ.
     """
     found = _descend(renderer, key, info, _EFFORTS[0])
-    return (
-        found
-        if found["ok"] or (found["ok"] is None and not info.differentiable)
-        else _descend(renderer, key, info, _EFFORTS[1])
-    )
+    if found["ok"] or (found["ok"] is None and not info.differentiable):
+        return found
+    found = _descend(renderer, key, info, _EFFORTS[1])
+    few = info.perturbable and np.prod(info.shape, dtype=int) <= _FEW
+    return _descend(renderer, key, info, _NEWTON) if found["ok"] is False and few else found
 
 
 def _descend(renderer: Any, key: str, info: Any, effort: Effort) -> dict[str, Any]:
@@ -221,8 +226,10 @@ def _descend(renderer: Any, key: str, info: Any, effort: Effort) -> dict[str, An
     problem = ur.Problem(renderer, [parameter], [ur.View(reference)], truth={key: truth})
     smoothed = ur.SmoothedDerivatives(size / 2, samples=8, spp=effort.spp)
     estimator = ur.PathGradient(spp=effort.spp) if info.differentiable else smoothed
-    adam = ur.optimizers.Adam(effort.rate * size, schedule=ur.schedules.Cosine(STEPS))
-    end = descend(problem, estimator, adam, STEPS)[key]
+    optimizer = ur.optimizers.Adam(effort.rate * size, schedule=ur.schedules.Cosine(STEPS))
+    if effort.newton:
+        estimator, optimizer = ur.GaussNewton(4 * effort.spp, effort.spp), ur.optimizers.AveragedNewton()
+    end = descend(problem, estimator, optimizer, STEPS)[key]
     after, _ = error(end)
     first, last = (problem.parameter_error({key: value})[key] for value in (start.astype(np.float32), end))
     closer = last / first if first else 0.0

@@ -104,6 +104,13 @@ def sky() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     return made, {"sky.turbidity": 3.0}, {"sky.turbidity": 6.0}, 0.7  # the reference has noise
 
 
+def sunlight() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
+    """A sun whose start is behind the scene."""
+    made, _, _, _ = sky()
+    made["floor"]["bsdf"] = checkers(3)
+    return made, {"sky.sun_direction": [0.3, 0.4, 0.86]}, {"sky.sun_direction": [-0.8, -0.3, 0.4]}, 3.0  # degrees
+
+
 def pose() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     place = mi.ScalarTransform4f().translate([0.3, 0.35, 0.2]).rotate([0, 1, 0], 25).scale([0.3, 0.35, 0.2])
     walls = {"type": "diffuse", "reflectance": rgb(0.6, 0.5, 0.4)}
@@ -124,6 +131,7 @@ CASES: dict[str, Callable[[], tuple[Scene, dict[str, Any], dict[str, Any], float
     "view": view,
     "glass": glass,
     "sky": sky,
+    "sunlight": sunlight,
     "pose": pose,
 }
 
@@ -177,6 +185,16 @@ def test_lights_arrive_from_a_tenth_and_from_ten_times_their_brightness(
     for key, light in zip(BRIGHTNESSES, LIGHTS.values(), strict=True):
         colour = light.get("emitter", light).get("radiance") or light["intensity"]
         np.testing.assert_allclose(result.parameters[key], colour["value"], rtol=0.03)
+
+
+def test_a_direction_of_any_length_means_the_same_sun() -> None:
+    """Mitsuba normalises it at loading, but not when it is set: half a vector is then another sky."""
+    scene, truth, _, _ = sunlight()
+    key, direction = next((key, np.array(value) / np.linalg.norm(value)) for key, value in truth.items())
+    problem = ur.Problem(scene, [ur.Parameter(key)], [ur.View(np.zeros((SIZE, SIZE, 3), np.float32))], max_depth=2)
+    images = [ur.render(problem, {key: factor * direction}, spp=16, seed=1) for factor in (1.0, 0.4, 3.0)]
+    for image in images[1:]:  # rounding changes a few paths
+        assert np.abs(image - images[0]).mean() < 0.01 * images[0].mean()
 
 
 def test_on_a_plateau_poses_take_steps_by_a_smoothed_loss() -> None:

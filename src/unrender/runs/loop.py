@@ -212,7 +212,7 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     mapped = by_coordinates(estimate, problem, parameters)
     steps, state = optimizer.update(mapped, state, coordinates.of(parameters))
     moved, reached = coordinates.moved(parameters, steps)
-    bounded = {k: problem.unknowns[k].project(x) for k, x in reached.items()}
+    bounded = {k: problem.unknowns[k].reached(x) for k, x in reached.items()}
     # Checked before projection, because the projection of a NaN may be a bound.
     finite = trees.map(arrays.is_finite, moved)
     del steps, moved, reached

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.parameterisations.base import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner
@@ -19,6 +20,8 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
 from unrender.scene.remeshing import Remeshing
 from unrender.scene.surfaces import Surface, surface_error
+
+_VECTOR = (3,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +73,14 @@ class Unknown:
     def project(self, values: Array) -> Array:
         """Return the nearest values inside the bounds, less the margin."""
         return project(values, *self.bounds, self._scale)
+
+    def reached(self, values: Array) -> Array:
+        """Return the values after a step that leads to `values`: inside the bounds, and of length 1 if they are one direction."""
+        inside = self.project(values)
+        if self.measure.role != "direction" or self.initial.shape != _VECTOR:
+            return inside
+        length = float(np.linalg.norm(arrays.numpy(inside)))
+        return inside / arrays.scalar(length, inside) if length > 0.0 else inside
 
     def shape(self, step: int | None = None) -> tuple[int, ...]:
         """Return its shape at a step; None for the scene's."""

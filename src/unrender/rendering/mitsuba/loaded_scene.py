@@ -25,7 +25,7 @@ from unrender.core.text import reason_of
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import gpu, spectral_colours
 from unrender.rendering.mitsuba.frozen import FrozenFunction
-from unrender.rendering.mitsuba.parameters import normals_key
+from unrender.rendering.mitsuba.parameters import is_one_direction, normals_key
 from unrender.rendering.mitsuba.ranges import SlotReaders
 from unrender.rendering.mitsuba.recordable import build_distributions
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
@@ -231,7 +231,8 @@ class LoadedScene:
             if key in self.poses:
                 self._posed[key] = leaf
             else:
-                self.parameters[key] = leaf
+                # Mitsuba normalises a direction when it loads it, but not when it is set, and renders another sky then.
+                self.parameters[key] = dr.normalize(leaf) if is_one_direction(key, leaf) else leaf
         plain = [key for key in changed if key not in self.poses]
         if plain:
             self._update(plain)

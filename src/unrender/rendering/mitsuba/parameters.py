@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
+import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba import poses
@@ -21,6 +22,7 @@ __all__ = [
     "brightness",
     "is_nonlinear",
     "is_of_vertices",
+    "is_one_direction",
     "normals_key",
     "parameter_traits",
     "role",
@@ -213,6 +215,11 @@ def update_obstacle(parameters: mi.SceneParameters, key: str) -> str:
     if leaf == "grid":
         reason = "Mitsuba corrupts memory when the distances of an sdfgrid change"
     return f"{reason}; recover a mesh's {POSITIONS} instead"
+
+
+def is_one_direction(key: str, value: Any) -> bool:
+    """Return whether a parameter is a single direction, such as the sun's."""
+    return key.rpartition(".")[2] in _DIRECTIONS and dr.size_v(value) == 3 and dr.width(value) == 1
 
 
 def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Role:
