@@ -24,11 +24,11 @@ instances* have the plugin's shape in a `shapegroup` with two instances; one par
 
 *refused* is followed by the line that a user reads. *perturbed* means that there is no path gradient, so `--method smoothed` recovers the
 parameter from perturbed renders. *weak* means that noise would hide a difference of 3 % of a picture, or of the whole gradient. *unseen*
-means that a start far away in the parameter's range leaves the picture as it is, within noise. A descent begins a tenth of the range
-away, or further where the pictures would hardly differ. It follows path gradients, or perturbed renders where there are none. Up to 24
-numbers that noise hides take Gauss-Newton steps instead. The squared error of its picture must halve. On path gradients, the parameter must come closer to the truth, too, except vertices, normals, texture
-coordinates and tables of phase functions, of which many give nearly the same picture. **no** marks a descent that did less within 40 steps:
-the noise of the renders hides its parameter."""
+means that a start far away in the parameter's range leaves the picture as it is, within noise. A descent begins a tenth of the range away,
+or further where the pictures would hardly differ. It follows path gradients, or perturbed renders where there are none. Up to 24 numbers
+that noise hides take Gauss-Newton steps instead. The squared error of its picture must halve. On path gradients, the parameter must come
+closer to the truth, too, except vertices, normals, texture coordinates and tables of phase functions, of which many give nearly the same
+picture. **no** marks a descent that did less within 40 steps: the noise of the renders hides its parameter."""
 
 
 def page(record: dict[str, Any]) -> str:

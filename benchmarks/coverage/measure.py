@@ -190,7 +190,7 @@ def descent(renderer: Any, key: str, info: Any) -> dict[str, Any]:
     if found["ok"] or (found["ok"] is None and not info.differentiable):
         return found
     found = _descend(renderer, key, info, _EFFORTS[1])
-    few = info.perturbable and np.prod(info.shape, dtype=int) <= _FEW
+    few = not info.differentiable and np.prod(info.shape, dtype=int) <= _FEW
     return _descend(renderer, key, info, _NEWTON) if found["ok"] is False and few else found
 
 
