@@ -81,6 +81,7 @@ def run(
     strength: float = 4.0,
     rates: tuple[float, ...] = (0.03, 0.1),
     repetitions: int = 40,
+    only: tuple[str, ...] = (),
 ) -> Iterator[dict[str, Any]]:
     """Every way.
 
@@ -93,6 +94,7 @@ def run(
         strength: of the large steps
         rates: tried on a seed of its own
         repetitions: gradients that a variance is of
+        only: ways of choosing pixels; left out, all
     """
     found: dict[str, Any] = {}
     for name in problems:
@@ -102,8 +104,9 @@ def run(
         problem = with_preconditioner(problem, ur.preconditioners.LargeSteps(strength), key)
         what = "surface" if problem.has_truth else "pictures"
         label = name if (pixels, spp) == _USUAL else f"{name}, {pixels} pixels, {spp} spp"
-        found[label] = {"judged by": what, "views": len(problem.views), "methods": {}}
-        for way, sampler in samplers(pixels, len(problem.views)).items():
+        found[label] = {"judged by": what, "views": len(problem.views), "seconds": seconds, "methods": {}}
+        ways = samplers(pixels, len(problem.views))
+        for way, sampler in ((way, ways[way]) for way in only or ways):
 
             def final(rate: float, sampler: PixelSampler = sampler, problem: ur.Problem = problem) -> float:
                 found = descend(problem, sampler, rate, spp, seconds, TUNING_SEED)
@@ -126,13 +129,13 @@ def table(record: Record) -> str:
             values = ([run[what] for run in of["runs"] if what in run] for what in ("surface", "pictures"))
             finals = (markdown.spread(each) if each else "–" for each in values)
             noise = f"{of['variance'] / uniform:.3g}" if uniform else "–"
-            rows.append([problem, name, f"{of['rate']:g}", *finals, noise])
+            rows.append([problem, f"{found['seconds']:g} s", name, f"{of['rate']:g}", *finals, noise])
     text = (
-        "Of the start's, after {seconds:g} s of the processor, {seeds} seeds: median (least to greatest). "
+        "Of the start's, after some seconds of the processor, {seeds} seeds: median (least to greatest). "
         "Views of {resolution}², mini-batches of 2048 pixels, 4 spp, where no others are named. "
         "Variance of the gradient at the start, over that of uniform mini-batches."
     )
-    head = "problem | pixels | rate | surface error | picture error | variance"
+    head = "problem | seconds | pixels | rate | surface error | picture error | variance"
     return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
 
 
