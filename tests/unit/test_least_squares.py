@@ -10,7 +10,7 @@ import pytest
 import unrender as ur
 from unrender.core.random import Key
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs.least_squares import check_numbers
+from unrender.runs.least_squares import _Fit, _judged, check_numbers
 from unrender.runs.numbers import Numbers
 
 SHAPE = (8, 8)
@@ -96,6 +96,19 @@ def test_a_number_without_influence_is_open_and_the_others_are_not():
     made = problem(matrix)
     found = check_numbers(made, at(np.append(best(made, MATRIX)[:3], 0.5)), made.initial_values(), FAR)
     assert list(found.undetermined) == ["b"]
+
+
+@pytest.mark.parametrize("share", [0.0125, 0.0])
+def test_a_number_that_moves_a_little_with_an_open_one_has_a_standard_error_of_that(share: float):
+    """Along a hidden direction b changes by .25, half its size, and the first of a by .0125, 2 % of its own."""
+    made = problem(MATRIX)
+    numbers = Numbers.of(made, TRUTH, made.initial_values())
+    assert numbers is not None
+    error, unseen = np.full(4, 0.001), np.array([[share], [0.0], [0.0], [0.25]])
+    found = _judged(numbers, _Fit(np.diag(error**2), error, error, np.zeros(4), unseen), np.full(4, 0.01))
+    assert list(found.undetermined) == ["b"]
+    np.testing.assert_allclose(found.errors["a"], [np.hypot(0.001, share), 0.001, 0.001], rtol=1e-9)
+    assert np.isinf(found.errors["b"]).all()
 
 
 @pytest.mark.parametrize("entry", [0.0, np.nan])

@@ -242,12 +242,13 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     posed = numbers.rigid | (numbers.sizes <= 0.0)
     sizes = np.where(posed, np.maximum(numbers.sizes, _OF_WIDTHS * widths), numbers.sizes)
     unseen = fit.unseen > _DOUBTFUL * np.where(posed, 2.0 * numbers.limits[: numbers.count], sizes)[:, None]
-    error = np.where(unseen.any(axis=1), np.inf, fit.error)
+    hidden = np.sqrt(np.square(fit.unseen).sum(axis=1))  # what moves along with a number that is left open
+    error = np.where(unseen.any(axis=1), np.inf, np.hypot(fit.error, hidden))
     open_ = error > _DOUBTFUL * sizes
     n, spread = numbers.count, np.outer(fit.error, fit.error)
     together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (unseen[:, None] & unseen[None]).any(axis=2)
     shared = open_ & (_shared_with_fields(fit.covariance, n) | unseen.any(axis=1))
-    further = np.abs(fit.step) > np.maximum(_STEP_ERRORS * np.maximum(fit.error, fit.own), _FURTHER * sizes)
+    further = np.abs(fit.step) > np.maximum(_STEP_ERRORS * np.maximum(error, fit.own), _FURTHER * sizes)
     shown, more = np.minimum(error, sizes), np.where(error > sizes, " or more", "")
     undetermined, unfinished = {}, {}
     for key, of in numbers.places().items():
