@@ -27,6 +27,7 @@ _QUIET = {
     "RAY_enable_metrics_collection": "0",
     "RAY_DISABLE_IMPORT_WARNING": "1",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
+    "RAY_worker_niceness": "0",  # its own would starve workers on a busy machine
 }
 
 
@@ -156,7 +157,7 @@ class Machines:
 
     def start(self, n: int) -> None:
         """Start a node, and wait until it is there; the head has to be the first."""
-        ray = Path(sys.executable).with_name("ray")
+        ray = (sys.executable, "-m", "ray.scripts.scripts", "start")
         own = ["--head", f"--port={_PORT}", "--include-dashboard=false", f"--temp-dir={self._folder / 'r'}"]
         words = [
             *(own if n == self.head else [f"--address={self.address}"]),
@@ -169,7 +170,7 @@ class Machines:
         ]
         log = (self._folder / f"node{n}.log").open("ab")
         self._nodes[n] = subprocess.Popen(
-            self.link.words(n, ray, "start", *words),
+            self.link.words(n, *ray, *words),
             stdout=log,
             stderr=log,
             env=self.environment,
@@ -216,7 +217,7 @@ class Machines:
             f"ray.init(address={self.address!r}, logging_level='ERROR', log_to_driver=False)\n"
             f"sys.exit(not any(x['Alive'] and x['NodeManagerAddress'] == '{_NETWORK}.{n + 1}' for x in ray.nodes()))"
         )
-        while time.monotonic() < end:
+        while time.monotonic() < end and self._nodes[n].poll() is None:
             done = subprocess.run(
                 self.link.words(self.head, sys.executable, "-c", code),
                 env=self.environment,
