@@ -168,14 +168,14 @@ class Machines:
             "--disable-usage-stats",
             "--block",
         ]
-        log = (self._folder / f"node{n}.log").open("ab")
-        self._nodes[n] = subprocess.Popen(
-            self.link.words(n, *ray, *words),
-            stdout=log,
-            stderr=log,
-            env=self.environment,
-            start_new_session=True,
-        )
+        with (self._folder / f"node{n}.log").open("ab") as log:
+            self._nodes[n] = subprocess.Popen(
+                self.link.words(n, *ray, *words),
+                stdout=log,
+                stderr=log,
+                env=self.environment,
+                start_new_session=True,
+            )
         self._await(n, log.name)
 
     @property
