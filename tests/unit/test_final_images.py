@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,30 @@ def test_the_error_of_a_picture_is_told_without_its_noise() -> None:
         assert with_noise > 2 * truth  # what the headline used to say
         assert value <= truth + 4 * error
         assert value + 4 * error >= truth
+
+
+@pytest.mark.parametrize(("what", "said"), [("ramp", True), ("noise", False), ("nothing", False)])
+def test_few_numbers_whose_picture_does_not_fit_are_warned_of(what: str, said: bool) -> None:
+    """A smooth difference is another minimum or a wrong model; noise of the references is neither. Errors of a misfit mean nothing."""
+    made = problem(noise=0.1)
+    renderer = made.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    truth = {"wall": np.full(3, 0.5, np.float32)}
+    reference = np.asarray(renderer.exact(truth))
+    size = float(np.sqrt(np.mean(reference**2)))
+    added = {
+        "ramp": 0.03 * size * np.linspace(0, 2, 16)[:, None, None],
+        "noise": 0.05 * size * np.random.default_rng(1).normal(size=reference.shape),
+        "nothing": 0.0,
+    }
+    made = Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(reference + added[what])])
+    result = Result(truth, {"wall": np.full(3, 0.4, np.float32)}, [{"step": 1, "loss": 0.1}], 1.0, 0.0, "steps")
+    result = replace(result, standard_error={"wall": np.full(3, 0.01)})
+    found = final_images.render_final_images(made, result, 64, tested=False)
+    assert any("differs from the references" in line for line in found.warnings) == said
+    assert bool(found.standard_error) == (not said)
+    told = replace(result, warnings=["the final picture differs from the references by 0.1, ..."])
+    assert not final_images.render_final_images(made, told, 64, tested=False).warnings
 
 
 def test_one_sample_has_no_halves() -> None:

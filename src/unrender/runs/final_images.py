@@ -11,6 +11,7 @@ import numpy as np
 
 from unrender.core import phases
 from unrender.core.text import listed
+from unrender.display import formatting
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
@@ -20,7 +21,8 @@ from unrender.runs.map_uncertainty import Uncertainty, of_residuals
 from unrender.runs.result import Result
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
-from unrender.statistics import debiased
+from unrender.scene.view import View
+from unrender.statistics import debiased, paired_losses
 
 _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
@@ -36,6 +38,9 @@ _NUMBERS_SHARE = 0.05
 """Time limit of least squares of few numbers relative to the time of the steps; at least one second."""
 _UNSETTLED = 3.0
 """Standard errors from which the remaining least-squares step is the standard error."""
+_FEW_NUMBERS, _SCORE, _OF_PICTURE = 24, 4.5, 0.01
+"""Most numbers of a problem whose images must agree with the references; smallest score of a difference; its smallest size relative to
+the image."""
 _TRIAL_PATHS = 1 << 18
 _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 """Paths of one pass over all views, and its most samples per pixel."""
@@ -44,6 +49,8 @@ _PICTURES_SHARE = 0.5
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
+_DIFFERS = "differs from the references"
+"""Part of the warnings about images that do not agree with the references."""
 _SEEDS = {"initial": 1, "result": 2}
 _SECOND_HALF = 1 << 16
 """Offset of the seed for the second half of an image's samples."""
@@ -149,6 +156,9 @@ def render_final_images(
             if result.steps and len(ends[0]) == 2 and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, list(zip(*ends, strict=True)), known)
     deviations |= maps.standard_error
+    misfit = _misfit(problem, result, [problem.views[index] for index in chosen], ends)
+    if misfit:
+        warnings, deviations = (*warnings, misfit), {}
     return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share)
 
 
@@ -178,6 +188,31 @@ def _undetermined(
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
     return lines, unfinished, deviations
+
+
+def _misfit(problem: Problem, result: Result, views: Sequence[View], ends: Sequence[tuple[np.ndarray, ...]]) -> str:
+    """Return a warning if only few numbers are unknown, and the images still differ from the references; else "".
+
+    Least squares of few numbers end where the difference is noise. Noise of the references does not count, since pixels do not share it.
+    """
+    few = sum(value.size for value in result.parameters.values()) <= _FEW_NUMBERS and len(ends[0]) == 2
+    if not few or not result.steps or any(_DIFFERS in line for line in result.warnings):
+        return ""
+    references = [np.asarray(view.reference, np.float32) for view in views]
+    weights = [view.pixel_weights(image.shape[:2]).reshape(-1) for view, image in zip(views, references, strict=True)]
+    halves = [
+        np.concatenate([(end[half] - image).reshape(-1, 3) for end, image in zip(ends, references, strict=True)])
+        for half in (0, 1)
+    ]
+    shared = paired_losses.systematic(halves[0], np.concatenate(weights), halves[1])
+    size = math.sqrt(np.mean(np.square(np.concatenate([image.reshape(-1) for image in references]), dtype=np.float64)))
+    error = math.sqrt(max(shared.mean_square, 0.0))
+    if not shared.score > _SCORE or error <= _OF_PICTURE * size:
+        return ""
+    return (
+        f"the final picture {_DIFFERS} by {formatting.number(error)} ({error / size:.0%} of the picture), which noise does not explain: "
+        "the run needs more steps or another start, or something that is not among the unknowns is wrong"
+    )
 
 
 def _unchecked(keys: Sequence[str]) -> list[str]:

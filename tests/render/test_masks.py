@@ -1,0 +1,53 @@
+"""Opacity masks under lamps: the closed form, and what Mitsuba's path integrator makes of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
+from unrender.rendering.renderer import SampleRequest
+
+SAID = "Mitsuba's path integrator squares the opacity"
+KEY = "sheet.bsdf.opacity.value"
+
+
+def scene(opacity: float, integrator: str = "path") -> dict[str, Any]:
+    """A diffuse sheet that a lamp lights, before black."""
+    look = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
+    return {
+        "type": "scene",
+        "integrator": {"type": integrator, "max_depth": 2},
+        "sensor": {"type": "perspective", "fov": 20, "to_world": look, "film": film},
+        "sheet": {"type": "rectangle", "bsdf": {"type": "mask", "opacity": opacity, "bsdf": {"type": "diffuse"}}},
+        "lamp": {"type": "point", "position": [1, 1, 3], "intensity": 10.0},
+    }
+
+
+def theirs(opacity: float, integrator: str = "path") -> float:
+    return float(np.mean(np.array(mi.render(mi.load_dict(scene(opacity, integrator)), spp=512))))
+
+
+def test_a_sheet_reflects_in_proportion_to_its_opacity() -> None:
+    """As `prb` and `volpath` have it. Without this difference the notice can go."""
+    renderer = MitsubaRenderer(scene(0.6), 2)
+    image = np.array(renderer.prepare([], None).image({}, SampleRequest(0, 512, 1)).images)
+    whole = theirs(1.0)
+    assert float(image.mean()) == pytest.approx(0.6 * whole, rel=2e-3)
+    assert theirs(0.6, "prb") == pytest.approx(0.6 * whole, rel=2e-3)
+    assert theirs(0.6) == pytest.approx(0.36 * whole, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("opacity", "integrator", "keys", "said"),
+    [(0.6, "path", (), True), (1.0, "path", (KEY,), True), (1.0, "path", (), False), (0.6, "prb", (KEY,), False)],
+)
+def test_the_notice_comes_where_references_may_be_wrong(
+    opacity: float, integrator: str, keys: tuple[str, ...], said: bool
+) -> None:
+    notices = MitsubaRenderer(scene(opacity, integrator), 2, keys).notices
+    assert any(notice.startswith(SAID) for notice in notices) == said
