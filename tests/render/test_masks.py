@@ -28,6 +28,23 @@ def scene(opacity: float, integrator: str = "path") -> dict[str, Any]:
     }
 
 
+def cut_out(value: float, byte: bool = False) -> dict[str, Any]:
+    """The sheet with a texture of opacity: 0, 1 and `value`."""
+    described = scene(1.0)
+    values = np.array([[0.0, 1.0], [1.0, value]], np.float32)[..., None]
+    bitmap = mi.Bitmap((values * 255).astype(np.uint8) if byte else values)
+    opacity = {"type": "bitmap", "bitmap": bitmap, "raw": True}
+    described["sheet"]["bsdf"]["opacity"] = opacity | ({"format": "auto"} if byte else {})
+    return described
+
+
+@pytest.mark.parametrize("byte", [False, True])
+def test_textures_of_opacity_have_the_notice_too(byte: bool) -> None:
+    for value, said in ((0.5, True), (1.0, False)):
+        notices = MitsubaRenderer(cut_out(value, byte), 2).notices
+        assert any(notice.startswith(SAID) for notice in notices) == said
+
+
 def theirs(opacity: float, integrator: str = "path") -> float:
     return float(np.mean(np.array(mi.render(mi.load_dict(scene(opacity, integrator)), spp=512))))
 

@@ -79,7 +79,34 @@ def test_few_numbers_whose_picture_does_not_fit_are_warned_of(what: str, said: b
     assert any("differs from the references" in line for line in found.warnings) == said
     assert bool(found.standard_error) == (not said)
     told = replace(result, warnings=["the final picture differs from the references by 0.1, ..."])
-    assert not final_images.render_final_images(made, told, 64, tested=False).warnings
+    found = final_images.render_final_images(made, told, 64, tested=False)
+    assert not found.warnings
+    assert not found.standard_error
+
+
+@pytest.mark.parametrize("outside", [0.0, 50.0])
+def test_pixels_outside_the_mask_do_not_count_for_a_misfit(outside: float) -> None:
+    made = problem(noise=0.1)
+    renderer = made.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    truth = {"wall": np.full(3, 0.5, np.float32)}
+    reference = np.asarray(renderer.exact(truth)) * (1 + 0.06 * np.linspace(0, 1, 16)[:, None, None])
+    mask = np.ones(SHAPE)
+    mask[:, 8:] = 0.0
+    reference[:, 8:] = outside
+    made = Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(reference, mask=mask)])
+    result = Result(truth, {"wall": np.full(3, 0.4, np.float32)}, [{"step": 1, "loss": 0.1}], 1.0, 0.0, "steps")
+    found = final_images.render_final_images(made, result, 64, tested=False)
+    assert any("differs from the references" in line for line in found.warnings)
+
+
+def test_black_references_make_no_error() -> None:
+    made = problem(noise=0.1)
+    black = Problem(made.renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(np.zeros((*SHAPE, 3)))])
+    values = {"wall": np.full(3, 0.5, np.float32)}
+    result = Result(values, values, [{"step": 1, "loss": 0.1}], 1.0, 0.0, "steps")
+    (line,) = final_images.render_final_images(black, result, 64, tested=False).warnings
+    assert "%" not in line
 
 
 def test_one_sample_has_no_halves() -> None:

@@ -133,7 +133,7 @@ def test_a_warning_that_is_no_unicode_is_written(tmp_path: Path) -> None:
             run.warnings.append("photo \udcff")
 
     ur.optimize(_problem("a"), ur.PathGradient(), ur.optimizers.SGD(), 1, callbacks=[Warns()], run_directory=tmp_path)
-    assert reader.read(tmp_path).record.warnings == ["photo \\udcff"]
+    assert "photo \\udcff" in reader.read(tmp_path).record.warnings
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)

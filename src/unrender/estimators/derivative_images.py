@@ -63,8 +63,19 @@ class DerivativeMean:
     other: np.ndarray
     count: float = 1.0
 
+    def is_finite(self) -> bool:
+        """Return whether all values are finite."""
+        return bool(np.isfinite(self.one).all() and np.isfinite(self.other).all())
+
     def and_one(self, new: DerivativeMean, moved: float) -> DerivativeMean:
-        """Return the mean with one more derivative image, after a step of length `moved` in units of the differences' widths."""
+        """Return the mean with one more derivative image, after a step of length `moved` in units of the differences' widths.
+
+        Images that are not finite are left out.
+        """
+        if not new.is_finite():
+            return self
+        if not self.is_finite():
+            return new
         usual = (1.0 + _GROWTH) / (self.count + 1.0 + _GROWTH)
         weight = max(usual, moved * moved / (1.0 + moved * moved))
         one, other = (

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.core import arrays, checks, trees
+from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -34,7 +35,7 @@ _LEAST_NOISE, _SURPRISE_ERRORS = 1e-6, 6.0
 """Relative eigenvalue of the gradient's noise below which a direction has none, and standard errors of a mean square of 1 that noise may
 reach."""
 _STOPPED = 1e-3
-"""Share of a step by which the parameters miss its end from which bounds stopped it."""
+"""Smallest miss of a step's end, relative to the step, that counts as a bound."""
 _WEAK_SHARE = 0.01
 """Squared share of an element in damped directions above which its standard error is infinite."""
 _OF_LINEAR = 1e4
@@ -63,7 +64,7 @@ class AveragedNewtonState:
             the model's gradient and that of the previous mean.
         radii: radius of the trust region of each element, (n,), in its units.
         step: last step, in units of the parameters, (n,).
-        end: where it should have led, (n,). The parameters differ from it where their bounds are.
+        end: planned parameters after the last step, (n,). The parameters differ from it where their bounds are.
         scores: mean covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; 0 if there is none.
         score_variances: variance of the diagonal of `scores`, (n,).
     """
@@ -129,6 +130,8 @@ class AveragedNewton:
     linear: tuple[str, ...] = ()
 
     def __post_init__(self):
+        if isinstance(self.linear, str):
+            raise InputError(f"AveragedNewton: linear: expected a list of keys, got {self.linear!r}")
         object.__setattr__(self, "linear", tuple(self.linear))  # files hold lists
         rates.check("AveragedNewton", self.learning_rate, None)
         checks.number("AveragedNewton", "averaging", self.averaging, above=0.0, inclusive=True)
@@ -326,7 +329,8 @@ def _outwards(state: AveragedNewtonState, x: np.ndarray) -> np.ndarray:
     If all elements missed the end, the step was not taken, and no other element could make up for the bounds.
     """
     missed, step = state.end - x, state.step
-    stopped = (np.abs(missed) > _STOPPED * np.abs(step)) & (missed * step > 0.0)
+    rounding = 4.0 * float(np.finfo(np.float32).eps) * np.abs(x)
+    stopped = (np.abs(missed) > np.maximum(_STOPPED * np.abs(step), rounding)) & (missed * step > 0.0)
     return np.where(stopped & ~stopped[step != 0.0].all(), np.sign(missed), 0.0)
 
 

@@ -115,7 +115,7 @@ def few_steps(seconds: float, steps: int, most: int | None = None) -> str:
     if steps >= min(_FEW_STEPS, most or _FEW_STEPS):
         return ""
     return (
-        f"the budget of {seconds:g} s allows about {steps} step{'s' if steps > 1 else ''}; use more seconds, fewer samples "
+        f"the budget of {seconds:g} s allows about {steps} step{'' if steps == 1 else 's'}; use more seconds, fewer samples "
         "(--set spp=1), a smaller picture (resolution), or fewer pixels a step of a large one (--set pixels=4096)"
     )
 

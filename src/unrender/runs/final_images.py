@@ -19,6 +19,7 @@ from unrender.runs.image_sensitivity import Curvature, curvature
 from unrender.runs.least_squares import check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, of_residuals
 from unrender.runs.result import Result
+from unrender.runs.verification import DIFFERS
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.scene.view import View
@@ -49,8 +50,6 @@ _PICTURES_SHARE = 0.5
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
-_DIFFERS = "differs from the references"
-"""Part of the warnings about images that do not agree with the references."""
 _SEEDS = {"initial": 1, "result": 2}
 _SECOND_HALF = 1 << 16
 """Offset of the seed for the second half of an image's samples."""
@@ -118,7 +117,6 @@ def render_final_images(
             take about half a second.
         tested: whether to estimate sensitivities and to test what the images determine.
     """
-    weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
     pictures: dict[str, np.ndarray] = {}
     errors: dict[str, tuple[float, float]] = {}
     ends: list[tuple[np.ndarray, ...]] = []
@@ -138,11 +136,7 @@ def render_final_images(
                 if error is not None:
                     errors[name] = error
                 advance((2 * place + done + 1) / (2 * len(chosen)))
-            if index in weights:
-                pictures[f"view{index}/control_weight"] = np.asarray(weights[index], np.float32)
-            if index in probabilities:
-                density = np.asarray(probabilities[index], np.float32)
-                pictures[f"view{index}/pixel_probability"] = resize_nearest(density, *reference.shape[:2])
+            pictures |= _maps(result, index, reference.shape[:2])
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
         everything = tested and len(chosen) == len(problem.views)
@@ -157,9 +151,20 @@ def render_final_images(
                 maps = of_residuals(problem, result.parameters, list(zip(*ends, strict=True)), known)
     deviations |= maps.standard_error
     misfit = _misfit(problem, result, [problem.views[index] for index in chosen], ends)
-    if misfit:
-        warnings, deviations = (*warnings, misfit), {}
+    warnings, deviations = (*warnings, *filter(None, misfit)), {} if misfit else deviations
     return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share)
+
+
+def _maps(result: Result, view: int, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Return the control weights and pixel probabilities of a view, as far as the run has them."""
+    weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
+    maps = {}
+    if view in weights:
+        maps[f"view{view}/control_weight"] = np.asarray(weights[view], np.float32)
+    if view in probabilities:
+        density = np.asarray(probabilities[view], np.float32)
+        maps[f"view{view}/pixel_probability"] = resize_nearest(density, shape[0], shape[1])
+    return maps
 
 
 def _undetermined(
@@ -190,29 +195,35 @@ def _undetermined(
     return lines, unfinished, deviations
 
 
-def _misfit(problem: Problem, result: Result, views: Sequence[View], ends: Sequence[tuple[np.ndarray, ...]]) -> str:
-    """Return a warning if only few numbers are unknown, and the images still differ from the references; else "".
+def _misfit(
+    problem: Problem, result: Result, views: Sequence[View], ends: Sequence[tuple[np.ndarray, ...]]
+) -> list[str]:
+    """Return a warning, "" if the run has one already, if only few numbers are unknown and the images differ from the references.
 
     Least squares of few numbers end where the difference is noise. Noise of the references does not count, since pixels do not share it.
     """
     few = sum(value.size for value in result.parameters.values()) <= _FEW_NUMBERS and len(ends[0]) == 2
-    if not few or not result.steps or any(_DIFFERS in line for line in result.warnings):
-        return ""
+    if not few or not result.steps:
+        return []
+    if any(DIFFERS in line for line in result.warnings):
+        return [""]
     references = [np.asarray(view.reference, np.float32) for view in views]
-    weights = [view.pixel_weights(image.shape[:2]).reshape(-1) for view, image in zip(views, references, strict=True)]
+    weights = np.concatenate([np.ravel(v.pixel_weights(x.shape[:2])) for v, x in zip(views, references, strict=True)])
     halves = [
         np.concatenate([(end[half] - image).reshape(-1, 3) for end, image in zip(ends, references, strict=True)])
         for half in (0, 1)
     ]
-    shared = paired_losses.systematic(halves[0], np.concatenate(weights), halves[1])
-    size = math.sqrt(np.mean(np.square(np.concatenate([image.reshape(-1) for image in references]), dtype=np.float64)))
+    shared = paired_losses.systematic(halves[0], weights, halves[1])
+    squares = np.concatenate([np.square(image, dtype=np.float64).reshape(-1, 3).sum(axis=1) for image in references])
+    size = math.sqrt(float(weights @ squares) / max(3.0 * float(weights.sum()), 1e-300))
     error = math.sqrt(max(shared.mean_square, 0.0))
     if not shared.score > _SCORE or error <= _OF_PICTURE * size:
-        return ""
-    return (
-        f"the final picture {_DIFFERS} by {formatting.number(error)} ({error / size:.0%} of the picture), which noise does not explain: "
-        "the run needs more steps or another start, or something that is not among the unknowns is wrong"
-    )
+        return []
+    part = f" ({error / size:.0%} of the picture)" if size > 0.0 else ""
+    return [
+        f"{DIFFERS} by {formatting.number(error)}{part}, which noise does not explain: the run needs more steps or another start, or "
+        "something that is not among the unknowns is wrong"
+    ]
 
 
 def _unchecked(keys: Sequence[str]) -> list[str]:

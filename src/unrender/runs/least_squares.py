@@ -242,7 +242,7 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     posed = numbers.rigid | (numbers.sizes <= 0.0)
     sizes = np.where(posed, np.maximum(numbers.sizes, _OF_WIDTHS * widths), numbers.sizes)
     unseen = fit.unseen > _DOUBTFUL * np.where(posed, 2.0 * numbers.limits[: numbers.count], sizes)[:, None]
-    hidden = np.sqrt(np.square(fit.unseen).sum(axis=1))  # what moves along with a number that is left open
+    hidden = np.sqrt(np.square(fit.unseen).sum(axis=1))  # uncertainty shared with undetermined numbers
     error = np.where(unseen.any(axis=1), np.inf, np.hypot(fit.error, hidden))
     open_ = error > _DOUBTFUL * sizes
     n, spread = numbers.count, np.outer(fit.error, fit.error)

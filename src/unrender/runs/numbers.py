@@ -44,12 +44,11 @@ class Differences:
         """Return the sums of squares over pixels and channels without noise, and their standard errors, (K,) each.
 
         The errors come from the difference of both halves, not from the scatter over pixels: few pixels, such as those of a visible
-        lamp, may show nearly all of a change without noise. With s + a and s + b, a product is s² + s (a + b) + a b, and a − b has the
-        distribution of a + b. The square of (a − b)² has three times the mean of that of 2 a b for Gaussian noise.
+        lamp, may show nearly all of a change without noise. For halves s + a and s + b, a − b and a + b are independent and of one
+        distribution, if noise is Gaussian. The square of (one − other) times their mean then has the variance of the product as its mean.
         """
         apart, mean = self.one - self.other, self.average()
-        linear, quadratic = (mean * apart).sum(axis=2), np.square(apart).sum(axis=2)
-        variances = np.square(linear) + np.square(quadratic) / 12.0
+        variances = np.square((mean * apart).sum(axis=2))
         return (self.one * self.other).sum(axis=(1, 2)), np.sqrt(variances.sum(axis=1))
 
     def average(self) -> np.ndarray:

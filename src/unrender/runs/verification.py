@@ -21,8 +21,10 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, view_request
 from unrender.statistics import paired_losses
 
-__all__ = ["FreshPictures", "Picture", "Remembering", "is_finite", "remembered"]
+__all__ = ["DIFFERS", "FreshPictures", "Picture", "Remembering", "is_finite", "remembered"]
 
+DIFFERS = "the final picture differs from the references"
+"""First words of warnings about images that do not agree with the references."""
 _GROUPS = 4
 """Number of independent groups of each new image."""
 _LEAST_PATHS, _MOST_PATHS = 1 << 13, 1 << 22

@@ -21,6 +21,7 @@ from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
 from unrender.runs.verification import (
+    DIFFERS,
     FreshPictures,
     Picture,
     is_finite,
@@ -218,8 +219,7 @@ class Verify(Callback):
             still = f"has hardly improved since step {earlier.step} of {result.steps}"
             cause = f"it may need more steps, or {cause}"
         return [
-            f"the final picture differs from the references by {formatting.number(error)} ({error / size:.0%} of the picture{times}), and "
-            f"{still}: {cause}"
+            f"{DIFFERS} by {formatting.number(error)} ({error / size:.0%} of the picture{times}), and {still}: {cause}"
         ]
 
 

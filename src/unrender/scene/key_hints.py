@@ -62,8 +62,8 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     # Mitsuba may name the owner after its shape, where a user expects the material: the rest of the key then decides.
     similar = [name for name in able if name.endswith("." + rest) and not _is_nameless(name)] if rest else []
     named = [name for name in able if not _is_nameless(name)]
-    alike = _same_quantity(key, named)
-    if near := did_you_mean(key, similar or alike, 0.0) or did_you_mean(key, named) or did_you_mean(key, known):
+    equivalent = _same_quantity(key, named)
+    if near := did_you_mean(key, similar or equivalent, 0.0) or did_you_mean(key, named) or did_you_mean(key, known):
         return near
     shown = named or able
     return f"; it has {', '.join(shown[:6])}{' and others' if len(shown) > 6 else ''}" if shown else ""

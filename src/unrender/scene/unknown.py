@@ -75,12 +75,13 @@ class Unknown:
         return project(values, *self.bounds, self._scale)
 
     def reached(self, values: Array) -> Array:
-        """Return the values after a step that leads to `values`: inside the bounds, and of length 1 if they are one direction."""
+        """Return the values after a step that leads to `values`: inside the bounds. A direction that has become very long or short gets
+        length 1; at each step, optimizers would take the change of its elements for bounds."""
         inside = self.project(values)
         if self.measure.role != "direction" or self.initial.shape != _VECTOR:
             return inside
         length = float(np.linalg.norm(arrays.numpy(inside)))
-        return inside / arrays.scalar(length, inside) if length > 0.0 else inside
+        return inside / arrays.scalar(length, inside) if 0.0 < length < 1e-3 or length > 1e3 else inside
 
     def shape(self, step: int | None = None) -> tuple[int, ...]:
         """Return its shape at a step; None for the scene's."""

@@ -22,11 +22,11 @@ _PATHS, _SPP = 1 << 17, (2, 64)
 _LIMIT = 1e4
 """Largest factor, and reciprocal of the smallest."""
 _BETTER = 0.25
-"""Ratio of the mean square residuals with and without the factors from which these are used."""
+"""Ratio of the mean square residuals with and without the factors below which the factors are used."""
 
 
 def start_factors(problem: Problem, keys: Sequence[str], constants: Constants) -> dict[str, float]:
-    """Return {key: factor} of the lights' initial values, for those that are far from 1; {} if factors hardly reduce the residual.
+    """Return {key: factor} of the lights' initial values if one is far from 1 and factors reduce the residual well, else {}.
 
     With D_k, the image of light k alone, f minimises ‖I + Σ (f_k − 1) D_k − R‖². Its normal equations are products of two independent
     halves, so noise does not bias them. The other unknowns are at their start, so factors are no better than these.
@@ -60,8 +60,7 @@ def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, flo
     matrix, vector, squares = np.zeros((count, count)), np.zeros(count), 0.0
     for view in views:
         own = problem.views[view]
-        mask = np.ones(problem.sizes[view]) if own.mask is None else np.asarray(own.mask, np.float64)
-        weight = own.weight * mask.reshape(*problem.sizes[view], 1)
+        weight = own.weight * own.pixel_weights(problem.sizes[view]).reshape(*problem.sizes[view], 1)
         halves = [np.stack([render(problem, x, view, spp, seed) for x in states]).astype(np.float64) for seed in _SEEDS]
         one, other = ((images[1:] - images[0]).reshape(count, -1) for images in halves)
         residuals = [(np.asarray(own.reference) - images[0]) * weight for images in halves]

@@ -87,7 +87,7 @@ def positive_values(traits: Traits) -> Part:
 def lights(traits: Traits) -> Part:
     """Start lights whose brightness is far from the references' at a multiple of their initial values."""
     positive = positive_values(traits).settings
-    keys = [key for key in traits.lights if key in positive]
+    keys = [key for key in traits.lights if key in positive and key not in traits.block]
     factors = start_factors(traits.problem, keys, traits.constants)
     named = {key: f"{factor:.3g} times the initial values" for key, factor in factors.items()}
     settings = {key: ParameterSettings(start_factor=factor) for key, factor in factors.items()}

@@ -1,4 +1,4 @@
-"""What spectral variants support, and their colours as RGB.
+"""Limits of spectral variants, and conversion of their colours to RGB.
 
 Mitsuba upsamples a reflectance (r, g, b) to a spectrum with three coefficients (Jakob and Hanika 2019).
 A parameter such as `wall.bsdf.reflectance.data` then holds coefficients, whose magnitudes differ by six orders. Callers see linear sRGB.
