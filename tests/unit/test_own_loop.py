@@ -319,8 +319,8 @@ def test_a_number_may_have_axes_of_length_one(shape: tuple[int, ...]) -> None:
     """The output of a network is (1,) or (1, 1): its gradient has the same shape."""
     torch = pytest.importorskip("torch")
     number = AnalyticRenderer({"alpha": np.full((), 0.5)}, np.ones((48, 1)), 0.1, 0.0)
-    for optional in ({}, {"coupled": True}):
-        renderer = ur.Renderer(number, ["alpha"], **optional)
+    for coupled in (False, True):
+        renderer = ur.Renderer(number, ["alpha"], coupled=coupled)
         alpha = torch.full(shape, 0.4, requires_grad=True)
         (renderer(alpha) ** 2).sum().backward()
         assert alpha.grad is not None
