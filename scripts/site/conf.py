@@ -1,5 +1,6 @@
 """The documentation site: `make docs`. Builds without the network, and its pages need none; warnings are errors."""
 
+import importlib.util
 import os
 import sys
 from importlib.metadata import version as version_of
@@ -37,6 +38,9 @@ nb_merge_streams = True
 nb_execution_in_temp = True
 
 # Reference: the names that a module's `__all__` lists, in the order of the page.
+autodoc_mock_imports = (
+    [] if importlib.util.find_spec("torch") else ["torch"]
+)  # an optional dependency of `unrender.grey_box`
 autodoc_member_order = "groupwise"
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
