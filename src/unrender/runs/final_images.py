@@ -39,9 +39,8 @@ _NUMBERS_SHARE = 0.05
 """Time limit of least squares of few numbers relative to the time of the steps; at least one second."""
 _UNSETTLED = 3.0
 """Standard errors from which the remaining least-squares step is the standard error."""
-_FEW_NUMBERS, _SCORE, _OF_PICTURE = 24, 4.5, 0.01
-"""Most numbers of a problem whose images must agree with the references; smallest score of a difference; its smallest size relative to
-the image."""
+_FEW_NUMBERS, _OF_PICTURE = 24, 0.01
+"""Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image."""
 _TRIAL_PATHS = 1 << 18
 _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 """Paths of one pass over all views, and its most samples per pixel."""
@@ -214,10 +213,10 @@ def _misfit(
         for half in (0, 1)
     ]
     shared = paired_losses.systematic(halves[0], weights, halves[1])
-    squares = np.concatenate([np.square(image, dtype=np.float64).reshape(-1, 3).sum(axis=1) for image in references])
-    size = math.sqrt(float(weights @ squares) / max(3.0 * float(weights.sum()), 1e-300))
+    pixels = np.concatenate([image.reshape(-1, 3) for image in references])
+    size = math.sqrt(paired_losses.mean_square(pixels, weights))
     error = math.sqrt(max(shared.mean_square, 0.0))
-    if not shared.score > _SCORE or error <= _OF_PICTURE * size:
+    if not shared.score > paired_losses.SIGNIFICANT or error <= _OF_PICTURE * size:
         return []
     part = f" ({error / size:.0%} of the picture)" if size > 0.0 else ""
     return [

@@ -41,9 +41,8 @@ _LEVEL = 1e-4
 """False positive rate of each test."""
 _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
-_SCORE, _OF_RESIDUAL, _OF_PICTURE = 4.5, 0.1, 0.02
-"""Smallest score of a control variate's error; its smallest fraction of the mean square residual; its smallest size relative to the
-image."""
+_OF_RESIDUAL, _OF_PICTURE = 0.1, 0.02
+"""Smallest error of a control variate, as a fraction of the mean square residual, and relative to the image."""
 _FEW_PIXELS, _OF_FEW, _OF_TRUTH = 96, 0.2, 4.0
 """Number of pixels below which the residual is also judged pixel by pixel, which includes the references' noise; its smallest size
 relative to the image in this case; its smallest mean square relative to that at the true values, if these are known."""
@@ -84,7 +83,7 @@ class Memory:
         if not math.isfinite(self.error):
             return True
         relevant = self.error**2 > _OF_RESIDUAL * self.residual**2 and self.error > _OF_PICTURE * self.picture
-        return self.score > _SCORE and relevant
+        return self.score > paired_losses.SIGNIFICANT and relevant
 
 
 @dataclass
@@ -196,20 +195,22 @@ class Verify(Callback):
         if not (np.isfinite(residual).all() and np.isfinite(earlier.residual).all()):
             return []
         shared = paired_losses.systematic(residual, weights, earlier.residual)
-        total = max(float(weights.sum()) * 3, 1e-300)
-        size = math.sqrt(float((weights[:, None] * references**2).sum()) / total)
+        size = math.sqrt(paired_losses.mean_square(references, weights))
         error = math.sqrt(max(shared.mean_square, 0.0))
-        if not shared.score > _SCORE or error <= (_OF_PICTURE_SHORT if earlier.is_short else _OF_PICTURE) * size:
+        if (
+            not shared.score > paired_losses.SIGNIFICANT
+            or error <= (_OF_PICTURE_SHORT if earlier.is_short else _OF_PICTURE) * size
+        ):
             if np.count_nonzero(weights) >= _FEW_PIXELS:
                 return []
             others = np.concatenate(end.images, axis=1) - references
             shared = paired_losses.repeated(last.residuals, others, weights)
             error = math.sqrt(max(shared.mean_square, 0.0))
-            if not shared.score > _SCORE or error <= _OF_FEW * size:
+            if not shared.score > paired_losses.SIGNIFICANT or error <= _OF_FEW * size:
                 return []
             if problem.has_truth and shared.mean_square <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
                 return []
-        noise = math.sqrt(max(float((weights[:, None] * residual**2).sum()) / total - shared.mean_square, 0.0))
+        noise = math.sqrt(max(paired_losses.mean_square(residual, weights) - shared.mean_square, 0.0))
         cause = "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
         if any(unknown.prior is not None for unknown in problem.unknowns.values()):
             cause = f"a prior may be too strong, or {cause}"

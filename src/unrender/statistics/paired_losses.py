@@ -36,6 +36,10 @@ class Difference:
         return self.value > -float(stdtrit(max(self.degrees, 1.0), level)) * self.standard_error
 
 
+SIGNIFICANT = 4.5
+"""Score of a `SystematicDifference` that noise alone hardly reaches."""
+
+
 @dataclass(frozen=True)
 class SystematicDifference:
     """The part of the difference of two images that neighbouring pixels share.
@@ -101,6 +105,12 @@ def difference(first: np.ndarray, second: np.ndarray, sampled: bool = False) -> 
     shares = variances / largest if largest > 0 else variances
     degrees = float(shares.sum() ** 2 / (shares**2).sum()) * (groups - 1) if largest > 0 else math.inf
     return Difference(value, math.sqrt(total), degrees)
+
+
+def mean_square(values: np.ndarray, weights: np.ndarray) -> float:
+    """Return the mean square per channel of values (N, C), with a weight per pixel (N,)."""
+    total = float((weights[:, None] * np.square(values, dtype=np.float64)).sum())
+    return total / max(float(weights.sum()) * values.shape[1], 1e-300)
 
 
 def repeated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> SystematicDifference:

@@ -87,10 +87,15 @@ def response_table() -> dict[str, Any]:
     return {"response": mi.Float(_curves().ravel())} if is_spectral() else {}
 
 
+def table_wavelengths() -> np.ndarray:
+    """Return the wavelengths of Mitsuba's tables of the CIE 1931 curves in nanometres, (95,)."""
+    return np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 1, _STEP)
+
+
 @functools.cache
 def _curves() -> np.ndarray:
     """Return the response of the linear sRGB channels every 5 nm from 360 to 830 nm, (95, 3), which Mitsuba interpolates linearly."""
-    λ: Any = mi.Float(np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 1, _STEP))
+    λ: Any = mi.Float(table_wavelengths())
     rgb = mi.xyz_to_srgb(mi.cie1931_xyz(λ))
     return np.array(rgb).reshape(3, -1).T * float(mi.MI_CIE_Y_NORMALIZATION)
 

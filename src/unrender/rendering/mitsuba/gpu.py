@@ -15,12 +15,14 @@ from typing import Any
 
 import mitsuba as mi
 
+from unrender.backend import variant
+
 __all__ = ["is_gpu", "lookup_mask"]
 
 
 def is_gpu() -> bool:
     """Return whether the current variant runs on a GPU: textures are copies, and a kernel traces one scene."""
-    return not str(mi.variant()).startswith(("llvm", "scalar"))
+    return variant.is_on_gpu(mi.variant())
 
 
 def lookup_mask(active: Any) -> Any:

@@ -117,8 +117,8 @@ def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -
     if integrator is not None and _light_transport(integrator)[0] != "PathIntegrator":
         return []
     masks = [mi.traverse(bsdf) for bsdf in bsdfs if bsdf.class_name() == "MaskBSDF"]
-    found = [np.array(mask[key]) for mask in masks for key in ("opacity.value", "opacity.data") if key in mask]
-    values = [value / 255.0 if value.dtype == np.uint8 else value for value in found]
+    opacities = [np.array(mask[key]) for mask in masks for key in ("opacity.value", "opacity.data") if key in mask]
+    values = [value / 255.0 if value.dtype == np.uint8 else value for value in opacities]
     unknown = masks and any(key.split(".")[-2:][0] == "opacity" for key in keys)
     if not unknown and not any(((value > 0) & (value < 1)).any() for value in values):
         return []

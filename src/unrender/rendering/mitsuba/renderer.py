@@ -211,11 +211,11 @@ class MitsubaRenderer:
         """Return the poses of the scene. With media only lights have poses, since a posed shape in a scene of its own does not see the
         media."""
         written, instances = self.pair.loaded().poses, has_instances(self.pair.current)
-        traced = gpu.is_gpu()
         return {
             key: pose
             for key, pose in poses.keys(self.pair.current).items()
-            if (pose.light or not self.pair.volumetric) and (key in written or not (pose.light or instances or traced))
+            if (pose.light or not self.pair.volumetric)
+            and (key in written or not (pose.light or instances or gpu.is_gpu()))
         }
 
     def _is_written(self, key: str, keys: Iterable[str]) -> bool:

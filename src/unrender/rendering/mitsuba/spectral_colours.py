@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from unrender.rendering.mitsuba.film_response import is_spectral
+from unrender.rendering.mitsuba.film_response import is_spectral, table_wavelengths
 from unrender.rendering.mitsuba.integrators.base import total
 from unrender.rendering.mitsuba.mesh_layout import NORMALS, POSITIONS
 from unrender.rendering.mitsuba.ranges import SlotReaders
@@ -36,8 +36,6 @@ _NUMBERS = ("normalmap", "nested_texture", "opacity", "weight", "roughness", "al
 _FILMS = ("HDRFilm",)
 _OTHER_PLUGINS = {"TurntableLight": "the emitter turntable_light"}
 _INSTEAD = "give the colour as a regular spectrum, whose values can be recovered"
-_STEP = 5.0
-"""Distance in nanometres of the wavelengths that a colour is integrated over."""
 _ROWS = 1 << 14
 """Number of colours that are converted at once."""
 _Ends = tuple[Any, Any]
@@ -259,7 +257,7 @@ def _table() -> tuple[np.ndarray, np.ndarray, int]:
 
 def _colours(coefficients: np.ndarray) -> np.ndarray:
     """Return linear sRGB (N, 3) in [0, 1] of reflectances with these coefficients (N, 3), lit by the white point D65."""
-    λ = np.arange(mi.MI_CIE_MIN, mi.MI_CIE_MAX + 1, _STEP)
+    λ = table_wavelengths()
     sampled: Any = mi.Float(λ)
     lit = np.array(mi.cie_d65(sampled)) * np.array(mi.cie1931_xyz(sampled)).reshape(3, -1)
     rgb = np.array(mi.xyz_to_srgb(mi.Color3f(lit / lit[1].sum()))).reshape(3, -1).T

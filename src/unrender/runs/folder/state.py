@@ -208,9 +208,9 @@ class _Unpacker:
             case {"class": str(name), "fields": dict(fields), **rest} if not rest:
                 kind = self.classes.get(name) or _class(name)
                 if set(fields) != {each.name for each in dataclasses.fields(kind)}:
-                    found = ", ".join(fields)[:100]
+                    names = ", ".join(fields)[:100]
                     raise InputError(
-                        f"state: {name} is of another version of unrender (fields {found}); start the run again"
+                        f"state: {name} is of another version of unrender (fields {names}); start the run again"
                     )
                 return kind(**{key: self.node(part, depth + 1) for key, part in fields.items()})
         raise InputError(f"state: expected a part of a state, got {repr(node)[:80]}")
