@@ -148,6 +148,7 @@ def test_saturated_photographs_are_censored(unrender: Unrender, capture: Path, m
     assert ur.Problem.from_file("asset/problem.toml").loss == ur.losses.Censored(ur.losses.L1(), 0.95)
 
 
+@pytest.mark.slow
 def test_a_response_is_fitted_or_named(unrender: Unrender, capture: Path, mesh: Path) -> None:
     given = ("import", capture, "--mesh", mesh, "--out", "asset", "--resolution", 20, "--texture", 4, "--overwrite")
     answer = unrender(*given, "--response", "linear")

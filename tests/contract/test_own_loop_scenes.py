@@ -57,6 +57,7 @@ def test_a_call_is_differentiable(scene: Any) -> None:
     assert np.abs(found[TEXTURE]).max() > 1e-5
 
 
+@pytest.mark.slow
 def test_two_images_of_one_loss(scene: Any) -> None:
     """Each goes back with its own parameters, of which some are equal."""
     values = attached()

@@ -48,6 +48,7 @@ def test_of_an_unbiased_loss_nothing_is_changed() -> None:
         np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_mini_batches_have_no_variance_and_no_damping() -> None:
     estimator = ur.PathGradient(ur.images.RecursiveControlVariate(), ur.pixels.Uniform(16), spp=2, tolerance=5.0)
     result = ur.optimize(problem((TEXTURE,)), estimator, ur.optimizers.Adam(0.02), steps=3)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import quick
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.picture_format import AOVS
@@ -94,7 +95,7 @@ def test_values_are_those_of_mitsubas_integrator(renderer: MitsubaRenderer) -> N
     assert mask[SIZE // 2, SIZE // 2] == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("name", AOVS)
+@pytest.mark.parametrize("name", quick(AOVS, "depth", "mask"))
 def test_derivatives_by_positions_are_those_of_differences(renderer: MitsubaRenderer, name: str) -> None:
     """The ball grows and is shifted: silhouettes move. Without them the derivative of all but the albedo would be wrong."""
     of = renderer.with_aov(name)
@@ -123,7 +124,7 @@ def test_derivatives_by_positions_are_those_of_differences(renderer: MitsubaRend
     assert not agree(None)  # the planted fault: silhouettes that stand still
 
 
-@pytest.mark.parametrize("method", ["auto", "plain", "rcv", "coupled", "adaptive"])
+@pytest.mark.parametrize("method", quick(["auto", "plain", "rcv", "coupled", "adaptive"], "auto", "rcv"))
 def test_albedo_and_depth_share_one_descent(method: str) -> None:
     views = [ur.View(picture("albedo"), aov="albedo", weight=2.0), ur.View(picture("depth"), aov="depth")]
     made = ur.Problem(scene, [ur.Parameter(FLOOR, initial=0.2)], views, truth={FLOOR: [0.4, 0.5, 0.6]})
@@ -139,6 +140,7 @@ def test_a_pose_is_recovered_from_one_picture(name: str) -> None:
     assert result.parameters["ball.translation.x"] == pytest.approx(0.3, abs=0.03)
 
 
+@pytest.mark.slow
 def test_a_mesh_follows_masks() -> None:
     made = problem([ur.View(picture("mask", x=0.2), aov="mask")], (BALL,))
     result = ur.optimize(made, steps=60)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 import unrender
+from tiers import slow
 from unrender.app.cli.main import main
 from unrender.rendering.mitsuba import frozen
 from unrender.rendering.mitsuba.integrators.path import PathPair
@@ -68,7 +69,9 @@ def run(folder: Path, *words: str) -> None:
     assert main(["run", *words, "--steps", "2", "--final-spp", "1", "--out", str(folder), "--no-cache"]) in (0, 5)
 
 
-@pytest.mark.parametrize("words", [POSTER, [*POSTER, "-m", "plain"], SMOKE], ids=["poster", "plain", "smoke"])
+@pytest.mark.parametrize(
+    "words", [POSTER, slow([*POSTER, "-m", "plain"]), slow(SMOKE)], ids=["poster", "plain", "smoke"]
+)
 def test_few_frames_lead_from_the_command_to_a_bounce(
     words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,7 +40,8 @@ def _compiled(folder: Path, name: str) -> list[int]:
     return [kernel["operation_count"] for kernel in new if kernel["operation_count"] > _FEW_OPERATIONS]
 
 
-@pytest.mark.parametrize("name", ["stage-lights", pytest.param("wall", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["stage-lights", "wall"])
 def test_nothing_compiles_after_the_last_step(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert not _compiled(tmp_path / "run", name)
     for hook in (RunWriter, Verify):

@@ -202,6 +202,7 @@ def box(size: float = 1.0) -> dict[str, Any]:
     }
 
 
+@pytest.mark.slow
 def test_a_mesh_may_follow_a_number_silhouettes_included() -> None:
     """Vertices are a function of the box's size: the gradient against differences of pictures, and the size from one picture."""
     key = "box.vertex_positions"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import quick, slow
 from unrender.methods import method
 
 Scene = dict[str, Any]
@@ -136,7 +137,7 @@ CASES: dict[str, Callable[[], tuple[Scene, dict[str, Any], dict[str, Any], float
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", quick(CASES, "lamps", "lens", "glass"))
 def test_auto_finds_the_right_values(name: str) -> None:
     scene, truth, start, tolerance = CASES[name]()
     integrator = mi.load_dict({"type": "path", "max_depth": 6})
@@ -165,7 +166,7 @@ BRIGHTNESSES = {"ball.emitter.radiance.value": 25.0, "point.intensity.value": 5.
 
 
 @pytest.mark.parametrize(
-    "factors", [(0.1, 0.1, 0.1), (10.0, 10.0, 10.0), (10.0, 0.1, 10.0)], ids=["low", "high", "mixed"]
+    "factors", [slow((0.1, 0.1, 0.1)), slow((10.0, 10.0, 10.0)), (10.0, 0.1, 10.0)], ids=["low", "high", "mixed"]
 )
 def test_lights_arrive_from_a_tenth_and_from_ten_times_their_brightness(
     factors: tuple[float, ...], tmp_path: Any

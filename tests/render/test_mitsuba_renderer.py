@@ -168,6 +168,7 @@ def test_moving_geometry_runs_in_primary_space() -> None:
     assert np.abs(np.array(gradient[key])).max() > 0
 
 
+@pytest.mark.slow
 def test_gradients_of_two_states_of_moving_geometry_are_each_its_own() -> None:
     """In primary space: the previous scene's adjoint on the same random numbers, to the rounding of sums."""
     key = "small-box.vertex_positions"

@@ -62,6 +62,7 @@ def test_a_true_prior_takes_most_of_the_noise_out_of_a_texture(name: str, prior:
     assert recovered(prior, name) < 0.6 * recovered(None, name)
 
 
+@pytest.mark.slow
 def test_gauss_newton_steps_of_a_lamp_lead_to_the_posterior_mean() -> None:
     """(P + I / τ²)⁻¹ (P x + m / τ²), x the place without a prior, P = Jᵀ J / σ² by differences of pictures."""
     key, expected, start = "lamp.position", np.array([0.8, 1.2, 3.2]), [1.3, 0.8, 2.8]

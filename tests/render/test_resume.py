@@ -218,6 +218,7 @@ def test_other_versions_are_refused(tmp_path: Path) -> None:
     assert ur.resume(folder, force=True).steps == 8
 
 
+@pytest.mark.slow
 def test_a_parameter_of_another_shape_cannot_be_forced(tmp_path: Path) -> None:
     options = {"resolution": 8, "reference_spp": 4}
     problems = [ur.gallery.problem("indirect-room", texture_resolution=n, **options) for n in (4, 5)]

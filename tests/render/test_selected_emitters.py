@@ -94,7 +94,7 @@ CASES: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("name", quick(list(CASES), "plain", "control variate, pixels"))
+@pytest.mark.parametrize("name", quick(list(CASES), "control variate, pixels"))
 def test_gradients_are_unbiased(name: str) -> None:
     """An environment map among area lights; in parts of the texture, from the steps at which it has learnt something."""
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.full((8, 16, 3), 0.3, np.float32))}
@@ -175,6 +175,7 @@ class Stop(ur.protocols.Callback):
             raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 @pytest.mark.cpu("atomic additions of a GPU have no order")
 @pytest.mark.usefixtures("one_thread")
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path: Path) -> None:

@@ -118,6 +118,7 @@ def problem(**options: Any) -> ur.Problem:
     )
 
 
+@pytest.mark.slow
 def test_ties_are_recovered_and_exported(tmp_path: Path) -> None:
     unknown = problem()
     assert list(unknown.shapes()) == ["gloss", LAMPS[0]]

@@ -207,6 +207,7 @@ def files(folder: Path, more: str) -> Path:
     return folder / "problem.toml"
 
 
+@pytest.mark.slow
 def test_a_file_has_worlds_and_its_run_resumes(tmp_path: Path) -> None:
     worlds = '[[views]]\nreference = "one.npy"\nwith = { "lamp.intensity.value" = [0.5, 0.5, 0.5] }\n'
     worlds += '[[views]]\nreference = "two.npy"\nscene = "other.xml"\n'

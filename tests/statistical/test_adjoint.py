@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from zoo import ALL, DEPTH, SIZE, scene, size, spp, subject, two_states
 
+from tiers import slow
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -68,7 +69,7 @@ def dents() -> Any:
 
 
 @pytest.mark.parametrize(
-    "inner", [{"type": "roughconductor", "alpha": 0.3}, {"type": "twosided", "b": {"type": "diffuse"}}]
+    "inner", [{"type": "roughconductor", "alpha": 0.3}, slow({"type": "twosided", "b": {"type": "diffuse"}})]
 )
 def test_the_gradient_of_a_normal_map_and_a_planted_fault_of_three_per_cent(inner: dict[str, Any]) -> None:
     renderer = MitsubaRenderer(scene({"type": "normalmap", "normalmap": dents(), "b": inner}), DEPTH)

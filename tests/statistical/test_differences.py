@@ -73,6 +73,7 @@ def paired_gradients(problem: ur.Problem, spp: int, difference_spp: int | None, 
     return np.stack(rows)
 
 
+@pytest.mark.slow
 def test_at_the_images_of_other_paths_the_difference_is_unbiased(monkeypatch: pytest.MonkeyPatch) -> None:
     """Against leave-one-out groups. Faults that are seen: the current image for the previous one, images of the adjoint's own paths."""
     problem = ur.gallery.problem("indirect-room", resolution=24, texture_resolution=8, reference_spp=256, loss="L2")

@@ -201,6 +201,7 @@ def test_what_moves_is_filtered(
     assert np.abs(scores(found, expected)).max() < LIMIT, (found.mean(axis=0), expected.mean(axis=0))
 
 
+@pytest.mark.slow
 def test_squared_boundary_derivatives_have_the_filter_s_reach() -> None:
     """Along a tangent, the pictures of a block with a wider filter change further away from its edges."""
     reached = []

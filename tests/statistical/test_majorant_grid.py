@@ -78,6 +78,7 @@ def test_both_images_of_a_pair_agree_with_separate_renders() -> None:
         assert not verdict, f"a bias of 3 % went unseen: {figures}"
 
 
+@pytest.mark.slow
 def test_a_cell_that_is_empty_in_one_state_only_is_lost_in_neither() -> None:
     renderer = MitsubaRenderer(scene(sparse()), DEPTH)
     key = next(key for key in renderer.parameters() if key.endswith("sigma_t.data"))

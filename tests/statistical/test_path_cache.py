@@ -12,6 +12,7 @@ import zoo
 
 import unrender as ur
 from kernels import count_recordings
+from tiers import quick
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import turntable_light
@@ -173,7 +174,7 @@ MORE_SCENES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...]]] = {
 SCENES |= MORE_SCENES
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in MORE_SCENES)) for n in SCENES])
+@pytest.mark.parametrize("name", quick(SCENES, "textures"))
 def test_images_and_gradients_are_those_of_traced_paths(name: str) -> None:
     compare(*prepared(name))
 
@@ -381,6 +382,7 @@ def test_paths_are_those_of_the_same_parameters_in_any_order() -> None:
             assert_equal(found[key], value)
 
 
+@pytest.mark.slow
 def test_a_run_is_the_same_with_kept_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     """Step by step the same numbers, but for rounding."""
     make, keys = SCENES["textures"]

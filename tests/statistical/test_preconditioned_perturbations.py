@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import slow
 from unrender.estimators.base import Estimate
 from unrender.estimators.coordinates import by_coordinates
 from unrender.rendering.numpy.linear import AnalyticRenderer
@@ -66,7 +67,7 @@ def worst(found: np.ndarray, exact: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"aggregate": False}, {"order": "hvp"}, {"order": "hessian"}, {"orthogonal": True}], ids=str
+    "options", [{}, slow({"aggregate": False}), {"order": "hvp"}, {"order": "hessian"}, {"orthogonal": True}], ids=str
 )
 def test_gradients_are_by_the_coordinates_of_the_descent(case: Case, options: dict[str, Any]) -> None:
     found = np.stack([e.gradient["x"].ravel() for e in estimates(case, 100, **options)]).astype(float)

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tiers import quick
+
 pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrender[capture]'")
 
 import unrender
@@ -340,7 +342,7 @@ def test_a_missing_package_is_told_before_photographs_are_read(
         importing.import_capture(tmp_path, tmp_path / "out", importing.ImportOptions())
 
 
-@pytest.mark.parametrize("kind", ["colmap", "transforms", "llff", "lights"])
+@pytest.mark.parametrize("kind", quick(["colmap", "transforms", "llff", "lights"], "colmap", "llff"))
 def test_a_hundred_thousand_photographs_are_one_line(kind: str, tmp_path: Path) -> None:
     """Before a file of them is looked for, which would take hours."""
     count = files.MOST + 1

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import slow
 from unrender.core.random import Key
 from unrender.estimators import derivative_images
 from unrender.estimators import gauss_newton as module
@@ -195,6 +196,7 @@ def test_noise_falls_as_the_root_of_the_steps() -> None:
     np.testing.assert_allclose(x - MINIMUM, -np.linalg.solve(HESSIAN, weights @ noises), rtol=1e-2, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_standard_errors_cover_the_truth_in_68_percent_of_the_seeds(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
@@ -227,7 +229,7 @@ def noisy(shape: tuple[int, int], seed: int, grey: bool, filtered: bool, size: f
     return convolve(noise, WIDE[..., None], mode="wrap") if filtered else noise
 
 
-@pytest.mark.parametrize(("grey", "filtered"), [(False, False), (True, True)])
+@pytest.mark.parametrize(("grey", "filtered"), [slow(False, False), (True, True)])
 def test_standard_errors_cover_the_noise_of_the_references(
     monkeypatch: pytest.MonkeyPatch, grey: bool, filtered: bool
 ) -> None:
