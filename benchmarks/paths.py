@@ -66,10 +66,13 @@ class _Recorder(ur.protocols.Callback):
         self.path.append(dict(run.parameters))
 
 
-def descent(problem: ur.Problem, estimator: Estimator, rate: float, steps: int, seed: int = 0) -> list[Tree]:
-    """The parameters at each of `steps` steps of a real optimization, the first one included."""
-    recorder = _Recorder()
-    ur.optimize(problem, estimator, ur.optimizers.Adam(rate), steps=max(steps - 1, 1), seed=seed, callbacks=[recorder])
+def descent(
+    problem: ur.Problem, estimator: Estimator, rate: float, steps: int, seed: int = 0, falling: bool = False
+) -> list[Tree]:
+    """The parameters at each of `steps` steps of Adam, the first one included; with `falling` its rate falls as half a cosine."""
+    recorder, taken = _Recorder(), max(steps - 1, 1)
+    optimizer = ur.optimizers.Adam(rate, schedule=ur.schedules.Cosine(taken) if falling else None)
+    ur.optimize(problem, estimator, optimizer, steps=taken, seed=seed, callbacks=[recorder])
     return recorder.path[:steps]
 
 

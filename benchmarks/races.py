@@ -38,7 +38,7 @@ class Entrant:
         group: what it is plotted as.
         estimator: where its gradients come from.
         optimizer: makes its optimizer from a learning rate.
-        rates: those to try.
+        rates: those to try; a single one is taken as it is.
     """
 
     name: str
@@ -177,7 +177,7 @@ def race(
             print(f"{problem.name} {entrant.name} rate {rate:g}: {np.median(ends):.4f}", flush=True)
             return float(np.median(ends))
 
-        return search(entrant.rates, error)
+        return (entrant.rates[0], []) if len(entrant.rates) == 1 else search(entrant.rates, error)
 
     chosen = {entrant.name: tuned(entrant) for entrant in entrants}
     found: dict[str, list[Recorder]] = {entrant.name: [] for entrant in entrants}

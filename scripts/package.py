@@ -44,7 +44,7 @@ def _check_wheel(wheel: Path) -> None:
 def _check_sdist(sdist: Path) -> None:
     with tarfile.open(sdist) as archive:
         names = archive.getnames()
-    records = [name for name in names if "/benchmarks/" in name and name.endswith(RECORDS)]
+    records = [name for name in names if ("/benchmarks/" in name or "/scripts/" in name) and name.endswith(RECORDS)]
     if records or sdist.stat().st_size > LARGEST_SDIST:
         sys.exit(f"package: the source archive has {sdist.stat().st_size} bytes and holds {records[:3]}")
     for name in ("SECURITY.md", "LICENSE", "pyproject.toml", "src/unrender/__init__.py"):

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import reference_pages
 
-from benchmarks.coverage import coverage_page, ranges_page
-from benchmarks.coverage.cli import RECORD
 from benchmarks.runner import records
 from benchmarks.runner.catalogue import benchmarks
+from scripts.coverage import coverage_page, ranges_page
+from scripts.coverage.cli import RECORD
 from unrender import gallery
 from unrender.app import distributed, exporting
 from unrender.app.capture import conventions, formats, unknowns

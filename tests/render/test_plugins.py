@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from benchmarks.coverage.plugins import PLUGINS
-from benchmarks.coverage.scenes import colour, scene
+from scripts.coverage.plugins import PLUGINS
+from scripts.coverage.scenes import colour, scene
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from benchmarks.coverage import ranges_page
-from benchmarks.coverage.plugins import PLUGINS
-from benchmarks.coverage.scenes import scene, wheel
+from scripts.coverage import ranges_page
+from scripts.coverage.plugins import PLUGINS
+from scripts.coverage.scenes import scene, wheel
 from unrender.rendering.mitsuba.ranges import CLASSES, KINDS
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 

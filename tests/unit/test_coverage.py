@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.coverage.checks import descended, gradients_agree, images_agree
-from benchmarks.coverage.cli import RECORD
+from scripts.coverage.checks import descended, gradients_agree, images_agree
+from scripts.coverage.cli import RECORD
 from unrender.rendering.numpy.linear import AnalyticRenderer
 
 RUNS, SIZE = 16, 16
@@ -64,8 +64,8 @@ def test_a_gradient_of_zero_is_told_from_one_that_is_missing() -> None:
 
 @pytest.mark.mitsuba
 def test_the_page_is_what_the_record_says_and_has_no_empty_cell() -> None:
-    from benchmarks.coverage.coverage_page import page
-    from benchmarks.coverage.plugins import IN_INSTANCES, PLUGINS
+    from scripts.coverage.coverage_page import page
+    from scripts.coverage.plugins import IN_INSTANCES, PLUGINS
 
     record = json.loads(RECORD.read_text())
     assert set(record) == set(PLUGINS) | set(IN_INSTANCES)
@@ -82,7 +82,7 @@ def test_a_descent_of_a_wrong_gradient_is_seen(
     monkeypatch: pytest.MonkeyPatch, factor: float, shift: float, ok: bool
 ) -> None:
     """A gradient of the wrong sign, and one that leads away from the truth by a large bias."""
-    from benchmarks.coverage.measure import descent
+    from scripts.coverage.measure import descent
 
     matrix = np.random.default_rng(0).uniform(0, 1, (SIZE * SIZE * 3, 3))
     renderer = AnalyticRenderer({"x": np.full(3, 0.5)}, matrix, noise=0.05, shape=(SIZE, SIZE))

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks.golden import cases
-from benchmarks.golden.cli import RECORD, compare, summary
+from scripts.golden import cases
+from scripts.golden.cli import RECORD, compare, summary
 
 KNOWN: dict[str, Any] = json.loads(RECORD.read_text())["cases"]
 

@@ -10,7 +10,8 @@ runs, the time of a path is measured in turns, after the race (`--part cost`: th
 
 `--steps 5000` races by steps, with rates that fall along half a cosine; `time` is then that in which each method first
 reaches the least error that all reach, over that of uniform mini-batches; these races have entries of their own. Large
-pictures: `--resolution 1024`; many views: `--views 16`.
+pictures: `--resolution 1024`; many views: `--views 16`. `--levels` races one level against five at equal paths in
+`plain-and-textured`, by the error of the texture alone: the paper's form, as Fig. 5 has it, and the default.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
+from benchmarks.internals import Tree
 from benchmarks.pixel_schemes import pixels
-from benchmarks.races import Entrant, Runs, follow, over, race, reached, tenths
+from benchmarks.races import Entrant, Runs, follow, over, race, reached, scaled, tenths, total_error
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 
@@ -43,7 +45,9 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
 }
 """Problem, its options, pixels a step."""
 RATES = (0.01, 0.03)
-MERGE = ("entries.*.methods", "seconds_per_path.*")
+PAPERS: dict[str, Any] = {"relative": False, "uniform": 0.1, "learn_from_draws": False, "by_cost": False}
+"""Options of the paper's form, but for its levels."""
+MERGE = ("entries.*.methods", "seconds_per_path.*", "levels")
 QUICK = {"problem": ("two-planets",), "seconds": 0.3, "seeds": 2, "resolution": 16, "count": 32, "rounds": 2}
 
 
@@ -58,11 +62,35 @@ def entrants(task: str, count: int, steps: int | None = None) -> list[Entrant]:
 
     found = [entrant("uniform", "uniform"), entrant("loss", "loss"), entrant("adaptive", "adaptive")]
     if task in ("plain-and-textured", "sun-glossy L2"):
-        paper = {"relative": False, "levels": 4, "uniform": 0.1, "learn_from_draws": False, "by_cost": False}
-        found.append(entrant("adaptive, as the paper", "adaptive", **paper))
+        found.append(entrant("adaptive, as the paper", "adaptive", **PAPERS, levels=4))
     if task == "plain-and-textured":
         found.append(entrant("adaptive, five levels", "adaptive", levels=4))
     return found
+
+
+LEVELS: dict[str, dict[str, Any] | None] = {
+    "uniform": None, "paper's form, one level": PAPERS, "paper's form, five levels": {**PAPERS, "levels": 4},
+    "adaptive, one level": {}, "adaptive, five levels": {"levels": 4},
+}  # fmt: skip
+
+
+def race_levels(count: int, steps: int, seeds: int, options: dict[str, Any]) -> dict[str, Any]:
+    """Race samplers of one and of five levels: final errors of each unknown of `plain-and-textured`."""
+    problem = ur.gallery.problem("plain-and-textured", **options)
+    start = problem.parameter_error(problem.initial())
+    names = {key: key.partition(".")[0] for key in start}
+
+    def measure(parameters: Tree) -> dict[str, float]:
+        errors = problem.parameter_error(parameters)
+        return {"": total_error(errors, start), **{names[key]: error / start[key] for key, error in errors.items()}}
+
+    adam = scaled(ur.optimizers.Adam, ur.schedules.Cosine(steps))
+    chosen = []
+    for name, own in LEVELS.items():
+        sampler = ur.pixels.Uniform(count) if own is None else ur.pixels.Adaptive(count, **own)
+        chosen.append(Entrant(name, name, ur.PathGradient(pixels=sampler, spp=2), adam, RATES))
+    methods = race(problem, chosen, seeds, measure=measure, by="cushion", points=4, steps=steps)
+    return {"options": options, "count": count, "steps": steps, "seeds": seeds, "methods": methods}
 
 
 def costs(
@@ -116,6 +144,7 @@ def run(
     only: tuple[str, ...] = (),
     part: tuple[str, ...] = ("race", "cost"),
     rounds: int = 5,
+    levels: bool = False,
 ) -> Iterator[dict[str, Any]]:
     """A part per task.
 
@@ -128,7 +157,12 @@ def run(
         only: methods to run and to time; the others' figures stay
         part: measured; the other's figures stay
         rounds: of turns of the cost
+        levels: race one level against five, by steps; the rest of the record stays
     """
+    if levels:
+        size = {**FINE, **({"resolution": resolution} if resolution else {})}
+        yield {"levels": {f"{count} pixels": race_levels(count or 512, steps or 400, seeds, size)}}
+        return
     for task in problem:
         name, options, usual = TASKS[task]
         options = {

@@ -123,15 +123,17 @@ def _variance(values: np.ndarray) -> tuple[float, float]:
     return float(np.var(values, ddof=1)), float(np.std(parts_of, ddof=1) / np.sqrt(8))
 
 
-def descents(problem: ur.Problem, count: int, rate: float, steps: int, seeds: int) -> dict[str, Any]:
+def descents(
+    problem: ur.Problem, count: int, rate: float, steps: int, seeds: int, kinds: tuple[str, ...], falling: bool
+) -> dict[str, Any]:
     """By pixels and kind: the error along each run, relative to its start, and its mean over the last quarter, one for each seed."""
     key, found = problem.parameters[0].key, {}
     for scheme in SCHEMES:
-        for kind in KINDS:
+        for kind in kinds:
             estimator = ur.PathGradient(pixels=pixels(scheme, count), spp=2, differential_bsdf=kind == "differential")
             runs, spent = [], time.process_time()
             for seed in range(seeds):
-                path = descent(problem, estimator, rate, steps + 1, seed)
+                path = descent(problem, estimator, rate, steps + 1, seed, falling)
                 errors = [problem.parameter_error(at)[key] for at in path]
                 runs.append([error / errors[0] for error in errors])
             last = [float(np.mean(run[-(steps // 4) :])) for run in runs]
@@ -165,6 +167,8 @@ def run(
     seeds: int = 6,
     reference_spp: int = 1024,
     part: tuple[str, ...] = ("variance", "descents"),
+    kinds: tuple[str, ...] = KINDS,
+    falling: bool = False,
 ) -> Iterator[dict[str, Any]]:
     """A part per scene.
 
@@ -180,6 +184,8 @@ def run(
         seeds: of the descents
         reference_spp: of the references
         part: measured; the other's figures stay
+        kinds: of derivatives of the descents; the other's figures stay
+        falling: whether rates fall as half a cosine; these descents have an entry of their own
     """
     for name in scene:
         problem = opened(name, resolution, reference_spp)
@@ -192,7 +198,8 @@ def run(
             found["variance"][name].append(point)
             print(name, point, flush=True)
         if name in DESCENTS and "descents" in part:
-            found["descents"] = {name: descents(problem, count, rate, steps, seeds)}
+            label = f"{name}, falling rate" if falling else name
+            found["descents"] = {label: descents(problem, count, rate, steps, seeds, kinds, falling)}
         yield found
 
 
@@ -213,7 +220,7 @@ def table(record: Record) -> str:
     return markdown.blocks(
         *parts,
         f"The largest |z| of the difference of the {len(every)} pairs of means: {worst:.2f}.",
-        "**descents**: two paths a pixel, constant rate",
+        "**descents**: two paths a pixel, constant rate if not said otherwise",
         markdown.records(
             "scene | steps × pixels | seeds | pixels, derivatives | error of alpha, last quarter | processor seconds a run",
             "{scene} | {budget[0]} × {budget[1]} | {last!n} | {kind} | {mean:.3f} ± {error:.2g} | {seconds:.1f}",

@@ -8,7 +8,9 @@ these with its images denoised before the loss sees them, by Open Image Denoise 
 variation, and the record says by which.
 
 Equal time is that of the clock; with `--processor` that of the processor, all cores together, which other work on the
-machine does not change much: entries of their own, on smaller films.
+machine does not change much: entries of their own, on smaller films. `--steps` and `--spp IMAGE ADJOINT` race those
+smaller films at equal steps, the adjoint on paths of its own as in the paper, rates falling along half a cosine. There
+"converged" has images of 64 times the samples: no control variate and no denoiser can do better with that adjoint.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import ImageEstimator, available_denoiser
-from benchmarks.races import TUNING_SEED, median_and_range, total_error
+from benchmarks.races import TUNING_SEED, Entrant, median_and_range, race, scaled, total_error
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import stock_loop
@@ -62,7 +64,9 @@ IMAGES: dict[str, Callable[[], ImageEstimator]] = {
     "plain, denoised": lambda: ur.images.Denoised(ur.images.Plain(), by=available_denoiser()),
     "rcv, denoised": lambda: ur.images.Denoised(ur.images.RecursiveControlVariate(), by=available_denoiser()),
 }
-MERGE = ("entries",)
+CONVERGED = 64
+"""Samples of a converged image over those of the other methods' images."""
+MERGE = ("entries", "equal steps.*.methods")
 QUICK = {
     "problem": ("indirect-room",), "loss": ("L2",), "seconds": 0.5, "seeds": 2, "resolution": 16,
     "grid": ("stock=2:0.01", "plain=2:0.01", "rcv=2:0.01,2:0.02"),
@@ -124,6 +128,26 @@ def compare(
     return found
 
 
+def at_equal_steps(
+    name: str,
+    loss: str,
+    steps: int,
+    spp: tuple[int, int],
+    seeds: int,
+    rates: tuple[float, ...],
+    methods: tuple[str, ...],
+) -> dict[str, Any]:
+    """Tune the rate of every method, then run its best on the seeds; the adjoint has paths of its own."""
+    problem = ur.gallery.problem(name, loss=loss, **SMALL[name])
+    image, adjoint = spp
+    estimators = {method: ur.PathGradient(make(), spp=image, adjoint_spp=adjoint) for method, make in IMAGES.items()}
+    estimators["converged"] = ur.PathGradient(spp=CONVERGED * image, adjoint_spp=adjoint)
+    adam = scaled(ur.optimizers.Adam, ur.schedules.Cosine(steps))
+    entrants = [Entrant(m, m, each, adam, rates) for m, each in estimators.items() if not methods or m in methods]
+    conditions = {"problem": name, "loss": loss, "steps": steps, "spp": spp, "denoiser": available_denoiser()}
+    return {**conditions, "methods": race(problem, entrants, seeds, steps=steps)}
+
+
 def summarise(found: dict[str, Any]) -> dict[str, Any]:
     """Final errors (median, least, most), their ratio, and when the control variate reaches the others' best error."""
     rows: dict[str, Any] = {}
@@ -160,6 +184,10 @@ def run(
     resolution: int | None = None,
     grid: tuple[str, ...] = (),
     processor: bool = False,
+    steps: int | None = None,
+    spp: tuple[int, ...] = (16, 16),
+    rates: tuple[float, ...] = (0.01, 0.03),
+    only: tuple[str, ...] = (),
 ) -> Iterator[dict[str, Any]]:
     """A part per problem and loss.
 
@@ -169,14 +197,23 @@ def run(
         resolution: film size, for GPUs
         grid: METHOD=SPP:RATE,..., in place of the method's grid; a single one is taken as it is
         processor: whether seconds are of the processor; then with denoised images, too, and smaller films
+        steps: of every run, in place of its seconds
+        spp: samples per pixel of the image and of the adjoint, with steps
+        rates: of a race by steps, to try; a single one is taken as it is
+        only: methods of a race by steps; the others' figures stay
     """
-    sizes = SMALL if processor else OPTIONS
+    sizes = SMALL if processor or steps else OPTIONS
     for name in problem:
         if name not in sizes:
             way = "with --processor" if processor else "without --processor"
             raise ur.InputError(f"{name}: not raced {way}; there are {', '.join(sizes)}")
     for name, which in itertools.product(problem or sizes, loss):
         options = {**sizes[name], **({"resolution": resolution} if resolution else {})}
+        if steps:
+            image, adjoint = spp
+            entry = f"{name}, {which}, {image} + {adjoint} spp"
+            yield {"equal steps": {entry: at_equal_steps(name, which, steps, (image, adjoint), seeds, rates, only)}}
+            continue
         budget = seconds or (8.0 if processor else BUDGETS.get(name, 4.0))
         entry = f"{name}, {which}{', processor' if processor else ''}"
         yield {"entries": {entry: compare(name, which, budget, seeds, options, parse(grid), processor)}}

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 from benchmarks import markdown
-from benchmarks.coverage.plugins import IN_INSTANCES, PLUGINS
 from benchmarks.runner.catalogue import ROOT
+from scripts.coverage.plugins import IN_INSTANCES, PLUGINS
 
 __all__ = ["PAGE", "page"]
 
 PAGE = ROOT / "docs" / "reference" / "coverage.md"
 _HEAD = """# Coverage of Mitsuba's plugins
 
-Built from the record of `python -m benchmarks coverage`: a scene of 16 x 16 pixels for each plugin of Mitsuba 3.9.1. The rows *in
+Built from the record of `python -m scripts.coverage`: a scene of 16 x 16 pixels for each plugin of Mitsuba 3.9.1. The rows *in
 instances* have the plugin's shape in a `shapegroup` with two instances; one parameter of each is measured, with a quarter of the samples.
 
 | column | contents |

@@ -10,10 +10,10 @@ from typing import Any
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.coverage.plugins import PLUGINS
-from benchmarks.coverage.scenes import Plugin
 from benchmarks.internals import ObjectGraph, Range, SlotReaders, dr, load_scene, mi
 from benchmarks.runner.catalogue import ROOT
+from scripts.coverage.plugins import PLUGINS
+from scripts.coverage.scenes import Plugin
 
 __all__ = ["NO_VALUES", "PAGE", "Row", "missing", "page", "rows"]
 

@@ -1,4 +1,4 @@
-"""`python -m benchmarks golden`: record short descents, or compare with the record."""
+"""`python -m scripts.golden`: record short descents, or compare with the record."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.golden.cases import METHODS, OPTIMIZERS, PROBLEMS, Trajectory, descend, optimize
 from benchmarks.runner import records
+from scripts.golden.cases import METHODS, OPTIMIZERS, PROBLEMS, Trajectory, descend, optimize
 
 __all__ = ["compare", "main", "summary"]
 
@@ -28,10 +28,10 @@ _ROUNDING = 1e-5
 
 def main(arguments: Sequence[str]) -> int:
     """Record or check. The status is 1 where a trajectory differs by more than seeds do."""
-    parser = argparse.ArgumentParser("python -m benchmarks golden", description=__doc__)
+    parser = argparse.ArgumentParser("python -m scripts.golden", description=__doc__)
     parser.add_argument("--record", action="store_true", help="write the record, of three seeds; else compare with it")
     parser.add_argument("--check", action="store_true", help="compare with the record (the default)")
-    parser.add_argument("--file", type=Path, default=RECORD, help="the record (benchmarks/golden/record.json)")
+    parser.add_argument("--file", type=Path, default=RECORD, help="the record (scripts/golden/record.json)")
     parser.add_argument("--only", default="", help="regular expression that the case's name must contain")
     given = parser.parse_args(arguments)
     import drjit as dr

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.coverage.scenes import (
+from benchmarks.internals import mi
+from scripts.coverage.scenes import (
     Plugin,
     area,
     attribute,
@@ -44,7 +45,6 @@ from benchmarks.coverage.scenes import (
     textured,
     unit_cube,
 )
-from benchmarks.internals import mi
 
 __all__ = ["IN_INSTANCES", "PLUGINS"]
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.coverage.checks import descended, gradients_agree, images_agree
-from benchmarks.coverage.plugins import IN_INSTANCES, PLUGINS
-from benchmarks.coverage.scenes import Plugin
 from benchmarks.internals import SampleRequest, descend, load_scene, media, mi, mitsuba_renderer
+from scripts.coverage.checks import descended, gradients_agree, images_agree
+from scripts.coverage.plugins import IN_INSTANCES, PLUGINS
+from scripts.coverage.scenes import Plugin
 
 __all__ = ["descent", "measure"]
 

@@ -1,4 +1,4 @@
-"""`python -m benchmarks coverage`: measure Mitsuba's plugins. The site makes pages of the record."""
+"""`python -m scripts.coverage`: measure Mitsuba's plugins. The site makes pages of the record."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _LONGEST = 400
 
 def main(arguments: Sequence[str]) -> int:
     """Do what the command line says; the exit status."""
-    parser = argparse.ArgumentParser("python -m benchmarks coverage", description=__doc__)
+    parser = argparse.ArgumentParser("python -m scripts.coverage", description=__doc__)
     parser.add_argument("plugins", nargs="*", help="measure these alone; the record keeps the others")
     parser.add_argument("--descents", action="store_true", help="measure the descents alone; the record keeps the rest")
     parser.add_argument("--record", type=Path, default=RECORD, help="the record's file")
     given = parser.parse_args(arguments)
     ur.use()
-    from benchmarks.coverage.plugins import IN_INSTANCES, PLUGINS
+    from scripts.coverage.plugins import IN_INSTANCES, PLUGINS
 
     scenes = {**PLUGINS, **IN_INSTANCES}
     record = json.loads(given.record.read_text()) if given.record.is_file() else {}
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _measure(name: str, known: dict[str, Any] | None) -> dict[str, Any]:
-    from benchmarks.coverage.measure import measure  # imports Mitsuba, in the process of its own
+    from scripts.coverage.measure import measure  # imports Mitsuba, in the process of its own
 
     return measure(name, known)
 
