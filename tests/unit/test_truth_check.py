@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.truth_check import further_from_truth
-from unrender.runs.verification import FreshPictures
 
 SIDE, CELLS = 12, 8
 START = 0.2

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder import reader
 from unrender.runs.folder.schema import NOT_VERIFIED
-from unrender.runs.verification import FreshPictures
 from unrender.statistics import paired_losses
 
 SIDE, WIDE, SIZE = 12, 20, 6

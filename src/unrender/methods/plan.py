@@ -142,6 +142,8 @@ def _settings_table(own: ParameterSettings) -> dict[str, Any]:
         settings["coarse_to_fine"] = tables.fields(own.coarse_to_fine)
     if own.start_factor is not None:
         settings["start_factor"] = own.start_factor
+    if own.start is not None:
+        settings["start"] = list(own.start)
     return settings
 
 
@@ -154,4 +156,6 @@ def _settings(table: Any, where: str) -> ParameterSettings:
         made["preconditioner"] = tables.component(made["preconditioner"], "preconditioner", where=where)
     if "coarse_to_fine" in made:
         made["coarse_to_fine"] = tables.build(CoarseToFine, made["coarse_to_fine"])
+    if "start" in made:
+        made["start"] = tuple(made["start"])
     return ParameterSettings(**made)

@@ -11,7 +11,6 @@ import numpy as np
 
 from unrender.core import phases
 from unrender.core.text import listed
-from unrender.display import formatting
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
@@ -19,11 +18,11 @@ from unrender.runs.image_sensitivity import Curvature, curvature
 from unrender.runs.least_squares import check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, of_residuals
 from unrender.runs.result import Result
-from unrender.runs.verification import DIFFERS
+from unrender.runs.verification import DIFFERS, misfit
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.scene.view import View
-from unrender.statistics import debiased, paired_losses
+from unrender.statistics import debiased
 
 _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
@@ -149,8 +148,8 @@ def render_final_images(
             if result.steps and len(ends[0]) == 2 and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, list(zip(*ends, strict=True)), known)
     deviations |= maps.standard_error
-    misfit = _misfit(problem, result, [problem.views[index] for index in chosen], ends)
-    warnings, deviations = (*warnings, *filter(None, misfit)), {} if misfit else deviations
+    differs = _misfit(problem, result, [problem.views[index] for index in chosen], ends)
+    warnings, deviations = (*warnings, *filter(None, differs)), {} if differs else deviations
     return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share)
 
 
@@ -208,20 +207,17 @@ def _misfit(
         return [""]
     references = [np.asarray(view.reference, np.float32) for view in views]
     weights = np.concatenate([np.ravel(v.pixel_weights(x.shape[:2])) for v, x in zip(views, references, strict=True)])
+    pixels = [image.reshape(-1, 3) for image in references]
     halves = [
-        np.concatenate([(end[half] - image).reshape(-1, 3) for end, image in zip(ends, references, strict=True)])
+        np.concatenate([(end[half].reshape(-1, 3) - of) for end, of in zip(ends, pixels, strict=True)])[None]
         for half in (0, 1)
     ]
-    shared = paired_losses.systematic(halves[0], weights, halves[1])
-    pixels = np.concatenate([image.reshape(-1, 3) for image in references])
-    size = math.sqrt(paired_losses.mean_square(pixels, weights))
-    error = math.sqrt(max(shared.mean_square, 0.0))
-    if not shared.score > paired_losses.SIGNIFICANT or error <= _OF_PICTURE * size:
+    found = misfit(halves[0], halves[1], np.concatenate(pixels), weights, _OF_PICTURE)
+    if found is None:
         return []
-    part = f" ({error / size:.0%} of the picture)" if size > 0.0 else ""
     return [
-        f"{DIFFERS} by {formatting.number(error)}{part}, which noise does not explain: the run needs more steps or another start, or "
-        "something that is not among the unknowns is wrong"
+        f"{found.describe()}, which noise does not explain: the run needs more steps, another start or bounds (auto compares starts "
+        "within them), or something that is not among the unknowns is wrong"
     ]
 
 

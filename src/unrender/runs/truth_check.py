@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.runs.image_sensitivity import seen_cells, sensitivity
-from unrender.runs.verification import FreshPictures
 from unrender.scene.problem import Problem
 
 __all__ = ["FEW_NEWTON_STEPS", "FEW_STEPS", "further_from_truth"]

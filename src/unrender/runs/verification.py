@@ -1,43 +1,87 @@
-"""New images of a run's parameters, and their comparison."""
+"""Whether the pictures of a run agree with its references, and the control variates in its state."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from unrender.core import arrays
 from unrender.core.arrays import Array
-from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.estimators.penalties import penalty
-from unrender.rendering.renderer import SampleRequest
-from unrender.scene.batches import PixelBatch, PixelSample
-from unrender.scene.problem import Problem
-from unrender.scene.render import power_of_two, view_request
+from unrender.display import formatting
 from unrender.statistics import paired_losses
 
-__all__ = ["DIFFERS", "FreshPictures", "Picture", "Remembering", "is_finite", "remembered"]
+__all__ = ["DIFFERS", "Misfit", "Remembering", "misfit", "remembered"]
 
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
-_GROUPS = 4
-"""Number of independent groups of each new image."""
-_LEAST_PATHS, _MOST_PATHS = 1 << 13, 1 << 22
-"""Limits of the paths of a new image."""
-_LONGER = 4
-"""Ratio of the allowed paths to the minimum below which an image has the minimum, because another number of pixels needs another
-recording."""
-_FEW_PIXELS = 1 << 12
-"""Number of pixels of all views up to which full views are rendered, for any number of paths."""
-_STREAM = 2
-"""Stream of the run's key for new images; the steps use 0, the warm-up 1."""
-_MOST_NON_FINITE = 0.01
-"""Fraction of pixels that may become non-finite, compared to the start, before an image counts as non-finite."""
+_FEW_PIXELS, _OF_FEW = 96, 0.2
+"""Number of pixels below which the difference is also judged pixel by pixel, which includes the references' noise; its smallest size
+relative to the image in this case."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """A difference of pictures from their references that noise does not explain.
+
+    Attributes:
+        error: its root mean square.
+        size: root mean square of the references.
+        noise: root mean square of the rest of the first picture's difference.
+        by_pixel: whether pixels were judged one by one, so that the references' noise counts.
+    """
+
+    error: float
+    size: float
+    noise: float
+    by_pixel: bool = False
+
+    def describe(self) -> str:
+        """Return the first words of a warning."""
+        times = f"{self.error / self.noise:.1f} times its noise" if self.noise > 0.0 else ""
+        share = f"{self.error / self.size:.0%} of the picture" if self.size > 0.0 else ""
+        parts = ", ".join(filter(None, (share, times)))
+        return f"{DIFFERS} by {formatting.number(self.error)}" + (f" ({parts})" if parts else "")
+
+
+def misfit(
+    residuals: np.ndarray,
+    others: np.ndarray,
+    references: np.ndarray,
+    weights: np.ndarray,
+    least: float,
+    fresh: np.ndarray | None = None,
+) -> Misfit | None:
+    """Return the difference from the references that two pictures share; None if it may be noise or is small.
+
+    Noise of the references does not count, since neighbouring pixels do not share it.
+
+    Args:
+        residuals: differences of K independent images from the references, (K, N, 3), in an order that mostly keeps neighbours adjacent.
+        others: those of another picture, whose noise may depend on the first one's at the same pixel, (K, N, 3).
+        references: references, (N, 3).
+        weights: weight of each pixel, (N,), in [0, 1].
+        least: smallest difference relative to the references.
+        fresh: differences of K >= 2 images with independent noise, (K, N, 3). With these, few pixels are also judged one by one.
+    """
+    one, other = residuals.mean(axis=0), others.mean(axis=0)
+    if not (np.isfinite(one).all() and np.isfinite(other).all()):
+        return None
+    size, total = (math.sqrt(paired_losses.mean_square(x, weights)) for x in (references, one))
+
+    def significant(shared: paired_losses.SystematicDifference, smallest: float, by_pixel: bool) -> Misfit | None:
+        error = math.sqrt(max(shared.mean_square, 0.0))
+        beyond = shared.score > paired_losses.SIGNIFICANT and error > smallest * size
+        return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), by_pixel) if beyond else None
+
+    found = significant(paired_losses.systematic(one, weights, other), least, False)
+    if found or fresh is None or np.count_nonzero(weights) >= _FEW_PIXELS:
+        return found
+    return significant(paired_losses.repeated(residuals, fresh, weights), _OF_FEW, True)
 
 
 @runtime_checkable
@@ -63,206 +107,3 @@ def remembered(state: Any) -> Iterator[tuple[Tree, Sequence[Array]]]:
     elif isinstance(state, (list, tuple)):
         for part in state:
             yield from remembered(part)
-
-
-@dataclass(frozen=True)
-class Picture:
-    """The new image at one point.
-
-    Attributes:
-        images: images of each frame, (K, N, 3), independent over K.
-        losses: pseudo-values (K, N) of the parts of the loss; see `paired_losses.pseudo_values`. Parts are pixels, or the sampling units:
-            pairs of pixels, or views.
-    """
-
-    images: tuple[np.ndarray, ...]
-    losses: np.ndarray
-
-    @property
-    def loss(self) -> tuple[float, float]:
-        """The loss without the image's noise, and its standard error; infinite for a non-finite image."""
-        value, error = paired_losses.mean_and_error(self.losses)
-        return (value, error) if math.isfinite(value) and math.isfinite(error) else (math.inf, math.inf)
-
-
-@dataclass(frozen=True)
-class _Frame:
-    """Pixels of one view, or a list of pixels of all views.
-
-    Attributes:
-        view: index of the view, all of whose pixels are rendered; None for a list of pixels.
-        views, pixels: index of each pixel's view, and its row-major index in the film, (N,).
-        reference: reference of each pixel, (N, 3).
-        factors: factor of each pixel's loss, (N, 1).
-    """
-
-    view: int | None
-    views: np.ndarray
-    pixels: np.ndarray
-    reference: np.ndarray
-    factors: np.ndarray
-
-
-class FreshPictures:
-    """Renders new images of any parameters, all with the same random numbers.
-
-    The random numbers come from a separate stream of the run's key, so they are independent of the run's. Few pixels are rendered as full
-    views. Many pixels are rendered as a list, which is a random sample if there are too few paths. If the loss needs full views, or
-    cameras move, the sample consists of views.
-
-    The samples per pixel of a launch depend on the problem only, so all images share one compiled kernel, and those of a short run share
-    one recording. More paths use more pixels, and then more launches.
-
-    Args:
-        problem: problem with the views.
-        seed: seed of the run.
-        paths: approximate number of paths of one image.
-        number: index of the run's independent set of random numbers.
-    """
-
-    def __init__(self, problem: Problem, seed: int, paths: float, number: int = 0):
-        self._problem, self._key = problem, Key(seed, 0, _STREAM).fold(number)
-        allowed = _LEAST_PATHS if paths < _LONGER * _LEAST_PATHS else int(min(paths, _MOST_PATHS))
-        self.frames, self.sampled = _frames(problem, allowed // _GROUPS, self._key.fold(0))
-        self.pixels = sum(len(frame.pixels) for frame in self.frames)
-        self._spp = _GROUPS * power_of_two(_LEAST_PATHS // (_GROUPS * max(self.pixels, 1)))
-        self._launches = power_of_two(allowed // max(self.pixels * self._spp, 1))
-
-    @property
-    def paths(self) -> int:
-        """Number of paths of one image."""
-        return self.pixels * self._spp * self._launches
-
-    def picture(self, parameters: Mapping[str, np.ndarray] | Tree, problem: Problem | None = None) -> Picture:
-        """Render the parameters; `problem` is needed for parameters of another mesh."""
-        images = self.images(parameters, problem)
-        parts = [self._losses(frame, of) for frame, of in zip(self.frames, images, strict=True)]
-        losses = np.concatenate(parts, axis=1)
-        # The penalty has no noise, so each part gets an equal share.
-        losses += penalty(problem or self._problem, parameters) / losses.shape[1]
-        return Picture(tuple(images), losses)
-
-    def images(self, parameters: Mapping[str, np.ndarray] | Tree, problem: Problem | None = None) -> list[np.ndarray]:
-        """Return the images (K, N, 3) of each frame."""
-        renderer = (problem or self._problem).renderer
-        tree = {k: renderer.array(x) if isinstance(x, np.ndarray) else x for k, x in parameters.items()}
-        session = renderer.prepare(list(tree), None, derivatives=False)
-        images_by_frame = []
-        for index, frame in enumerate(self.frames):
-            key, total = self._key.fold(index + 1), np.zeros((_GROUPS, len(frame.pixels), 3))
-            for launch in range(self._launches):
-                seed = (key.fold(launch) if launch else key).uint32()
-                images = session.image(tree, self._request(frame, seed)).images
-                total += arrays.numpy(images).reshape(total.shape)
-            images_by_frame.append(total / self._launches)
-        return images_by_frame
-
-    def residual(self, images: Sequence[np.ndarray]) -> float:
-        """Return the mean square difference over pixels and channels between images (K, N, 3) of each frame and the references."""
-        means = np.concatenate([one.mean(axis=0) for one in images])
-        weights = self.weights[:, None] * np.isfinite(means)
-        squares = np.where(np.isfinite(means), means - self.references, 0.0) ** 2
-        return float((weights * squares).sum() / max(float(weights.sum()), 1e-300))
-
-    @property
-    def weights(self) -> np.ndarray:
-        """Weight of each pixel, (N,), of all frames concatenated; at most 1."""
-        factors = np.concatenate([frame.factors[:, 0] for frame in self.frames])
-        return factors / max(float(factors.max(initial=0.0)), 1e-300)
-
-    @property
-    def references(self) -> np.ndarray:
-        """Reference of each pixel, (N, 3)."""
-        return np.concatenate([frame.reference for frame in self.frames]).astype(np.float64)
-
-    def memory(self, images: Sequence[Array]) -> list[np.ndarray]:
-        """Return the pixels (N, 3) of each frame from one image (H, W, 3) of each view."""
-        flat: dict[int, np.ndarray] = {}
-        for frame in self.frames:
-            for view in np.unique(frame.views):
-                flat[int(view)] = arrays.numpy(images[view]).astype(np.float64).reshape(-1, 3)
-        return [
-            np.concatenate([flat[int(v)][frame.pixels[frame.views == v]] for v in np.unique(frame.views)])
-            for frame in self.frames
-        ]
-
-    def _request(self, frame: _Frame, seed: int) -> SampleRequest:
-        if frame.view is not None:
-            return replace(view_request(self._problem, frame.view, self._spp, seed), groups=_GROUPS)
-        like = self._problem.renderer.array(np.zeros(1))
-        views, pixels = (arrays.like_integers(x, like) for x in (frame.views, frame.pixels))
-        sample = PixelSample(views, pixels, self._problem.renderer.array(frame.factors))
-        return PixelBatch(self._problem, sample).request(self._spp, seed, _GROUPS)
-
-    def _losses(self, frame: _Frame, images: np.ndarray) -> np.ndarray:
-        """Return the pseudo-values (K, N) of pixels, or (K, 1) of the view if the loss needs full images."""
-        candidates = [images.mean(axis=0), *paired_losses.leave_one_out(images)]
-        total, *others = (self._values(frame, image) for image in candidates)
-        pseudo = paired_losses.pseudo_values(total, np.stack(others))
-        if not self.sampled:
-            return pseudo
-        # The parts are the sampling units: pairs of pixels, or views.
-        divisor = 1 if frame.view is not None else pseudo.shape[1] // 2
-        return pseudo.reshape(len(pseudo), divisor, -1).sum(axis=2)
-
-    def _values(self, frame: _Frame, image: np.ndarray) -> np.ndarray:
-        problem, array = self._problem, self._problem.renderer.array
-        if frame.view is not None and not problem.loss.pixelwise:
-            height, width = problem.sizes[frame.view]
-            return np.array([arrays.number(problem.loss_value(frame.view, array(image.reshape(height, width, 3))))])
-        values = arrays.numpy(problem.loss.value(array(image), array(frame.reference))).reshape(len(image), -1)
-        counted = frame.factors > 0
-        return np.where(counted, values * frame.factors, 0.0).sum(axis=1, dtype=np.float64)
-
-
-def is_finite(first: Picture, other: Picture) -> bool:
-    """Return whether `other` is finite wherever `first` is, except at very few pixels."""
-    broken, known = 0, 0
-    for a, b in zip(first.images, other.images, strict=True):
-        at_first, here = (np.isfinite(images.sum(axis=(0, 2))) for images in (a, b))
-        broken += int((at_first & ~here).sum())
-        known += at_first.size
-    return broken <= _MOST_NON_FINITE * known
-
-
-def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], bool]:
-    """Return the tested pixels, at most about `allowed`, and whether they are a sample."""
-    count, total = len(problem.views), problem.pixels
-    if total <= _FEW_PIXELS:
-        return [_full_view(problem, view) for view in range(count)], False
-    generator = np.random.default_rng(key.uint32())
-    known = problem.renderer.parameters()
-    rigid = any(known[parameter.key].rigid for parameter in problem.parameters)
-    if not problem.loss.pixelwise or (rigid and count > 1):
-        many = max(1, min(count, allowed * count // total))
-        chosen = np.sort(generator.choice(count, many, replace=False))
-        return [_full_view(problem, int(view)) for view in chosen], many < count
-    return [_pixel_list(problem, None if total <= allowed else allowed, generator)], total > allowed
-
-
-def _full_view(problem: Problem, view: int) -> _Frame:
-    height, width = problem.sizes[view]
-    own = problem.views[view]
-    reference = np.asarray(own.reference, np.float32).reshape(-1, 3)
-    factors = own.pixel_weights((height, width)).reshape(-1, 1) * (own.weight / reference.size)
-    return _Frame(view, np.full(height * width, view), np.arange(height * width), reference, factors)
-
-
-def _pixel_list(problem: Problem, count: int | None, generator: np.random.Generator) -> _Frame:
-    """Return pairs of neighbouring pixels, stratified over all pixels of all views; None for all pixels."""
-    sizes = np.array([height * width for height, width in problem.sizes])
-    starts = np.cumsum([0, *sizes])
-    place = np.arange(starts[-1])
-    if count is not None:
-        strata = np.linspace(0, starts[-1], max(count // 2, 1) + 1)
-        place = (strata[:-1] + generator.random(len(strata) - 1) * np.diff(strata)).astype(np.int64)
-        place = np.clip(place, 0, starts[-1] - 1)
-    views = np.searchsorted(starts, place, side="right") - 1
-    pixels = place - starts[views]
-    if count is not None:
-        partners = np.where(pixels + 1 < sizes[views], pixels + 1, np.maximum(pixels - 1, 0))
-        pixels, views = np.stack([pixels, partners], axis=1).reshape(-1), np.repeat(views, 2)
-    like = problem.renderer.array(np.zeros(1))
-    reference, factors = problem.references.at(arrays.like_integers(views, like), arrays.like_integers(pixels, like))
-    weight = starts[-1] / len(pixels)
-    return _Frame(None, views, pixels, arrays.numpy(reference), arrays.numpy(factors).astype(np.float64) * weight)

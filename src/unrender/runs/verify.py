@@ -12,6 +12,7 @@ import numpy as np
 
 from unrender.core import phases
 from unrender.display import formatting
+from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
@@ -20,13 +21,7 @@ from unrender.runs.number_means import averaged
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
-from unrender.runs.verification import (
-    DIFFERS,
-    FreshPictures,
-    Picture,
-    is_finite,
-    remembered,
-)
+from unrender.runs.verification import misfit, remembered
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
@@ -43,9 +38,8 @@ _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
 _OF_RESIDUAL, _OF_PICTURE = 0.1, 0.02
 """Smallest error of a control variate, as a fraction of the mean square residual, and relative to the image."""
-_FEW_PIXELS, _OF_FEW, _OF_TRUTH = 96, 0.2, 4.0
-"""Number of pixels below which the residual is also judged pixel by pixel, which includes the references' noise; its smallest size
-relative to the image in this case; its smallest mean square relative to that at the true values, if these are known."""
+_OF_TRUTH = 4.0
+"""Smallest mean square of a residual judged pixel by pixel, relative to that at the true values, if these are known."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
 _FIRST_CANDIDATE = 64
@@ -190,38 +184,23 @@ class Verify(Callback):
         last = _Earlier.of(result.steps, self._pictures, result.parameters)
         if not last.is_still(earlier):
             return []
-        weights, references = self._pictures.weights, self._pictures.references
-        residual = last.residual
-        if not (np.isfinite(residual).all() and np.isfinite(earlier.residual).all()):
+        least = _OF_PICTURE_SHORT if earlier.is_short else _OF_PICTURE
+        references, weights = self._pictures.references, self._pictures.weights
+        fresh = np.concatenate(end.images, axis=1) - references
+        found = misfit(last.residuals, earlier.residuals, references, weights, least, fresh)
+        if found is None:
             return []
-        shared = paired_losses.systematic(residual, weights, earlier.residual)
-        size = math.sqrt(paired_losses.mean_square(references, weights))
-        error = math.sqrt(max(shared.mean_square, 0.0))
-        if (
-            not shared.score > paired_losses.SIGNIFICANT
-            or error <= (_OF_PICTURE_SHORT if earlier.is_short else _OF_PICTURE) * size
-        ):
-            if np.count_nonzero(weights) >= _FEW_PIXELS:
-                return []
-            others = np.concatenate(end.images, axis=1) - references
-            shared = paired_losses.repeated(last.residuals, others, weights)
-            error = math.sqrt(max(shared.mean_square, 0.0))
-            if not shared.score > paired_losses.SIGNIFICANT or error <= _OF_FEW * size:
-                return []
-            if problem.has_truth and shared.mean_square <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
-                return []
-        noise = math.sqrt(max(paired_losses.mean_square(residual, weights) - shared.mean_square, 0.0))
+        judged = found.by_pixel and problem.has_truth
+        if judged and found.error**2 <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
+            return []
         cause = "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
         if any(unknown.prior is not None for unknown in problem.unknowns.values()):
             cause = f"a prior may be too strong, or {cause}"
-        times = f", {error / noise:.1f} times its noise" if noise > 0 else ""
         still = "no longer improves"
         if earlier.is_short:
             still = f"has hardly improved since step {earlier.step} of {result.steps}"
             cause = f"it may need more steps, or {cause}"
-        return [
-            f"{DIFFERS} by {formatting.number(error)} ({error / size:.0%} of the picture{times}), and {still}: {cause}"
-        ]
+        return [f"{found.describe()}, and {still}: {cause}"]
 
 
 @dataclass(frozen=True)

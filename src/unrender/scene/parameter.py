@@ -80,12 +80,14 @@ class ParameterSettings:
         preconditioner: linear map of gradients and steps; None for no choice.
         coarse_to_fine: resolutions over the steps; None for no choice.
         start_factor: factor of the initial values before the first step; None for no choice.
+        start: values before the first step, in place of the initial ones; None for no choice.
     """
 
     parameterisation: Parameterisation | str | None = None
     preconditioner: Preconditioner | None = None
     coarse_to_fine: CoarseToFine | None = None
     start_factor: float | None = None
+    start: tuple[float, ...] | None = None
 
 
 def ties_of(parameters: Sequence[Parameter]) -> tuple[Tie, ...]:

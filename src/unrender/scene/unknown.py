@@ -45,7 +45,7 @@ class Unknown:
         truth: True value, of the shape of `initial`; None if unknown.
         surface: True surface of a mesh, if the true position of each vertex is unknown; else None.
         notices: One line for each change of the input.
-        start_factor: Factor of `initial` before the first step, chosen by a method.
+        first: Value before the first step at the scene's resolution, chosen by a method; None for `initial`.
     """
 
     parameter: Parameter
@@ -64,7 +64,7 @@ class Unknown:
     truth: np.ndarray | None = None
     surface: Surface | None = None
     notices: tuple[str, ...] = ()
-    start_factor: float = 1.0
+    first: np.ndarray | None = None
 
     @cached_property
     def _scale(self) -> float:
@@ -90,7 +90,7 @@ class Unknown:
 
     def start(self, step: int) -> np.ndarray:
         """Return the initial value at the resolution of a step."""
-        first = self.initial if self.start_factor == 1.0 else np.float32(self.start_factor) * self.initial
+        first = self.initial if self.first is None else self.first
         return first if self.coarse_to_fine is None else self.coarse_to_fine.coarsened(first, step)
 
     def full(self, values: np.ndarray) -> np.ndarray:

@@ -172,9 +172,17 @@ def _check_rate(rate: Any) -> float | None:
 def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo) -> Unknown:
     """Return the unknown with those settings for which its own are None. Raises `InputError` for an unsuitable one."""
     chosen = {n: x for n, x in vars(settings).items() if x is not None}
-    factor = chosen.pop("start_factor", unknown.start_factor)
+    factor, start = chosen.pop("start_factor", None), chosen.pop("start", None)
     own = {n: x for n, x in chosen.items() if getattr(unknown.parameter, n) is None}
-    changes: dict[str, Any] = {**own, "start_factor": factor}
+    changes: dict[str, Any] = dict(own)
+    if factor is not None:
+        changes["first"] = np.float32(factor) * unknown.initial
+    if start is not None:
+        if np.shape(start) != (unknown.initial.size,):
+            raise InputError(
+                f"parameter {unknown.parameter.key}: start: expected {unknown.initial.size} numbers, got {np.shape(start)}"
+            )
+        changes["first"] = np.reshape(np.asarray(start, np.float32), unknown.initial.shape)
     if "parameterisation" in own:
         pair = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
         changes |= {"parameterisation": pair[0], "transform": pair[1]}

@@ -13,6 +13,7 @@ from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling
+from unrender.methods.rules.starts import best_start
 from unrender.methods.rules.traits import Traits
 from unrender.methods.smoothed import widths_of
 from unrender.optimizers.adam import Adam
@@ -82,7 +83,7 @@ def few_numbers(traits: Traits) -> Plan | None:
             return None
     why = f"change their form with {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
-    return Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
+    return best_start(traits, keys, Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,)))
 
 
 def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
@@ -104,13 +105,14 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     reason = (
         f"{_reason(traits, keys, estimator)}{times}, after {constants.block_wait} steps of the others: {listed(keys)}"
     )
-    return replace(
+    made = replace(
         plan,
         problem=problem,
         estimator=HybridGradient(plan.estimator, estimator, keys, wait=constants.block_wait, every=every),
         optimizer=Partitioned(keys, _optimizer(traits, keys), plan.optimizer),
         reasons=(reason, *plan.reasons),
     )
+    return best_start(traits, keys, made)
 
 
 def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
