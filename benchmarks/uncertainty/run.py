@@ -1,11 +1,12 @@
 """Standard errors of textures and numbers against the true errors, as scores z = error / standard error, on problems with known truth.
 
-Short runs of `auto` at small sizes. Textures count where the references decide at least half of an element (`Result.data_share`). "wall,
-noisy" has references of 8 samples per pixel.
+Short runs of `auto` at small sizes, and `unrender.runs.uncertainty` at their ends. Textures count where the references decide at least half
+of an element (`Result.data_share`). "wall, noisy" has references of 8 samples per pixel.
 """
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,11 @@ from scipy import stats
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.runner import records
 from benchmarks.runner.records import Record
 from benchmarks.suite import scenes
 
 MERGE = ("problems.*",)
-QUICK: dict[str, Any] = {"problems": ("wall",), "seeds": 1, "steps": 4}
+QUICK: dict[str, Any] = {"problems": ("wall",), "seeds": 1, "steps": (4,)}
 _WALL = {"resolution": 40, "texture_resolution": 20}
 _QUANTILES = 41
 
@@ -37,7 +37,7 @@ def run(
     assets: Path = Path("assets"),
     problems: tuple[str, ...] = ("wall", "wall, noisy", "tray", "spot", "numbers", "smoke"),
     seeds: int = 3,
-    steps: int = 40,
+    steps: tuple[int, ...] = (40, 160),
 ) -> dict[str, Any]:
     """Scores of every problem.
 
@@ -45,18 +45,17 @@ def run(
         assets: folder of the suite's assets
         problems: names
         seeds: runs of each
-        steps: of a run
+        steps: numbers of steps of the runs
     """
     found: dict[str, Any] = {}
-    for name in problems:
+    for name, count in itertools.product(problems, steps):
         made, scores, shares = problem(name, assets), [], []
         for seed in range(seeds):
-            result = ur.optimize(made, steps=steps, seed=seed, run_directory=records.scratch("uncertainty"))
-            maps = ur.runs.uncertainty(made, result.parameters)
-            numbers = {key: x for key, x in result.standard_error.items() if key not in result.data_share}
-            for key, error in {**numbers, **maps.standard_error}.items():
-                z = (result.parameters[key] - made.truth[key].reshape(error.shape)) / error
-                share = maps.data_share.get(key)
+            values = ur.optimize(made, steps=count, seed=seed).parameters
+            known = ur.runs.uncertainty(made, values, seed=seed)
+            for key, error in known.standard_error.items():
+                z = (values[key] - made.truth[key].reshape(error.shape)) / error
+                share = known.data_share.get(key)
                 scores.append(np.ravel(z if share is None else z[share >= 0.5]))
                 shares.append(1.0 if share is None else float(np.mean(share >= 0.5)))
         z = np.concatenate(scores) if scores else np.zeros(0)
@@ -66,8 +65,8 @@ def run(
             levels = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
             entry |= {"std": float(z.std()), "mean": float(z.mean()), "beyond_2": float(np.mean(np.abs(z) > 2))}
             entry |= {"decided": float(np.mean(shares)), "quantiles": np.quantile(z, levels).tolist()}
-        found[name] = entry
-        print(name, {k: x for k, x in entry.items() if k != "quantiles"}, flush=True)
+        found[f"{name}, {count} steps"] = entry
+        print(name, count, {k: x for k, x in entry.items() if k != "quantiles"}, flush=True)
     return {"problems": found}
 
 
@@ -82,7 +81,7 @@ def table(record: Record) -> str:
         shares = [f"{entry[key]:.1%}" for key in ("beyond_2", "decided")]
         rows.append([name, entry["count"], *numbers, *shares])
     head = "problem | scores | standard deviation of z (1 is right) | mean of z | beyond ± 2 (4.6 % is right) | decided by the references"
-    return markdown.blocks("{seeds} seeds of {steps} steps.".format(**record["settings"]), markdown.table(head, rows))
+    return markdown.blocks("{seeds} seeds.".format(**record["settings"]), markdown.table(head, rows))
 
 
 def plot(record: Record) -> figures.Figure:

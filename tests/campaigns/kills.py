@@ -14,12 +14,17 @@ from tests.campaigns.cuts import final_state, leftovers
 from tests.campaigns.machine import KILLED, Victims
 from unrender.runs.folder.schema import ENDED
 
-__all__ = ["COMMANDS", "campaign", "digest"]
+__all__ = ["COMMANDS", "METHODS", "campaign", "digest"]
 
 _COMMON = ["--threads", 1, "--variant", "llvm_ad_rgb", "--final-spp", 1, "--checkpoint-every", 4]
-_TOY = ["exponential", "--method", "plain", "--set", "spp=2", "--steps", 12, *_COMMON]
-_ROOM = ["-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=8"]
-_SCENE = ["indirect-room", *_ROOM, "--method", "plain", "--steps", 4, *_COMMON]
+_ROOM = ["indirect-room", "-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=8"]
+_SCENE = [*_ROOM, "--method", "plain", "--steps", 4, *_COMMON]
+METHODS: dict[str, list[Any]] = {
+    "plain": ["exponential", "--method", "plain", "--set", "spp=2", "--steps", 12, *_COMMON],
+    "rcv": [*_ROOM, "--method", "rcv", "--steps", 12, *_COMMON],
+    "coupled": [*_ROOM, "--method", "coupled", "--steps", 12, *_COMMON],
+}
+"""Run that is killed, by method."""
 
 
 class _Case:
@@ -28,10 +33,11 @@ class _Case:
     Args:
         victims: carry it out.
         home: a folder for it.
+        method: of the runs, one of `METHODS`.
     """
 
-    def __init__(self, victims: Victims, home: Path):
-        self.victims, self.home = victims, home
+    def __init__(self, victims: Victims, home: Path, method: str):
+        self.victims, self.home, self.options = victims, home, METHODS[method]
         shutil.rmtree(home, ignore_errors=True)
         home.mkdir(parents=True)
         self.prepare()
@@ -67,11 +73,11 @@ class _Case:
 
 class _Run(_Case):
     def prepare(self) -> None:
-        self.must("run", *_TOY, "--out", self.home / "whole")
+        self.must("run", *self.options, "--out", self.home / "whole")
         self.whole = final_state(self.home / "whole")
 
     def words(self, folder: Path) -> Sequence[object]:
-        return "run", *_TOY, "--out", folder / "run"
+        return "run", *self.options, "--out", folder / "run"
 
     def judge(self, folder: Path) -> str:
         return self.go_on(folder / "run", self.whole, (*self.words(folder), "--overwrite"))
@@ -83,7 +89,7 @@ class _Resume(_Run):
     def prepare(self) -> None:
         super().prepare()
         begun = self.home / "begun"
-        self.victims.carry_out("run", *_TOY, "--out", begun / "run", watch=str(begun), at=110)
+        self.victims.carry_out("run", *self.options, "--out", begun / "run", watch=str(begun), at=110)
         shutil.rmtree(begun / "run" / "live", ignore_errors=True)
 
     def begin(self, folder: Path) -> None:
@@ -145,7 +151,7 @@ def digest(folder: Path) -> str:
     return state.hexdigest()
 
 
-COMMANDS: dict[str, Callable[[Victims, Path], _Case]] = {
+COMMANDS: dict[str, Callable[[Victims, Path, str], _Case]] = {
     "run": _Run,
     "resume": _Resume,
     "compare": _Compare,
@@ -153,9 +159,9 @@ COMMANDS: dict[str, Callable[[Victims, Path], _Case]] = {
 }
 
 
-def campaign(victims: Victims, folder: Path, command: str, number: int) -> dict[str, Any]:
-    """So many kills of a command, at file operations spread evenly over it."""
-    case = COMMANDS[command](victims, folder / command)
+def campaign(victims: Victims, folder: Path, command: str, number: int, method: str = "plain") -> dict[str, Any]:
+    """So many kills of a command, at file operations spread evenly over it; runs are by a method."""
+    case = COMMANDS[command](victims, folder / command, method)
     counted, seen = folder / command / "counted", folder / command / "operations"
     case.begin(counted)
     if status := victims.carry_out(*case.words(counted), watch=str(counted), count=str(seen)):

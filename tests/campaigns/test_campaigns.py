@@ -7,6 +7,7 @@ Power cuts and killed nodes need root: for an ext4 file system on a loop device,
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import signal
@@ -44,10 +45,15 @@ def test_a_power_cut_loses_nothing_after_the_last_checkpoint(method: str, victim
         assert summary[outcome] == summary["cuts"], summary["rows"]
 
 
-@pytest.mark.parametrize("command", kills.COMMANDS)
-def test_a_killed_command_leaves_a_folder_that_goes_on(command: str, victims: Victims, tmp_path: Path) -> None:
-    summary = kills.campaign(victims, tmp_path, command, COUNT)
-    print(command, summary)
+@pytest.mark.parametrize(
+    ("command", "method"),
+    [*((command, "plain") for command in kills.COMMANDS), *itertools.product(("run", "resume"), ("rcv", "coupled"))],
+)
+def test_a_killed_command_leaves_a_folder_that_goes_on(
+    command: str, method: str, victims: Victims, tmp_path: Path
+) -> None:
+    summary = kills.campaign(victims, tmp_path, command, COUNT, method)
+    print(command, method, summary)
     assert summary["killed"] > 0
     assert summary["wrong"] == []
 

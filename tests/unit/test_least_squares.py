@@ -10,7 +10,7 @@ import pytest
 import unrender as ur
 from unrender.core.random import Key
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs.least_squares import _Fit, _judged, check_numbers
+from unrender.runs.least_squares import NumbersCheck, _Fit, _judged, check_numbers
 from unrender.runs.numbers import Differences, Numbers
 
 SHAPE = (8, 8)
@@ -22,10 +22,10 @@ TRUTH = {"a": np.array([0.6, 0.3, 0.4]), "b": np.array(0.5)}
 FAR = np.inf
 
 
-def problem(matrix: np.ndarray, reference_noise: float = NOISE, noise: float = 0.05) -> ur.Problem:
+def problem(matrix: np.ndarray, reference_noise: float = NOISE, noise: float = 0.05, seed: int = 5) -> ur.Problem:
     """Return three numbers and one, whose picture is linear in them, with a noisy reference."""
     renderer = AnalyticRenderer(TRUTH, matrix, offset=2.0, noise=noise, shape=SHAPE)
-    added = np.random.default_rng(5).normal(0.0, reference_noise, (*SHAPE, 3))
+    added = np.random.default_rng(seed).normal(0.0, reference_noise, (*SHAPE, 3))
     view = ur.View((renderer.exact(TRUTH) + added).astype(np.float32))
     parameters = [ur.Parameter(key, initial=0.5 * value) for key, value in TRUTH.items()]
     return ur.Problem(renderer, parameters, [view])
@@ -52,6 +52,33 @@ def test_standard_errors_and_steps_are_those_of_the_closed_form():
     np.testing.assert_allclose(np.concatenate([found.errors["a"], found.errors["b"]]), expected, rtol=0.1)
     step = np.concatenate([found.steps["a"], found.steps["b"]])
     np.testing.assert_allclose(step, -away, atol=0.1 * expected.max())
+
+
+def scores_of_early_ends(steps: bool) -> np.ndarray:
+    """Return z of the numbers of twelve references, at some distance from the least-squares solutions."""
+    found = []
+    for seed in range(12):
+        made = problem(MATRIX, seed=seed)
+        values = at(best(made, MATRIX) + np.random.default_rng(100 + seed).normal(0.0, 0.004, 4))
+        errors = ur.runs.uncertainty(made, values).standard_error
+        if not steps:
+            errors = check_numbers(made, values, made.initial_values(), FAR).errors
+        found += [np.ravel((values[key] - truth) / errors[key]) for key, truth in TRUTH.items()]
+    return np.concatenate(found)
+
+
+def test_stated_errors_contain_the_distance_from_the_solution():
+    assert scores_of_early_ends(steps=True).std() == pytest.approx(1.0, abs=0.25)
+    assert scores_of_early_ends(steps=False).std() > 2.0  # planted: the references' noise alone
+
+
+def test_the_noise_of_the_check_is_no_distance_and_no_number_is_known_better_than_it():
+    errors, steps, noise = ({"a": np.array(x)} for x in ([3.0, 3.0, np.inf], [5.0, 0.5, 1.0], [4.0, 4.0, 1.0]))
+    check = NumbersCheck(errors=errors, steps=steps, noise=noise)
+    values = {"a": np.zeros((3, 1))}
+    np.testing.assert_allclose(check.standard_errors(values)["a"][:, 0], [5.0, 4.0, np.inf])
+    own = check.standard_errors(values, {"a": np.full((3, 1), 3.5)})["a"][:, 0]  # the run knows its noise
+    np.testing.assert_allclose(own, [np.sqrt(18.0), 3.5, np.inf])
 
 
 def test_a_run_that_arrived_is_told_nothing():

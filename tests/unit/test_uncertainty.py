@@ -14,7 +14,7 @@ from unrender.runs import final_images
 from unrender.runs import map_uncertainty as module
 from unrender.runs.folder import reader as folders
 from unrender.runs.image_sensitivity import curvature
-from unrender.runs.map_uncertainty import of_residuals, uncertainty
+from unrender.runs.map_uncertainty import of_residuals, pixel_noise, uncertainty
 from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
@@ -34,11 +34,16 @@ def matrix() -> np.ndarray:
     return made.reshape(3 * SIZE**2, 3 * TEXELS**2)
 
 
-def problem(seed: int = 0, mask: np.ndarray | None = None, prior: dict[str, float] | None = None) -> Problem:
+def problem(
+    seed: int = 0,
+    mask: np.ndarray | None = None,
+    prior: dict[str, float] | None = None,
+    noise: float | np.ndarray = NOISE,
+) -> Problem:
     rng = np.random.default_rng(seed)
     truth = {"wall": rng.uniform(0.2, 0.8, (TEXELS, TEXELS, 3))}
     renderer = AnalyticRenderer(truth, matrix(), 0.0, 0.0, shape=(SIZE, SIZE), sensors=1)
-    picture = renderer.exact(truth) + NOISE * rng.normal(size=(SIZE, SIZE, 3))
+    picture = renderer.exact(truth) + noise * rng.normal(size=(SIZE, SIZE, 3))
     if mask is not None:
         picture = np.where(mask[..., None] > 0, picture, 7.0)
     parameter = Parameter("wall", initial=0.5, bounds=(0, 1), prior=prior)
@@ -59,14 +64,16 @@ def estimate(made: Problem, converged: float = 1.0) -> dict[str, np.ndarray]:
 
 
 def scores(converged: float, mask: np.ndarray | None = None) -> np.ndarray:
-    found = []
-    for seed in range(4):
-        made = problem(seed, mask)
-        values = estimate(made, converged)
-        of = uncertainty(made, values)
-        where = of.data_share["wall"] > 0.5
-        found.append(((values["wall"] - made.truth["wall"]) / of.standard_error["wall"])[where])
-    return np.concatenate(found)
+    found = [score_map(problem(seed, mask), converged) for seed in range(4)]
+    return np.concatenate([z[np.isfinite(z)] for z in found])
+
+
+def score_map(made: Problem, converged: float) -> np.ndarray:
+    """Return the scores of the elements, NaN where the references decide less than half."""
+    values = estimate(made, converged)
+    of = uncertainty(made, values)
+    z = (values["wall"] - made.truth["wall"]) / of.standard_error["wall"]
+    return np.where(of.data_share["wall"] > 0.5, z, np.nan)
 
 
 @pytest.mark.parametrize("converged", [0.6, 0.9, 1.0])
@@ -76,8 +83,31 @@ def test_errors_have_the_stated_spread(converged: float) -> None:
 
 
 def test_without_the_references_noise_the_end_would_seem_exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_noise", lambda residuals: module._Mean(1e-12, 0.0))
+    monkeypatch.setattr(module, "pixel_noise", lambda problem, halves: [np.full((SIZE, SIZE, 1), 1e-12)])
     assert scores(1.0).std() > 3
+
+
+def spreads_of_halves() -> tuple[float, float]:
+    """Return the spread of the scores of the upper and of the lower half, whose pixels have five times the noise."""
+    noise = np.where(np.arange(SIZE) < SIZE // 2, 0.2 * NOISE, NOISE)[:, None, None]
+    z = np.stack([score_map(problem(seed, noise=noise), 1.0) for seed in range(6)])
+    # Rows beside the border between both halves share their noise.
+    return float(np.nanstd(z[:, :2])), float(np.nanstd(z[:, -2:]))
+
+
+def test_errors_follow_the_noise_of_the_pixels_that_see_a_texel() -> None:
+    for spread in spreads_of_halves():
+        assert spread == pytest.approx(1.0, abs=0.25)
+
+
+def test_one_noise_for_all_pixels_would_be_wrong_in_both_halves(monkeypatch: pytest.MonkeyPatch) -> None:
+    def mean(of: Problem, halves: object) -> list[np.ndarray]:
+        return [np.full_like(noise, noise.mean()) for noise in pixel_noise(of, halves)]  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "pixel_noise", mean)
+    quiet, loud = spreads_of_halves()
+    assert quiet < 0.5
+    assert loud > 1.25
 
 
 def test_what_no_pixel_sees_has_the_spread_of_the_seen_and_no_share_of_the_data() -> None:
@@ -175,6 +205,6 @@ def test_too_few_probes_or_samples_give_no_map() -> None:
     picture = np.asarray(made.views[0].reference)
     few = curvature(made, values, probes=4)
     assert not of_residuals(made, values, [[picture], [picture]], few).standard_error
-    enough = curvature(made, values)
     noisy = [[picture + np.random.default_rng(seed).normal(size=picture.shape)] for seed in range(2)]
+    enough = curvature(made, values, noise=pixel_noise(made, noisy))
     assert not of_residuals(made, values, noisy, enough).standard_error

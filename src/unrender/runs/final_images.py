@@ -16,7 +16,7 @@ from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
 from unrender.runs.image_sensitivity import Curvature, curvature
 from unrender.runs.least_squares import check_numbers, checked_keys, compile_check
-from unrender.runs.map_uncertainty import Uncertainty, of_residuals
+from unrender.runs.map_uncertainty import Uncertainty, of_residuals, pixel_noise
 from unrender.runs.result import Result
 from unrender.runs.verification import DIFFERS, misfit
 from unrender.scene.problem import Problem
@@ -36,8 +36,6 @@ _LEAST_TESTS = 0.6
 """Seconds on an idle machine that the tests of undetermined parameters have together even if the budget is over."""
 _NUMBERS_SHARE = 0.05
 """Time limit of least squares of few numbers relative to the time of the steps; at least one second."""
-_UNSETTLED = 3.0
-"""Standard errors from which the remaining least-squares step is the standard error."""
 _FEW_NUMBERS, _OF_PICTURE = 24, 0.01
 """Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image."""
 _TRIAL_PATHS = 1 << 18
@@ -138,15 +136,19 @@ def render_final_images(
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
         everything = tested and len(chosen) == len(problem.views)
-        known = curvature(problem, result.parameters, seconds=seconds) if everything else Curvature({}, {}, 0)
+        halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
+        noise = pixel_noise(problem, halves) if halves else ()
+        known = Curvature({}, {}, 0)
+        if everything:
+            known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
         sensitivities, maps = known.sensitivity(), Uncertainty()
         lines, warnings, deviations = [], (), dict(result.standard_error)
         if not tested and result.steps:
             lines = _unchecked(checked_keys(problem, result.parameters, result.initial))
         if everything:
             lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests)
-            if result.steps and len(ends[0]) == 2 and left() > 0.0:
-                maps = of_residuals(problem, result.parameters, list(zip(*ends, strict=True)), known)
+            if halves and left() > 0.0:
+                maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
     differs = _misfit(problem, result, [problem.views[index] for index in chosen], ends)
     warnings, deviations = (*warnings, *filter(None, differs)), {} if differs else deviations
@@ -184,10 +186,7 @@ def _undetermined(
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
     text = "\n".join(lines)
     lines += [line for key, line in numbers.undetermined.items() if key not in text] + _unchecked(numbers.unchecked)
-    for key, error in numbers.errors.items():  # a block's own errors take other unknowns as known
-        shape, step = result.parameters[key].shape, np.abs(numbers.steps[key])
-        error = np.where(step > _UNSETTLED * error, step, error)  # the run ended before the noise decides
-        deviations[key] = np.maximum(error.reshape(shape), deviations.get(key, 0.0)).astype(np.float32)
+    deviations |= numbers.standard_errors(result.parameters, deviations)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
     return lines, unfinished, deviations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,11 +35,13 @@ class Curvature:
         squares: {key: diagonal elements} of the parameters' shapes. Estimates below 0 are 0.
         overlap: {key: Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²}, at least 1, of textures and grids: 1 if no pixel depends on two elements.
         probes: number of probes of the estimate.
+        noise: {key: diagonal elements of JᵀΣJ} for pixels of variance Σ; {} if that is unknown.
     """
 
     squares: Mapping[str, np.ndarray]
     overlap: Mapping[str, float]
     probes: int
+    noise: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def sensitivity(self) -> dict[str, np.ndarray]:
         """Return the roots of the diagonal elements, float32."""
@@ -92,10 +94,12 @@ def curvature(
     seconds: float = np.inf,
     seed: int = 0,
     views: int | None = None,
+    noise: Sequence[np.ndarray] = (),
 ) -> Curvature:
     """Return the curvature of `sensitivity`, with the same arguments.
 
     The overlap is the mean of (Jᵀs · Jᵀs')² over pairs of probes, whose expectation is Σ_ij (JᵀJ)_ij², with separate paths of its factors.
+    With the variance `noise` (H, W, 1) of each view's pixels, the probes are also weighted by its root, on the same paths.
     """
     checks.integer("sensitivity", "probes", probes, at_least=1)
     if spp is None:
@@ -106,25 +110,32 @@ def curvature(
         return Curvature({}, {}, 0)
     parameters = off_ends(as_tree(problem, values), problem.renderer.parameters())
     squares = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
+    noisy = {key: np.zeros_like(square) for key, square in squares.items()} if noise else {}
     maps = [key for key, square in squares.items() if square.ndim >= MAP_AXES]
     kept: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {key: [] for key in maps}
     most = min(_PROBES, _KEPT // max(1, sum(squares[key].size for key in maps)))
     made, until = 0, time.perf_counter() + seconds
     while made == 0 or (made < probes and time.perf_counter() < until):
         one, other = (
-            _projections(problem, session, parameters, keys, spp, Key(seed, made), half, views) for half in range(2)
+            _projections(problem, session, parameters, keys, spp, Key(seed, made), half, views, noise)
+            for half in range(2)
         )
         for key, square in squares.items():
-            square += one[key] * other[key]
+            square += one[key][0] * other[key][0]
+            if key in noisy:
+                noisy[key] += one[key][1] * other[key][1]
             if key in kept and made < most:
-                kept[key].append((one[key].astype(np.float32), other[key].astype(np.float32)))
+                kept[key].append((one[key][0].astype(np.float32), other[key][0].astype(np.float32)))
         made += 1
     overlap = {key: _overlap(squares[key] / made, made, of) for key, of in kept.items()}
-    means = {
-        key: periodic.repeat(np.maximum(square / made, 0.0), problem.unknowns[key].measure.repeated)
-        for key, square in squares.items()
-    }
-    return Curvature(means, overlap, made)
+    means, variances = (
+        {
+            key: periodic.repeat(np.maximum(x / made, 0.0), problem.unknowns[key].measure.repeated)
+            for key, x in sums.items()
+        }
+        for sums in (squares, noisy)
+    )
+    return Curvature(means, overlap, made, variances)
 
 
 def _overlap(squares: np.ndarray, probes: int, kept: list[tuple[np.ndarray, np.ndarray]]) -> float:
@@ -222,15 +233,15 @@ def _projections(
     key: Key,
     half: int,
     views: int | None,
+    noise: Sequence[np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """Return {key: Jᵀs} for the signs s of a probe, on one of its two sets of paths."""
-    signs = np.random.default_rng(key.uint32())
-    pictures = [
-        signs.choice(np.array([-1, 1], np.float32), size=(1, *problem.sizes[view], 3)) * mask_roots(problem, view)
-        for view in range(len(problem.views))[:views]
-    ]
+    """Return {key: Jᵀs, and Jᵀ√Σ s with noise} for the signs s of a probe, on one of its two sets of paths."""
+    signs, pictures = np.random.default_rng(key.uint32()), []
+    for view in range(len(problem.views))[:views]:
+        drawn = signs.choice(np.array([-1, 1], np.float32), size=(*problem.sizes[view], 3)) * mask_roots(problem, view)
+        pictures.append(np.stack([drawn, drawn * np.sqrt(noise[view])] if noise else [drawn]))
     seeds = {view: key.fold(2 * view + half) for view in range(len(pictures))}
-    return {name: x[0] for name, x in adjoints(problem, session, parameters, keys, spp, seeds, pictures).items()}
+    return adjoints(problem, session, parameters, keys, spp, seeds, pictures)
 
 
 def adjoints(

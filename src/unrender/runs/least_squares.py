@@ -62,6 +62,7 @@ class NumbersCheck:
         unfinished: {key: line} of those that a least-squares step would still move.
         errors: {key: standard errors} of all numbers, the references' noise included.
         steps: {key: least-squares steps} of all numbers.
+        noise: {key: standard errors of the steps by the noise of this check}.
         unchecked: keys of the numbers that there was no time to test.
     """
 
@@ -69,7 +70,28 @@ class NumbersCheck:
     unfinished: Mapping[str, str] = field(default_factory=dict)
     errors: Mapping[str, np.ndarray] = field(default_factory=dict)
     steps: Mapping[str, np.ndarray] = field(default_factory=dict)
+    noise: Mapping[str, np.ndarray] = field(default_factory=dict)
     unchecked: tuple[str, ...] = ()
+
+    def standard_errors(
+        self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] = MappingProxyType({})
+    ) -> dict[str, np.ndarray]:
+        """Return the standard errors of the numbers at the end of a run, of the shapes of `values`, float32.
+
+        The squares of the error by the references' noise and of the distance from the least-squares solution are added. An estimate of the
+        distance, without its noise σ, is step² − σ². A number is not known better than σ, unless the run states its own error.
+
+        Args:
+            values: {key: array} at the end of the run.
+            known: {key: standard errors} from the run's own noise; errors are no smaller.
+        """
+        found = {}
+        for key, error in self.errors.items():
+            square, noise = np.square(error), np.square(self.noise[key])
+            square = square if key in known else np.maximum(square, noise)
+            stated = np.sqrt(square + np.maximum(np.square(self.steps[key]) - noise, 0.0)).reshape(values[key].shape)
+            found[key] = np.maximum(stated, known.get(key, 0.0)).astype(np.float32)
+        return found
 
 
 @exclusive("check_numbers")
@@ -265,8 +287,8 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
                 f"{key}: the run ended before it settled: a least-squares step from its end moves it by {_numbers(fit.step[of])}, with the "
                 f"standard error {_numbers(error[of])}; give more seconds, or resume the run"
             )
-    errors, steps = ({k: x[of] for k, of in numbers.places().items()} for x in (error, fit.step))
-    return NumbersCheck(undetermined, unfinished, errors, steps)
+    errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (error, fit.step, fit.own))
+    return NumbersCheck(undetermined, unfinished, errors, steps, noise)
 
 
 def _shared_with_fields(covariance: np.ndarray, n: int) -> np.ndarray:

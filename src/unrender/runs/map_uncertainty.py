@@ -1,8 +1,9 @@
-"""Uncertainty of recovered textures, per texel."""
+"""Uncertainty of recovered textures, per texel, and of numbers."""
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -18,10 +19,11 @@ from unrender.runs.image_sensitivity import (
     neighbour_means,
     transposed,
 )
+from unrender.runs.least_squares import check_numbers
 from unrender.scene.problem import Problem
-from unrender.scene.render import render
+from unrender.scene.render import as_tree, render
 
-__all__ = ["Uncertainty", "of_residuals", "uncertainty"]
+__all__ = ["Uncertainty", "of_residuals", "pixel_noise", "uncertainty"]
 
 _STREAM, _PASSES = 6, 4
 """Stream of the random numbers, and number of adjoints of each half of the residual."""
@@ -37,15 +39,18 @@ _MOST_OVERLAP = 2.0
 """Overlap from which on texels are not independent, such as with more texels than pixels that see them."""
 _ELEMENTS, _LEAST = 9.0, 0.1
 """Number of elements that the mean over all cells weighs as much as beside the neighbours, and the least ratio to it."""
+_NEARBY, _LEAST_NOISE = 5, 0.02
+"""Side of the squares of pixels that share a variance, and least variance relative to the mean."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Uncertainty of textures.
+    """Uncertainty of textures and numbers.
 
     Attributes:
-        standard_error: {key: array} of the parameters' shapes, float32: standard deviation of each element's error.
-        data_share: {key: array} of the same shapes, in [0, 1]: weight of the references in each element. The rest of its value was
+        standard_error: {key: array} of the parameters' shapes, float32: standard deviation of each element's error. It is infinite for
+            numbers that the references do not determine.
+        data_share: {key: array} of the textures' shapes, in [0, 1]: weight of the references in each element. The rest of its value was
             decided by the start, by smoothing, or by a prior.
     """
 
@@ -57,17 +62,23 @@ class Uncertainty:
 def uncertainty(
     problem: Problem, values: Mapping[str, np.ndarray], seconds: float = math.inf, seed: int = 0
 ) -> Uncertainty:
-    """Estimate the standard error of each texel of a problem's textures.
+    """Estimate the standard error of each texel of a problem's textures, and of each number.
 
-    With the pictures' residual r, their derivative J by the parameters, and the diagonal elements H of the Gauss-Newton matrix JᵀJ, the
-    variance of an element is that of a posterior with independent elements:
+    Numbers, 24 elements at most, are tested by least squares at `values`, together with directions of textures and grids that trade off
+    against them. Their standard errors contain the references' noise, and the distance from the least-squares solution.
+
+    For textures, with the pictures' residual r, their derivative J by the parameters, and the diagonal elements H of the Gauss-Newton
+    JᵀJ, the variance of an element is that of a posterior with independent elements:
 
         1 / se² = H / c + 1 / τ² + p        share of the data = (H / c) se²
-        c = max(m, (σ − √m)²)        m = ⟨(Jᵀr)² / (κ H)⟩        κ = Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²
+        c = m + max(σ − √m, 0)²      m = ⟨(Jᵀr)² / (κ H)⟩        κ = Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²      σ² = (JᵀΣJ) / H
 
     m is the variance of the residual that the parameters could still explain, as mean over neighbours: what has not converged, and the
-    run's noise. The references' noise, of standard deviation σ, is missing there as far as the parameters have followed it. τ² is the mean
-    square change from the start plus the mean variance, and p the curvature of the parameter's prior.
+    run's noise. The references' noise, of variance σ² at an element, is missing there as far as the parameters have followed it. The
+    variance Σ of a pixel is that of the residual that neighbouring pixels do not share. τ² is the mean square change from the start plus
+    the mean variance, and p the curvature of the parameter's prior.
+
+    Standard errors are too large where noise of the references remains in m: after few steps, and with strong smoothing.
 
     Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels,
     and a diagonal does not bound their errors; nor have textures with κ ≥ 2, such as those with more texels than pixels that see them.
@@ -76,23 +87,30 @@ def uncertainty(
     Args:
         problem: problem with views and scene.
         values: {key: array} at the end of a run.
-        seconds: time after which no further probe of H is started; there is at least one.
+        seconds: time after which no further probe of H and no further test of the numbers is started; H has at least one probe.
         seed: seed of all random numbers.
 
     Returns:
-        Maps of the textures with path gradients and κ < 2.
+        Maps of the textures with path gradients and κ < 2, and standard errors of the numbers.
 
     Raises:
         InputError: `values` have other keys or shapes than the problem's.
     """
-    known = curvature(problem, values, seconds=seconds, seed=seed)
-    spp = min(max(_PATHS // problem.pixels, _SPP[0]), _SPP[1])
-    key = Key(seed, 0, _STREAM)
-    halves = [
-        [render(problem, values, view, spp, key.fold(2 * view + half).uint32()) for view in range(len(problem.views))]
-        for half in range(2)
-    ]
-    return of_residuals(problem, values, halves, known, seed)
+    as_tree(problem, values)  # refuses other keys and shapes
+    until = time.perf_counter() + seconds
+    known, maps = Curvature({}, {}, 0), Uncertainty()
+    if any(len(shape) >= MAP_AXES for shape in problem.shapes().values()):
+        spp = min(max(_PATHS // problem.pixels, _SPP[0]), _SPP[1])
+        key, views = Key(seed, 0, _STREAM), range(len(problem.views))
+        halves = [
+            [render(problem, values, view, spp, key.fold(2 * view + half).uint32()) for view in views]
+            for half in range(2)
+        ]
+        known = curvature(problem, values, seconds=seconds, seed=seed, noise=pixel_noise(problem, halves))
+        maps = of_residuals(problem, values, halves, known, seed)
+    left = until - time.perf_counter()
+    numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity())
+    return Uncertainty({**numbers.standard_errors(values), **maps.standard_error}, maps.data_share)
 
 
 def of_residuals(
@@ -108,7 +126,7 @@ def of_residuals(
         problem: problem with views and scene.
         values: {key: array} at the end of a run.
         halves: two independent pictures (H, W, 3) of each view, without the references.
-        known: curvature at the values.
+        known: curvature at the values, with `pixel_noise`.
         seed: seed of all random numbers.
     """
     keys = [
@@ -119,23 +137,17 @@ def of_residuals(
     if not keys or known.probes < _FEWEST:
         return Uncertainty()
     roots = [mask_roots(problem, view) for view in range(len(problem.views))]
-    residuals = [
-        [
-            np.nan_to_num(root * (image - np.asarray(view.reference, np.float64)))
-            for image, view, root in zip(half, problem.views, roots, strict=True)
-        ]
-        for half in halves
-    ]
-    noise = _noise(residuals)
+    residuals = _residuals(problem, halves)
+    noise = _Mean.of(np.concatenate([products[seen] for products, seen in _unshared(residuals)]))
     weighted = [[root * x for root, x in zip(roots, half, strict=True)] for half in residuals]
     one, other = (
         transposed(problem, values, of, _PASSES, Key(seed, half, _STREAM)) for half, of in enumerate(weighted)
     )
     errors, shares = {}, {}
     for key in keys:
-        own = _Cells.of(values[key], problem.unknowns[key].initial, known.squares[key], known.probes)
+        own = _Cells.of(values[key], problem.unknowns[key].initial, known.squares[key], known.noise[key], known.probes)
         prior = 0.0 if (of := problem.unknowns[key].prior) is None else of.diagonal(values[key])
-        posterior = own.posterior(one[key] * other[key], known.overlap.get(key, 1.0), noise, prior)
+        posterior = own.posterior(one[key] * other[key], known.overlap.get(key, 1.0), noise.is_known, prior)
         if posterior is not None:
             variance, share = posterior
             errors[key], shares[key] = np.sqrt(variance).astype(np.float32), share.astype(np.float32)
@@ -149,45 +161,46 @@ class _Cells:
     Attributes:
         change: mean square change of each cell from the start, (...).
         curvature: mean diagonal element of each cell, (...), > 0.
+        noise: variance of the references' noise at each cell, (...).
         channels: number of channels.
     """
 
     change: np.ndarray
     curvature: np.ndarray
+    noise: np.ndarray
     channels: int
 
     @classmethod
-    def of(cls, values: np.ndarray, start: np.ndarray, squares: np.ndarray, probes: int) -> _Cells:
+    def of(cls, values: np.ndarray, start: np.ndarray, squares: np.ndarray, noise: np.ndarray, probes: int) -> _Cells:
         """Return the cells. The fewer probes, the more a cell's curvature follows those of its neighbours, as geometric mean."""
-        means = squares.mean(axis=-1)
-        logarithms = np.log(np.maximum(means, 1e-6 * np.median(means[means > 0])))
-        logarithms = (probes * logarithms + _PROBES * neighbour_means(logarithms)) / (probes + _PROBES)
         change = np.square(values.astype(np.float64) - start).mean(axis=-1)
-        return cls(change, np.exp(logarithms), values.shape[-1])
+        curvature = _smoothed(squares.mean(axis=-1), probes)
+        variances = _smoothed(noise.mean(axis=-1), probes) / curvature if noise.any() else np.zeros(curvature.shape)
+        return cls(change, curvature, variances, values.shape[-1])
 
     def posterior(
-        self, gradient: np.ndarray, overlap: float, noise: _Mean, prior: np.ndarray | float
+        self, gradient: np.ndarray, overlap: float, noise_is_known: bool, prior: np.ndarray | float
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the variance and the share of the data of each element, (..., C); None if samples are too few to tell the residual.
 
         Args:
             gradient: product of two independent Jᵀr, (..., C).
             overlap: κ.
-            noise: σ².
+            noise_is_known: whether the residual's noise is significant.
             prior: curvature of the prior, (..., C).
         """
         counted = self.curvature > _COUNTED * np.median(self.curvature)
         explained = gradient.mean(axis=-1) / (overlap * self.curvature)
         m = _Mean.of(explained[counted])
-        if not (m.is_known or noise.is_known):
+        if not (m.is_known or noise_is_known):
             return None
-        mean = m.value
-        followed = max(math.sqrt(max(noise.value, 0.0)) - math.sqrt(max(mean, 0.0)), 0.0) ** 2
         elements = 3.0**explained.ndim * self.channels
-        local = neighbour_means(np.where(counted, explained, mean))
-        pooled = (elements * local + _ELEMENTS * mean) / (elements + _ELEMENTS)
-        c = np.maximum(pooled, max(_LEAST * mean, followed, 1e-12))
-        before = float(self.change[counted].mean()) + max(mean, followed) / float(self.curvature[counted].mean())
+        local = neighbour_means(np.where(counted, explained, m.value))
+        pooled = (elements * local + _ELEMENTS * m.value) / (elements + _ELEMENTS)
+        pooled = np.maximum(pooled, max(_LEAST * m.value, 0.0))
+        followed = np.square(np.maximum(np.sqrt(self.noise) - np.sqrt(pooled), 0.0))
+        c = np.maximum(pooled + followed, 1e-12)
+        before = float(self.change[counted].mean()) + float(c[counted].mean()) / float(self.curvature[counted].mean())
         precision = (self.curvature / c)[..., None] * np.ones(self.channels)
         variance = 1.0 / (precision + 1.0 / max(before, 1e-12) + prior)
         return variance, precision * variance
@@ -202,7 +215,9 @@ class _Mean:
 
     @classmethod
     def of(cls, values: np.ndarray) -> _Mean:
-        return cls(float(values.mean()), float(values.std()) / math.sqrt(max(values.size, 1)))
+        if not values.size:
+            return cls(0.0, 0.0)
+        return cls(float(values.mean()), float(values.std()) / math.sqrt(values.size))
 
     @property
     def is_known(self) -> bool:
@@ -210,11 +225,49 @@ class _Mean:
         return self.value > _ERRORS * self.error
 
 
-def _noise(residuals: Sequence[Sequence[np.ndarray]]) -> _Mean:
-    """Return the variance of the residual that neighbouring pixels do not share, from two halves of independent pictures."""
-    products = []
+def _smoothed(means: np.ndarray, probes: int) -> np.ndarray:
+    """Return positive means of cells, which follow those of their neighbours more, the fewer probes they have."""
+    logarithms = np.log(np.maximum(means, 1e-6 * np.median(means[means > 0])))
+    return np.exp((probes * logarithms + _PROBES * neighbour_means(logarithms)) / (probes + _PROBES))
+
+
+def pixel_noise(problem: Problem, halves: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
+    """Return the variance (H, W, 1) of each view's residual that neighbouring pixels do not share, as mean over nearby pixels.
+
+    Args:
+        problem: problem with views and scene.
+        halves: two independent pictures (H, W, 3) of each view, without the references.
+    """
+    from scipy.ndimage import uniform_filter  # takes long to import
+
+    parts = _unshared(_residuals(problem, halves))
+    least = _LEAST_NOISE * max(_Mean.of(np.concatenate([products[seen] for products, seen in parts])).value, 0.0)
+    variances = []
+    for products, seen in parts:
+        sums, counts = (
+            uniform_filter(np.pad(np.sum(x, axis=-1, dtype=float), ((0, 1), (0, 1))), _NEARBY, mode="constant")
+            for x in (products * seen, seen)
+        )
+        near = counts > 0.5 / _NEARBY**2  # running sums round
+        variances.append(np.where(near, np.maximum(sums / np.where(near, counts, 1.0), least), least)[..., None])
+    return variances
+
+
+def _residuals(problem: Problem, halves: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]]:
+    """Return the differences of both halves of the pictures from the references, times the roots of the masks' weights."""
+    views = [
+        (np.asarray(view.reference, np.float64), mask_roots(problem, index)) for index, view in enumerate(problem.views)
+    ]
+    return [
+        [np.nan_to_num(root * (image - reference)) for image, (reference, root) in zip(half, views, strict=True)]
+        for half in halves
+    ]
+
+
+def _unshared(residuals: Sequence[Sequence[np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return, for each view, estimates of the variance that neighbouring pixels do not share, (H - 1, W - 1, 3), and which are known."""
+    found = []
     for pair in zip(*residuals, strict=True):
         one, other = (0.5 * (x[1:, 1:] - x[:-1, 1:] - x[1:, :-1] + x[:-1, :-1]) for x in pair)
-        products.append((one * other)[one != 0.0])
-    every = np.concatenate(products)
-    return _Mean.of(every) if every.size else _Mean(0.0, 0.0)
+        found.append((one * other, one != 0.0))
+    return found
