@@ -27,6 +27,7 @@ SMALL = {
     "grid_resolution": 8,
     "views": 2,
     "subdivisions": 1,
+    "height_resolution": 4,
     "label": 4,
 }
 ONE_OF_A_KIND = ("poster", "smoke", "sphere-to-mesh", "mug", "camera", "tea", "exponential")

@@ -69,7 +69,13 @@ WITHOUT_RENDERER = ["exponential", "quad"]
 DRAWN = [
     "mirror-trio", "sun-glossy", "plain-and-textured", "two-planets", "caustic", "three-textures", "globe-and-mirror",
 ]  # fmt: skip
-MESHES = ["sphere-to-mesh", "sphere-to-bunny", "shadow-art", "statue"]  # see test_shapes.py, test_mesh_runs.py
+MESHES = [
+    "sphere-to-mesh",
+    "sphere-to-bunny",
+    "shadow-art",
+    "statue",
+    "relief",
+]  # test_shapes.py, test_mesh_runs.py, test_relief.py
 VOLUMES = ["three-bodies", "tea", "smoke", "nerf-volume"]  # see test_gallery_volumes.py
 
 

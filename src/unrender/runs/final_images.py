@@ -138,11 +138,10 @@ def render_final_images(
         everything = tested and len(chosen) == len(problem.views)
         halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
         noise = pixel_noise(problem, halves) if halves else ()
-        known = Curvature({}, {}, 0)
+        known, maps = Curvature({}, {}, 0), Uncertainty()
         if everything:
             known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
-        sensitivities, maps = known.sensitivity(), Uncertainty()
-        lines, warnings, deviations = [], (), dict(result.standard_error)
+        sensitivities, lines, warnings, deviations = known.sensitivity(), [], (), dict(result.standard_error)
         if not tested and result.steps:
             lines = _unchecked(checked_keys(problem, result.parameters, result.initial))
         if everything:

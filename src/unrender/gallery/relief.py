@@ -1,0 +1,125 @@
+"""Problem `relief`: the height map of a plaque, from three images under one lamp each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from unrender.core.registry import register
+from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery.specification import reference
+from unrender.losses import L2, Loss
+from unrender.preconditioners import LargeSteps
+from unrender.rendering.mitsuba.scene_loading import load
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
+
+_LAMPS = ((-2.2, 0.9, 1.2), (2.2, 0.9, 1.2), (0.0, -2.3, 1.2))
+"""Positions, low beside the plaque and in front of it."""
+_INTENSITY = 14.0
+_LARGEST = 0.3
+"""Largest height above and below the plaque's plane, whose sides are 2 long."""
+
+
+@register(name="relief", position=34)
+@dataclass(frozen=True)
+class Relief:
+    """The height map of a plaque, from three images under one lamp each, starting with a flat plaque.
+
+    Three views by one camera, each of a world in which one lamp is on. The unknown is the height of each vertex above the plane, (n, n, 1),
+    with LargeSteps. An expression makes the mesh's vertex positions a function of it. Heights decide slopes, thereby shading and shadows;
+    the camera looks straight at the plaque and does not see them by itself.
+    """
+
+    resolution: int = fields.resolution(48)
+    height_resolution: int = fields.integer(24, "n: the height map has n by n vertices", at_least=2, at_most=1024)
+    reference_spp: int = fields.reference_spp(256)
+    max_depth: int = fields.max_depth(3, at_least=2)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the flat plaque, x and y in [-1, 1] at z = 0, under all lamps."""
+        return self._stage(np.zeros((self.height_resolution, self.height_resolution)))
+
+    def target(self) -> dict[str, Any]:
+        """Return the true plaque."""
+        return self._stage(_heights(self.height_resolution))
+
+    def problem(self, name: str) -> Problem:
+        """Return the problem: the flat plaque, and references of the true one by Mitsuba's `path` integrator."""
+        truth = _heights(self.height_resolution)
+        views = []
+        for lit in range(len(_LAMPS)):
+            picture = reference(load(partial(self._stage, truth, lit)), 0, self.reference_spp, self.max_depth)
+            off = {f"lamp_{n}.intensity.value": [0.0, 0.0, 0.0] for n in range(len(_LAMPS)) if n != lit}
+            views.append(View(picture, known=off))
+        grid = _grid(self.height_resolution)
+        unknown = Parameter(
+            "height", initial=np.zeros_like(grid[..., :1]), bounds=(-_LARGEST, _LARGEST), preconditioner=LargeSteps(1.0)
+        )
+        return Problem(
+            self.scene,
+            [unknown],
+            views,
+            self.loss,
+            self.max_depth,
+            expressions={"plaque.vertex_positions": partial(_displaced, grid)},
+            truth={"height": truth[..., None]},
+            name=name,
+        )
+
+    def _stage(self, heights: np.ndarray, lit: int | None = None) -> dict[str, Any]:
+        """Return the scene with a height map (n, n), under one lamp or all."""
+        positions = _grid(self.height_resolution)
+        positions[..., 2] = heights
+        corners = _corners(self.height_resolution)
+        lamps = {
+            f"lamp_{n}": {
+                "type": "point",
+                "position": list(place),
+                "intensity": parts.colour(_INTENSITY if lit in (None, n) else 0.0),
+            }
+            for n, place in enumerate(_LAMPS)
+        }
+        return {
+            "type": "scene",
+            "camera": parts.camera((0, 0, 5.0), (0, 0, 0), 25.0, self.resolution),
+            "plaque": meshes.triangles("plaque", positions.reshape(-1, 3), corners, parts.twosided(parts.diffuse(0.6))),
+            **lamps,
+        }
+
+
+def _grid(count: int) -> np.ndarray:
+    """Return the vertices of the flat plaque, (n, n, 3)."""
+    y, x = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count), indexing="ij")
+    return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+def _corners(count: int) -> np.ndarray:
+    """Return the triangles of the grid, (2 (n - 1)², 3), whose front faces the camera."""
+    number = np.arange(count * count).reshape(count, count)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+
+
+def _displaced(grid: np.ndarray, values: Any) -> Any:
+    """Return the positions (3 n²,) of the vertices of a flat plaque, moved along its normal by `values["height"]`, (n, n, 1)."""
+    normal = mi.TensorXf(np.array([[[0.0, 0.0, 1.0]]], np.float32))
+    return dr.reshape(mi.TensorXf, mi.TensorXf(grid.astype(np.float32)) + values["height"] * normal, -1)
+
+
+def _heights(count: int) -> np.ndarray:
+    """Return a ring with a dome in its middle and a groove across, flat at the border: (n, n)."""
+    grid = _grid(count)
+    x, y = grid[..., 0], grid[..., 1]
+    radius = np.hypot(x, y)
+    ring = 0.12 * np.exp(-(((radius - 0.6) / 0.12) ** 2))
+    dome = 0.16 * np.exp(-((radius / 0.25) ** 2))
+    groove = -0.08 * np.exp(-(((x - y) / 0.18) ** 2)) * textures.ramp(1.0 - radius, 0.0, 0.3)
+    return ring + dome + groove
