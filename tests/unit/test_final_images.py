@@ -75,7 +75,7 @@ def test_few_numbers_whose_picture_does_not_fit_are_warned_of(what: str, said: b
     made = Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(reference + added[what])])
     result = Result(truth, {"wall": np.full(3, 0.4, np.float32)}, [{"step": 1, "loss": 0.1}], 1.0, 0.0, "steps")
     result = replace(result, standard_error={"wall": np.full(3, 0.01)})
-    found = final_images.render_final_images(made, result, 64, tested=False)
+    found = final_images.render_final_images(made, result, 64)
     assert any("differs from the references" in line for line in found.warnings) == said
     assert bool(found.standard_error) == (not said)
     told = replace(result, warnings=["the final picture differs from the references by 0.1, ..."])
@@ -164,13 +164,14 @@ def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypa
     """A run that ends without its test of numbers says so; one that was tested does not."""
     made = problem()
     values = {"wall": np.full(3, 0.4, np.float32)}
-    result = Result(values, values, [{}], 30.0, 0.0, "steps")
+    result = replace(Result(values, values, [{}], 30.0, 0.0, "steps"), standard_error={"wall": np.full(3, 1e-3)})
     line = "whether wall converged: no time was left to test it; use more seconds or fewer pixels"
     if tested:
         assert line not in final_images.render_final_images(made, result).undetermined
         monkeypatch.setattr(final_images, "slowdown", lambda: 1e-9)
     late = final_images.render_final_images(made, result, left=lambda: 0.0, tested=tested)
     assert line in late.undetermined
+    assert not late.standard_error  # what a run claims is checked first
 
 
 def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import unrender as ur
 from unrender.optimizers import Adam, AveragedNewton, Partitioned
-from unrender.optimizers.base import averaged_by
+from unrender.optimizers.base import Measuring, averaged_by
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import number_means, verify
 from unrender.runs.number_trace import NumberTrace
@@ -63,6 +63,23 @@ def test_a_number_that_drifts_leaves_the_others_without_errors() -> None:
     means, errors, _ = number_means._means(rows, 1, last)
     assert (list(means), list(errors)) == (["a"], ["a"])
     assert errors["a"][0] == pytest.approx(0.1 / np.sqrt(190), rel=0.4)
+
+
+def test_numbers_beside_other_unknowns_have_means_without_errors() -> None:
+    """A texture that still drifts takes numbers along slowly, so the scatter of their steps is no error."""
+    made = problem()
+    shapes = {"gain": TRUTH["gain"], "map": np.full((2, 2, 1), 0.5)}
+    renderer = AnalyticRenderer(shapes, np.random.default_rng(1).uniform(0.0, 1.0, (48, 6)), 0.1, 0.3)
+    unknown = [ur.Parameter("gain", initial=0.2), ur.Parameter("map", initial=0.5, learning_rate=1e-9)]
+    beside = ur.Problem(renderer, unknown, [ur.View(renderer.exact(shapes))], truth=shapes)
+    results = [
+        [ur.optimize(of, ur.PathGradient(spp=2), Adam(0.02, beta_1=0.5), steps=200, seed=seed) for seed in range(4)]
+        for of in (made, beside)
+    ]
+    assert all(any(result.adapted for result in each) for each in results)
+    assert [any(result.standard_error for result in each) for each in results] == [True, False]
+    block = Partitioned(("gain",), Adam(0.02), Adam(0.01))
+    assert not isinstance(block, Measuring)  # a block's own errors take the other unknowns as known
 
 
 @pytest.mark.mitsuba

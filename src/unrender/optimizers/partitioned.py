@@ -14,7 +14,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate, Capabilities, FreshGradient, Gradient
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.base import Choosing, Measuring, Optimizer, averaged_by
+from unrender.optimizers.base import Choosing, Optimizer, averaged_by
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
 
@@ -110,16 +110,6 @@ class Partitioned:
         return averaged_by(self.optimizer, given.intersection(self.keys)) | averaged_by(
             self.others, given.difference(self.keys)
         )
-
-    def standard_errors(self, state: PartitionedState, parameters: Tree) -> Tree:
-        """Return the standard errors from the optimizers that estimate them."""
-        parts = zip((self.optimizer, self.others), (state.own, state.others), self._parts(parameters), strict=True)
-        return {
-            key: error
-            for part, of, point in parts
-            if isinstance(part, Measuring)
-            for key, error in part.standard_errors(of, point).items()
-        }
 
     def choices(self, state: PartitionedState) -> tuple[str, ...]:
         """Return the choices of both optimizers, one line each."""

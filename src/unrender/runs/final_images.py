@@ -143,7 +143,8 @@ def render_final_images(
             known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
         sensitivities, lines, warnings, deviations = known.sensitivity(), [], (), dict(result.standard_error)
         if not tested and result.steps:
-            lines = _unchecked(checked_keys(problem, result.parameters, result.initial))
+            unchecked = checked_keys(problem, result.parameters, result.initial)
+            lines, deviations = _unchecked(unchecked), _without(deviations, unchecked)
         if everything:
             lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests)
             if halves and left() > 0.0:
@@ -175,7 +176,7 @@ def _undetermined(
     """
     if not result.steps:
         return [], (), {}
-    lines, deviations = undetermined_cells(sensitivities), dict(result.standard_error)
+    lines = undetermined_cells(sensitivities)
     spp, seconds = _trial_spp(problem), min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
     per_pass = _pass_spp(problem)
     lines += common_factor(problem, result.parameters, spp, seconds, per_pass)
@@ -183,7 +184,7 @@ def _undetermined(
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
-    text = "\n".join(lines)
+    text, deviations = "\n".join(lines), _without(result.standard_error, numbers.unchecked)
     lines += [line for key, line in numbers.undetermined.items() if key not in text] + _unchecked(numbers.unchecked)
     deviations |= numbers.standard_errors(result.parameters, deviations)
     failed = result.status == "failed"  # such a run did not end by its budget
@@ -217,6 +218,11 @@ def _misfit(
         f"{found.describe()}, which noise does not explain: the run needs more steps, another start or bounds (auto compares starts "
         "within them), or something that is not among the unknowns is wrong"
     ]
+
+
+def _without(errors: Mapping[str, np.ndarray], keys: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the standard errors of other keys: those of a number that may not have converged are too small."""
+    return {key: error for key, error in errors.items() if key not in keys}
 
 
 def _unchecked(keys: Sequence[str]) -> list[str]:

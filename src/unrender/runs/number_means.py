@@ -46,7 +46,10 @@ def numbers_of(problem: Problem, optimizer: Any) -> dict[str, tuple[int, ...]]:
 
 
 def averaged(run: Run, result: Result) -> Result:
-    """Return the result with the mean of each number over its last steps, where these are stationary, and its standard error."""
+    """Return the result with the mean of each number over its last steps, where these are stationary, and its standard error.
+
+    There are no standard errors beside other unknowns, such as textures: numbers may follow these slowly, with little noise.
+    """
     trace = run.state.numbers
     shapes = numbers_of(run.problem, run.optimizer)
     if not shapes or not trace.rows:
@@ -59,7 +62,7 @@ def averaged(run: Run, result: Result) -> Result:
         result,
         parameters={**result.parameters, **means},
         last=result.parameters,
-        standard_error={**errors, **result.standard_error},
+        standard_error=result.standard_error if set(run.problem.shapes()) - set(shapes) else errors,
         adapted=[*result.adapted, f"numbers are means of their last steps: {grouped(steps)}"],
     )
 

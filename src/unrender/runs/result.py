@@ -55,8 +55,8 @@ class Result:
             and the image's expectation, without rendering noise; see `statistics.debiased`.
         standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings
             and of the references, infinite where the images do not determine it. Runs with a run folder have it for all numbers, also
-            beside textures and grids, see `runs.least_squares`. Other runs have it for numbers optimised by `AveragedNewton`, without
-            errors of unknowns outside its block, and for numbers that are means over enough steps, without the references' noise.
+            beside textures and grids, see `runs.least_squares`, unless there was no time for that test. Other runs have it if all
+            unknowns are numbers: for those optimised by `AveragedNewton`, and for means over enough steps, without the references' noise.
             Textures of runs with a run folder have a map, see `unrender.runs.uncertainty`.
         data_share: {key: array} of the parameters' shapes, in [0, 1], for textures: weight of the references in each element, see
             `unrender.runs.uncertainty`. {} for runs without a run folder.
