@@ -127,10 +127,8 @@ def render_final_images(
                 of = problem.remeshed_from or problem if which == "initial" else problem
                 halves, error = _picture(of, values, index, samples, _SEEDS[which])
                 pictures[name] = sum(halves[1:], halves[0]) / len(halves)
-                if which == "result":
-                    ends.append(halves)
-                if error is not None:
-                    errors[name] = error
+                ends += [halves] if which == "result" else []
+                errors |= {name: error} if error is not None else {}
                 advance((2 * place + done + 1) / (2 * len(chosen)))
             pictures |= _maps(result, index, reference.shape[:2])
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
