@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,26 @@ from benchmarks.internals import dr, from_tensor, mi, project, stock_scene, volu
 def step_seed(seed: int, step: int, view: int) -> int:
     """The first of two seeds of a view at a step, which no other step of the run has."""
     return (seed * 1_000_003 + step * 64 + view) * 2 % 2**31
+
+
+def backward(
+    problem: ur.Problem,
+    scene: Any,
+    parameters: Any,
+    integrator: Any,
+    seed: int,
+    step: int,
+    views: Iterable[int],
+    spp: int = 0,
+) -> Any:
+    """Render views by `mi.render`, sum their losses, and call `dr.backward`. Return the sum; 0 samples are the integrator's own."""
+    loss: Any = 0.0
+    for view in views:
+        sensor, number = problem.views[view].sensor, step_seed(seed, step, view)
+        options = {"sensor": sensor, "integrator": integrator, "spp": spp, "seed": number, "seed_grad": number + 1}
+        loss += problem.loss_value(view, mi.render(scene, parameters, **options))
+    dr.backward(loss)
+    return loss
 
 
 def stock_loop(
@@ -57,21 +77,9 @@ def stock_loop(
         clock, step = 0.0, 0
         while clock < seconds and step < ((count if views else 2) if warm else steps):
             began = timer()
-            loss: Any = 0.0
             drawn = [step] if warm else rng.choice(count, min(views or count, count), replace=False).tolist()
-            for view in drawn if views else range(count):
-                number = step_seed(seed, step, view)
-                image = mi.render(
-                    scene,
-                    parameters,
-                    sensor=problem.views[view].sensor,
-                    integrator=integrator,
-                    spp=spp,
-                    seed=number,
-                    seed_grad=number + 1,
-                )
-                loss += problem.loss_value(view, image)
-            dr.backward(loss)
+            chosen = drawn if views else range(count)
+            loss = backward(problem, scene, parameters, integrator, seed, step, chosen, spp)
             if fall:
                 factor = fall(min(max(clock / seconds, step / steps), 1.0))
                 optimizer.set_learning_rate({key: max(rate * factor, 1e-9) for key, rate in rates.items()})

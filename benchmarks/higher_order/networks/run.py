@@ -35,6 +35,7 @@ def run(
     images: int = 16,
     size: int = 32,
     only: tuple[str, ...] = ("OurG", "OurHVPA", "OurJoint"),
+    rate: float | None = None,
 ) -> Iterator[dict[str, Any]]:
     """A part per task.
 
@@ -43,6 +44,7 @@ def run(
         images: that the network learns from
         size: of the rendered answers, pixels along a side
         only: methods to train by; the others' figures stay
+        rate: of longer runs, which are not tuned; they have an entry of their own
     """
     from benchmarks.higher_order.networks import training  # PyTorch is optional, and tables do not need it
 
@@ -52,14 +54,14 @@ def run(
         weights = training.parameter_count(training.PoseNetwork(len(data.ranges)))
         methods: dict[str, Any] = {}
         for method in only:
-            rates = training.GRID[method]
+            rates = () if rate else training.GRID[method]
             tried = {r: training.train(data, method, r, seconds / 4, 1000)["final"] for r in rates}
-            best = min(tried, key=lambda rate, tried=tried: tried[rate])
+            best = rate or min(tried, key=lambda one, tried=tried: tried[one])
             found = [training.train(data, method, best, seconds, seed) for seed in range(runs)]
             methods[method] = {"rate": best, "tried": tried, "runs": found}
             print(name, method, best, [round(one["final"], 3) for one in found], flush=True)
         entry = {"weights": weights, "seconds": seconds, "methods": methods}
-        yield {"tasks": {name: entry}}
+        yield {"tasks": {f"{name}, {seconds:g} s" if rate else name: entry}}
 
 
 def table(record: Record) -> str:

@@ -237,7 +237,12 @@ def table(record: Record) -> str:
             row = f"{{problem}} | {{loss}} | {{seconds:g}} s{clock} | {method} ({{spp}} spp, {{rate:g}}) | {{final!m}} | {{best:.3f}}"
             rows.append([markdown.fill(row, found), *others])
     head = "problem | loss | budget | method (spp, rate) | final error | best on the way | × rcv's final | its best at"
-    return markdown.table(f"{head} | rcv gets there at", rows)
+    at_equal_steps = markdown.records(
+        "at equal steps: problem, loss, image + adjoint | steps | method | rate | final error",
+        "{name} | {steps[0]} | {method} | {rate:g} | {final!m}",
+        markdown.named(record.get("equal steps", {}), "name", "methods", "method"),
+    )
+    return markdown.blocks(markdown.table(f"{head} | rcv gets there at", rows), at_equal_steps)
 
 
 def plot(record: Record) -> figures.Figure:

@@ -22,7 +22,7 @@ from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
 from benchmarks.races import TUNING_SEED, search
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
-from benchmarks.stock_loop import step_seed
+from benchmarks.stock_loop import backward
 from benchmarks.timed_runs import POINTS, Kept, blind, measured
 
 QUICK: dict[str, Any] = {
@@ -93,19 +93,8 @@ class StockShapes:
                 others[key] = project(others[key], low, high)
                 self.parameters[key] = others[key]
             self.parameters.update()
-            loss: Any = 0.0
-            for index, view in enumerate(self.problem.views):
-                number = step_seed(seed, step, index)
-                image = mi.render(
-                    self.scene,
-                    self.parameters,
-                    sensor=view.sensor,
-                    integrator=self._integrator,
-                    seed=number,
-                    seed_grad=number + 1,
-                )
-                loss += self.problem.loss_value(index, image)
-            dr.backward(loss)
+            views = range(len(self.problem.views))
+            backward(self.problem, self.scene, self.parameters, self._integrator, seed, step, views)
             vertices.step()
             others.step()
             dr.eval(vertices["u"])
