@@ -173,6 +173,35 @@ def test_numbers_of_any_scale():
         assert not found.undetermined
 
 
+@pytest.mark.parametrize("weighted", [True, False])
+def test_rare_bright_samples_at_the_ends_of_differences_leave_no_number_open(
+    monkeypatch: pytest.MonkeyPatch, weighted: bool
+):
+    made, pictures = problem(MATRIX), Numbers.pictures
+
+    def with_bright_samples(self: Numbers, points: np.ndarray, key: Key) -> np.ndarray:
+        images = pictures(self, points, key)
+        if key.uint32() % 4 == 0:
+            images[:, 5] += 1e4 * np.maximum(points[:, 3:4] - self.point[3], 0.0)
+        return images
+
+    monkeypatch.setattr(Numbers, "pictures", with_bright_samples)
+    if not weighted:  # planted fault
+        monkeypatch.setattr(Differences, "weights", lambda self: np.ones(len(self.one)))
+    found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), FAR)
+    assert bool(found.undetermined) is not weighted
+
+
+def test_the_error_of_a_step_is_at_least_that_of_the_check():
+    """References without noise may leave a covariance of 0, which says nothing about the step."""
+    made = problem(MATRIX)
+    numbers = Numbers.of(made, TRUTH, made.initial_values())
+    assert numbers is not None
+    own, step = np.full(4, 0.004), np.array([0.1, 0.0, 0.0, 0.0])
+    found = _judged(numbers, _Fit(np.zeros((4, 4)), np.zeros(4), own, step, np.zeros((4, 0))), np.full(4, 0.01))
+    assert found.unfinished["a"].endswith("standard error 0.004, 0.004, 0.004; give more seconds, or resume the run")
+
+
 def test_no_time_no_check():
     made = problem(MATRIX)
     found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), 0.0)

@@ -149,7 +149,9 @@ def _colour_channels(bitmap: Any) -> np.ndarray:
     """Return R, G and B, (H, W, 3), of an EXR file of many channels, such as those of Mitsuba's `aov` integrator."""
     names = [field.name for field in bitmap.struct_()]
     if not {"R", "G", "B"} <= set(names):
-        raise InputError(f"has the channels {', '.join(names)[:200]}, but not R, G and B")
+        raise InputError(
+            f"has the channels {', '.join(names)[:200]}, but not R, G and B; save colour alone, such as mi.Bitmap(image[:, :, :3])"
+        )
     return np.array(bitmap)[..., [names.index(name) for name in "RGB"]].astype(np.float32)
 
 

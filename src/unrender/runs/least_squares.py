@@ -172,11 +172,14 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
     if beside := beside_fields(numbers, differences, sensitivities, change, key.fold(_FIELDS), half):
         numbers, differences = beside
     directions, repeats = _directions(differences, numbers.limits, change), 0
+    weights = np.zeros(directions.shape[1])
     residuals = np.zeros((2, *numbers.references().shape))
     while repeats < _REPEATS and (not repeats or time.perf_counter() + 2.0 * longest < until):
         own = key.fold(_PASSES + 1 + repeats)
         more = numbers.differences(directions, own)
-        differences = more if repeats == 0 else differences.mean(more, repeats)
+        # The end of a long difference may have rare bright samples, such as at a low roughness; repeats that have them count less.
+        weights += more.weights()
+        differences = more if repeats == 0 else differences.moved(more, more.weights() / weights)
         for half in (0, 1):  # as many pictures as for the differences
             for index in range(directions.shape[1]):
                 picture = numbers.pictures(numbers.point[None], own.fold(2 + 2 * index + half))[0]
@@ -270,7 +273,8 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     n, spread = numbers.count, np.outer(fit.error, fit.error)
     together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (unseen[:, None] & unseen[None]).any(axis=2)
     shared = open_ & (_shared_with_fields(fit.covariance, n) | unseen.any(axis=1))
-    further = np.abs(fit.step) > np.maximum(_STEP_ERRORS * np.maximum(error, fit.own), _FURTHER * sizes)
+    of_step = np.maximum(error, fit.own)  # references without noise leave the noise of this check
+    further = np.abs(fit.step) > np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes)
     shown, more = np.minimum(error, sizes), np.where(error > sizes, " or more", "")
     undetermined, unfinished = {}, {}
     for key, of in numbers.places().items():
@@ -285,7 +289,7 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
         elif further[of].any() and numbers.problem.loss.linear:
             unfinished[key] = (
                 f"{key}: the run ended before it settled: a least-squares step from its end moves it by {_numbers(fit.step[of])}, with the "
-                f"standard error {_numbers(error[of])}; give more seconds, or resume the run"
+                f"standard error {_numbers(of_step[of])}; give more seconds, or resume the run"
             )
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (error, fit.step, fit.own))
     return NumbersCheck(undetermined, unfinished, errors, steps, noise)

@@ -60,11 +60,15 @@ class Differences:
         product = self.one.reshape(len(self.one), -1) @ self.other.reshape(len(self.other), -1).T
         return 0.5 * (product + product.T)
 
-    def mean(self, other: Differences, number: int) -> Differences:
-        """Return the mean of these `number` differences and one more along the same directions."""
-        share = 1.0 / (number + 1.0)
-        one, two = (a + share * (b - a) for a, b in ((self.one, other.one), (self.other, other.other)))
-        return Differences(self.directions, one, two)
+    def weights(self) -> np.ndarray:
+        """Return the inverse squares of the standard errors of `squares`, (K,)."""
+        squares, errors = self.squares()
+        return 1.0 / np.square(errors + 1e-6 * np.abs(squares) + 1e-100)
+
+    def moved(self, other: Differences, share: np.ndarray) -> Differences:
+        """Return these differences, moved by shares (K,) towards others along the same directions."""
+        pairs = ((self.one, other.one), (self.other, other.other))
+        return Differences(self.directions, *(a + share[:, None, None] * (b - a) for a, b in pairs))
 
 
 @dataclass(frozen=True)
