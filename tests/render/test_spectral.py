@@ -262,6 +262,29 @@ def _raw_wall() -> dict[str, Any]:
     return {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": picture}}
 
 
+def _picture_wall(name: str, picture: Any) -> dict[str, Any]:
+    made = {"type": "bitmap", name: picture, "raw": False}
+    return {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": made}}
+
+
+def _overwritten() -> mi.Bitmap:
+    """Return a bitmap that an earlier load has overwritten with coefficients."""
+    picture = mi.Bitmap(np.full((2, 2, 3), [0.8, 0.3, 0.1], np.float32))
+    mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": False})
+    return picture
+
+
+def test_a_bitmap_object_keeps_its_colours_for_the_next_load() -> None:
+    """Mitsuba overwrites it with coefficients; a second load, such as that of the previous state, would then read another picture."""
+    picture = mi.Bitmap(np.full((2, 2, 3), [0.8, 0.3, 0.1], np.float32))
+    description = scene(wall=_picture_wall("bitmap", picture))
+    for _ in range(2):
+        renderer = MitsubaRenderer(description, DEPTH)
+        values = renderer.values(["wall.bsdf.reflectance.data"])["wall.bsdf.reflectance.data"]
+        np.testing.assert_allclose(np.array(values)[0, 0], [0.8, 0.3, 0.1], atol=2e-3)
+    np.testing.assert_allclose(np.array(picture)[0, 0], [0.8, 0.3, 0.1], atol=1e-6)
+
+
 def _fog() -> dict[str, Any]:
     return {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
 
@@ -270,6 +293,11 @@ def _fog() -> dict[str, Any]:
     ("others", "message"),
     [
         (lambda: {"wall": _raw_wall()}, "the bitmap of reflectance is raw.*set raw to false"),
+        (
+            lambda: {"wall": _picture_wall("data", mi.TensorXf(np.full((2, 2, 3), 0.5, np.float32)))},
+            "the data of the bitmap of reflectance are colours.*give bitmap = ",
+        ),
+        (lambda: {"wall": _picture_wall("bitmap", _overwritten())}, "colours below 0.*make a new mitsuba.Bitmap"),
         (lambda: {"fog": _fog()}, "do not support participating media; use the variant llvm_ad_rgb"),
         (
             lambda: {"camera": {"type": "perspective", "film": {"type": "specfilm", "b": spectrum(1, 1)}}},

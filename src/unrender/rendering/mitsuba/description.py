@@ -15,12 +15,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from unrender.backend import plugins, variant
 from unrender.core.errors import InputError
 from unrender.core.text import one_line, shorten
 from unrender.io import scene_assets, scene_files
+from unrender.rendering.mitsuba.film_response import is_spectral
 
 _DEEPEST = 128
 _MOST_PATHS = 1 << 20
@@ -189,7 +192,7 @@ class _Dictionary:
         result = {}
         for key, value in description.items():
             if not isinstance(value, dict):
-                result[key] = str(value) if key == _FILE and isinstance(value, Path) else value
+                result[key] = str(value) if key == _FILE and isinstance(value, Path) else _copied(value, description)
             elif depth == 0 and value.get("type") == _RESOURCES:
                 self._add_resources(value)
             else:
@@ -209,6 +212,24 @@ class _Dictionary:
             raise InputError(f"spectrum {shorten(str(name), 200)}: no such file")
         scene_assets.check_spectrum(path)
         return path.absolute()
+
+
+def _copied(value: Any, owner: Mapping[str, Any]) -> Any:
+    """Return a copy of a bitmap or tensor, because Mitsuba empties tensors, and in spectral variants overwrites bitmaps with coefficients.
+
+    Raises `InputError` for a bitmap of colours that another load has overwritten.
+    """
+    if dr.is_tensor_v(value):
+        return type(value)(value)
+    if not isinstance(value, mi.Bitmap):
+        return value
+    colours = is_spectral() and owner.get("type") == "bitmap" and not owner.get("raw", False)
+    if colours and np.array(value, copy=False).min(initial=0) < 0:
+        raise InputError(
+            "bitmap: colours below 0, such as the coefficients with which mitsuba.load_dict overwrites a bitmap in spectral variants; "
+            "make a new mitsuba.Bitmap for each load"
+        )
+    return mi.Bitmap(value)
 
 
 @contextmanager

@@ -27,6 +27,8 @@ from unrender.rendering.mitsuba.tensors import tensor
 
 _DARKEST, _BRIGHTEST = 1e-4, 1 - 1e-4
 """Range of grey, and smallest value of the largest channel of a colour. Coefficients of black and white are infinite, without slopes."""
+_LARGEST_FIRST = 0.02
+"""Size that the first coefficient of no colour has; the largest is .005."""
 _RAW = re.compile(r"^\s*raw = (1|true)\b", re.MULTILINE)
 _RGB_TEXTURES = {"BitmapTextureImpl": "data", "SRGBReflectanceSpectrum": "value"}
 _DIRECT = {"RegularSpectrum": "values", "IrregularSpectrum": "values", "UniformSpectrum": "value"}
@@ -66,6 +68,8 @@ def refusal(scene: Any, holders: Holders) -> str:
         used = next((slot for _, slot in slots if slot not in _NUMBERS), "")
         if used and _is_raw(node) and channels(mi.traverse(node)["data"]) != 1:
             return f"the bitmap of {used} is raw, and spectral variants do not upsample raw colours; set raw to false"
+        if used and _holds_colours(node):
+            return f"the data of the bitmap of {used} are colours, which Mitsuba takes for coefficients; give bitmap = mitsuba.Bitmap(...)"
     for sensor in scene.sensors():
         film = class_name(sensor.film())
         if film not in _FILMS or any(name == "srf" for name, _ in children(sensor)):
@@ -231,6 +235,14 @@ class _Cell:
                 ]
             )
         return result
+
+
+def _holds_colours(node: Any) -> bool:
+    """Return whether a bitmap that is not raw holds values that are no coefficients of a spectrum."""
+    if class_name(node) != "BitmapTextureImpl" or _is_raw(node):
+        return False
+    data: Any = mi.traverse(node)["data"]
+    return channels(data) == 3 and bool(np.abs(data.numpy()[..., 0]).max(initial=0.0) > _LARGEST_FIRST)
 
 
 def _is_raw(node: Any) -> bool:
