@@ -165,7 +165,8 @@ def campaign(victims: Victims, folder: Path, command: str, number: int, method: 
     case = COMMANDS[command](victims, folder / command, method)
     counted, seen = folder / command / "counted", folder / command / "operations"
     case.begin(counted)
-    if status := victims.carry_out(*case.words(counted), watch=str(counted), count=str(seen)):
+    status = victims.carry_out(*case.words(counted), watch=str(counted), count=str(seen))
+    if status not in (0, DOUBTFUL):
         raise RuntimeError(f"{command}: exit status {status}")
     names = seen.read_text().splitlines()
     wrong: list[str] = []

@@ -8,6 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import unrender as ur
+
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("spectral_variant")]
 
 SPECTRUM, COLOUR = "ball.bsdf.reflectance.values", "wall.bsdf.reflectance.value"
@@ -59,6 +61,24 @@ def test_run_resume_and_export(unrender, problem: Path, spectral_variant: str) -
     np.testing.assert_allclose(np.array(written[SPECTRUM]), values[SPECTRUM], rtol=1e-5)
     coefficients = mi.srgb_model_fetch(mi.ScalarColor3f(*map(float, values[COLOUR])))  # pyright: ignore[reportAttributeAccessIssue]
     np.testing.assert_allclose(np.array(written[COLOUR]).ravel(), np.array(coefficients), rtol=1e-3)
+
+
+def test_workers_render_the_colours_of_this_process(problem: Path, spectral_variant: str, mitsuba_variant: str) -> None:
+    """Those of another kind would give gradients of other pictures."""
+    pytest.importorskip("ray")
+    with (problem / "problem.toml").open("a") as file:
+        file.write('[[views]]\nreference = "reference.exr"\nweight = 2.0\n')
+    made = ur.Problem.from_file(problem / "problem.toml")
+    line = f"workers: {mitsuba_variant} renders other colours than {spectral_variant} of this process; use {spectral_variant}$"
+    with pytest.raises(ur.InputError, match=line), ur.app.distribute(made, workers=2, variant=mitsuba_variant):
+        pass
+    alone = ur.optimize(made, "plain", steps=8, progress=False).parameters
+    with ur.app.distribute(made, workers=2) as distributed:
+        assert distributed.executor.variant == spectral_variant
+        together = ur.optimize(distributed, "plain", steps=8, progress=False).parameters
+    for key, value in alone.items():
+        assert np.abs(value - 0.5).max() > 0.01
+        np.testing.assert_allclose(together[key], value, rtol=1e-5)
 
 
 def test_the_rgb_variant_names_the_spectral_one(

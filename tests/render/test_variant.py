@@ -103,6 +103,16 @@ def test_spectral_variants_are_checked_as_those_of_rgb(fake: FakeMitsuba, monkey
         variant.ensure()
 
 
+def test_the_variant_of_a_device_has_the_colours_of_another_variant():
+    of = variant.with_colours_of
+    assert of(variant.CUDA, "llvm_ad_spectral") == "cuda_ad_spectral"
+    assert of(variant.LLVM, "cuda_ad_spectral") == "llvm_ad_spectral"
+    assert of("cuda_ad_spectral", variant.LLVM) == variant.CUDA
+    assert [of(name, None) for name in variant.VARIANTS] == list(variant.VARIANTS)
+    assert variant.same_colours(variant.CUDA, variant.LLVM)
+    assert not variant.same_colours(variant.LLVM, "llvm_ad_spectral")
+
+
 @pytest.mark.parametrize("name", ["llvm", "scalar_rgb", "llvm_ad_spectral_polarized", "cuda_ad_rgb ", ""])
 def test_an_unknown_variant_is_refused(name: str):
     expected = "expected 'auto', 'cuda_ad_rgb', 'llvm_ad_rgb', 'cuda_ad_spectral' or 'llvm_ad_spectral'"

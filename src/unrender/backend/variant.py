@@ -132,6 +132,16 @@ def on_cpu(variant: str) -> str:
     return variant.replace("cuda", "llvm", 1)
 
 
+def same_colours(variant: str, other: str) -> bool:
+    """Return whether two variants render the same colours: both RGB, or both spectral."""
+    return variant.endswith("spectral") == other.endswith("spectral")
+
+
+def with_colours_of(variant: str, other: str | None) -> str:
+    """Return the variant for the device of `variant` that renders the colours of `other`; `variant` itself for None."""
+    return next(v for v in VARIANTS if v[:4] == variant[:4] and same_colours(v, other or variant))
+
+
 def _unsupported(variant: str) -> str:
     """Return what a variant lacks, for a message."""
     parts = variant.split("_")

@@ -15,7 +15,7 @@ from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.ray_hosts import RayHosts
 from unrender.app.distributed.transfer import packed
 from unrender.backend.limits import cores
-from unrender.backend.variant import check_threads
+from unrender.backend.variant import check_threads, current, same_colours, with_colours_of
 from unrender.core.errors import InputError
 from unrender.scene.problem import Problem
 
@@ -55,15 +55,21 @@ def distribute(
         compress: whether parameters are sent as float16 differences from the workers' values, and gradients are returned in single
             instead of double precision. This halves the traffic, and gradients are at values that differ from the run's by up to 2⁻¹¹
             of the last step. Checkpoints of such a run can only be resumed with `compress`.
-        variant: Mitsuba variant of the workers.
+        variant: Mitsuba variant of the workers; "auto" for one with the colours of this process's variant.
         threads: processor threads per worker; None for its share.
         tell: function that receives a line for each lost or lagging worker.
         insecure: whether to join a cluster that other users can enter.
 
     Raises:
-        InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; the problem cannot be sent,
-            has too few views, or does not fit a worker's memory; workers are lost repeatedly.
+        InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; `variant` renders other colours
+            than this process's; the problem cannot be sent, has too few views, or does not fit a worker's memory; workers are lost
+            repeatedly.
     """
+    own = current()
+    if variant != "auto" and own is not None and not same_colours(variant, own):
+        raise InputError(
+            f"workers: {variant} renders other colours than {own} of this process; use {with_colours_of(variant, own)}"
+        )
     parsed = workers if isinstance(workers, Workers) else Workers.parse(str(workers), "workers")
     parsed = replace(parsed, insecure=parsed.insecure or insecure)
     views = len(problem.views)

@@ -151,7 +151,7 @@ def connect(
 
     Args:
         workers: number of workers, and address. Without an address, the environment variable RAY_ADDRESS is used, if set.
-        name: Mitsuba variant; "auto" for CUDA if there are GPUs, else LLVM.
+        name: Mitsuba variant; "auto" for CUDA if there are GPUs, else LLVM, with the colours of this process's variant.
         store_bytes: shared memory for objects of a local cluster.
         most: maximum useful number of workers, see `share`.
 
@@ -188,9 +188,11 @@ def connect(
         machines = _machines(ray)
         if name == "auto" and address is not None:
             gpu = any(gpus >= 1 for _, gpus in machines)
+        if name == "auto":
+            name = variant.with_colours_of(variant.CUDA if gpu else variant.LLVM, variant.current())
         yield Cluster(
             ray,
-            name if name != "auto" else variant.CUDA if gpu else variant.LLVM,
+            name,
             share(machines, workers.count, gpu, most),
             workers.address or address,
             HeadNode(gcs_address),
