@@ -61,15 +61,10 @@ def distribute(
         insecure: whether to join a cluster that other users can enter.
 
     Raises:
-        InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; `variant` renders other colours
-            than this process's; the problem cannot be sent, has too few views, or does not fit a worker's memory; workers are lost
-            repeatedly.
+        InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; the problem cannot be sent,
+            has too few views, or does not fit a worker's memory; workers are lost repeatedly, or render other colours than this process.
     """
-    own = current()
-    if variant != "auto" and own is not None and not same_colours(variant, own):
-        raise InputError(
-            f"workers: {variant} renders other colours than {own} of this process; use {with_colours_of(variant, own)}"
-        )
+    _check_colours(variant)
     parsed = workers if isinstance(workers, Workers) else Workers.parse(str(workers), "workers")
     parsed = replace(parsed, insecure=parsed.insecure or insecure)
     views = len(problem.views)
@@ -86,12 +81,20 @@ def distribute(
         resolutions = problem.renderer.resolutions()
         pixels = [math.prod(resolutions[view.sensor]) for view in problem.views]
         shares = assign(pixels, cluster.share.count)
-        blobs = tuple(packed(problem, share, cluster.ray) for share in shares)
-        hosts = RayHosts(cluster, shares, blobs, threads, tell)
+        hosts = RayHosts(cluster, shares, tuple(packed(problem, share, cluster.ray) for share in shares), threads, tell)
         try:
             yield problem.with_parts(executor=DistributedExecutor(problem, shares, hosts, compress, cluster.variant))
         finally:
             hosts.close()
+
+
+def _check_colours(variant: str) -> None:
+    """Raise `InputError` for a variant of workers whose gradients would be those of other pictures than this process's."""
+    own = current()
+    if variant != "auto" and own is not None and not same_colours(variant, own):
+        raise InputError(
+            f"workers: {variant} renders other colours than {own} of this process; use {with_colours_of(variant, own)}"
+        )
 
 
 def _store_bytes(problem: Problem, workers: Workers) -> int:
