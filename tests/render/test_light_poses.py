@@ -11,6 +11,7 @@ import pytest
 
 import unrender as ur
 from tiers import quick
+from unrender.methods import method
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -73,6 +74,18 @@ def light(kind: str, moved: Any = None) -> dict[str, Any]:
             return {"type": kind, "sun_direction": sun.tolist(), "to_world": m}
     place = mi.ScalarTransform4f().translate([0.3, 2, 0]).rotate([1, 0, 0], 90).scale(0.3)
     return {"type": kind, "to_world": m @ place, "emitter": EMITTER}
+
+
+def test_auto_finds_a_far_rotation_beside_an_unknown_scale() -> None:
+    sky = unknown_light("sky")[0]
+    path = mi.load_dict({"type": "path", "max_depth": 2})
+    reference = np.array(mi.render(mi.load_dict(room(lamp=sky)), integrator=path, spp=256))
+    unknown = [ur.Parameter("lamp.rotation.y", initial=2.5), ur.Parameter("lamp.scale", initial=0.5)]
+    plan = method("auto").plan(ur.Problem(room(lamp=sky), unknown, [ur.View(reference)], max_depth=2))
+    assert any(reason.startswith("starts at another place") for reason in plan.reasons)
+    start = {key: float(np.ravel(x)[0]) for key, x in plan.configured().start().items()}
+    assert abs(start["lamp.rotation.y"]) < 1.0
+    assert 0.7 < start["lamp.scale"] < 1.4
 
 
 VALUES = {"translation": SHIFT, "rotation": TURN, "scale": SCALE}

@@ -116,7 +116,10 @@ class FreshPictures:
     def images(self, parameters: Mapping[str, np.ndarray] | Tree, problem: Problem | None = None) -> list[np.ndarray]:
         """Return the images (K, N, 3) of each frame."""
         renderer = (problem or self._problem).renderer
-        tree = {k: renderer.array(x) if isinstance(x, np.ndarray) else x for k, x in parameters.items()}
+        tree = {
+            k: renderer.array(np.asarray(x)) if isinstance(x, (np.ndarray, np.generic)) else x
+            for k, x in parameters.items()
+        }
         session = renderer.prepare(list(tree), None, derivatives=False)
         images_by_frame = []
         for index, frame in enumerate(self.frames):
