@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from unrender.statistics import scores
 
 __all__ = [
-    "DerivativeMean",
+    "HalvesMean",
     "LossWeights",
     "Products",
     "differences",
+    "mean_residuals",
     "noise_weights",
     "products",
     "running_mean",
@@ -48,14 +49,16 @@ class LossWeights:
 
 
 @dataclass(frozen=True)
-class DerivativeMean:
-    """Weighted mean of the derivative images of a view, in two independent halves.
+class HalvesMean:
+    """Weighted mean of images of a view over steps, in two independent halves.
 
-    The gradient Jᵀ r has the noise of r times J, and that of r times the noise of J. The mean makes the second one small for elements
-    that hardly change the picture. It adds no bias, since r is of images that are independent of J.
+    Derivative images: the gradient Jᵀ r has the noise of r times J, and that of r times the noise of J. The mean makes the second one
+    small for elements that hardly change the picture. It adds no bias, since r is of images that are independent of J.
+
+    Derivatives of the loss: their mean has less of the renderings' noise, so that the references' noise shows.
 
     Attributes:
-        one, other: halves, (m, H, W, 3).
+        one, other: halves, (m, H, W, 3) or (H, W, 3).
         count: number of images, reduced by long steps.
     """
 
@@ -67,8 +70,8 @@ class DerivativeMean:
         """Return whether all values are finite."""
         return bool(np.isfinite(self.one).all() and np.isfinite(self.other).all())
 
-    def and_one(self, new: DerivativeMean, moved: float) -> DerivativeMean:
-        """Return the mean with one more derivative image, after a step of length `moved` in units of the differences' widths.
+    def and_one(self, new: HalvesMean, moved: float) -> HalvesMean:
+        """Return the mean with one more image, after a step of length `moved` in units of the differences' widths.
 
         Images that are not finite are left out.
         """
@@ -82,7 +85,21 @@ class DerivativeMean:
             (a + np.float32(weight) * (b - a)).astype(np.float32)
             for a, b in ((self.one, new.one), (self.other, new.other))
         )
-        return DerivativeMean(one, other, (1.0 + _GROWTH) * (1.0 / weight - 1.0) + 1.0)
+        return HalvesMean(one, other, (1.0 + _GROWTH) * (1.0 / weight - 1.0) + 1.0)
+
+    def shared(self) -> tuple[float, float]:
+        """Return the sum of squares of images (H, W, 3) without noise, and its variance.
+
+        For halves s + a and s + b, a − b and the mean are independent if noise is Gaussian. The square of their product has the variance of
+        the product of both halves as its mean. Channels share their noise.
+        """
+        one, other = self.one.astype(np.float64), self.other.astype(np.float64)
+        terms = (0.5 * (one + other) * (one - other)).sum(axis=-1)
+        return float((one * other).sum()), float(np.square(terms).sum())
+
+    def plus(self, change: np.ndarray) -> HalvesMean:
+        """Return the mean with a change of both halves."""
+        return replace(self, one=(self.one + change).astype(np.float32), other=(self.other + change).astype(np.float32))
 
 
 @dataclass
@@ -105,6 +122,16 @@ class Products:
     scores: np.ndarray
     squares: np.ndarray
 
+    @classmethod
+    def zero(cls, m: int) -> Products:
+        """Return sums of 0."""
+        return cls(np.zeros(m), *(np.zeros((m, m)) for _ in range(4)), squares=np.zeros(m))
+
+    def add(self, other: Products, elements: np.ndarray) -> None:
+        """Add sums of some elements, given by their indices."""
+        for name, values in vars(other).items():
+            vars(self)[name][elements if values.ndim == 1 else np.ix_(elements, elements)] += values
+
 
 def noise_weights(variance: np.ndarray, limit: float) -> np.ndarray:
     """Return the weight 1 / (1 + σ² / (c m)) of each pixel, with c = `limit` and the median m of the variances σ² above 0.
@@ -119,6 +146,27 @@ def running_mean(before: tuple[np.ndarray, ...], view: int, variance: np.ndarray
     """Return the running mean of a view's variance (H, W, 1), from those of all views and the new one (H, W, 3)."""
     new = variance.astype(np.float64).mean(axis=-1, keepdims=True)
     return before[view] + _MEMORY * (new - before[view]) if before else new
+
+
+def mean_residuals(
+    before: HalvesMean | None, weights: LossWeights, derivatives: HalvesMean, step: np.ndarray, moved: float
+) -> HalvesMean:
+    """Return the mean of ℓ' over steps, (H, W, 3), at the present parameters.
+
+    Earlier residuals are moved along by ℓ'' J s for the step s. Otherwise the way to the solution would count as noise of references.
+
+    Args:
+        before: mean of earlier steps.
+        weights: derivatives of the loss.
+        derivatives: derivative images, (m, H, W, 3).
+        step: last step, (m,).
+        moved: its length in units of the differences' widths.
+    """
+    now = HalvesMean(weights.one, weights.other)
+    if before is None:
+        return now
+    slopes = 0.5 * (derivatives.one + derivatives.other)
+    return before.plus(weights.second * np.tensordot(step, slopes, axes=1)).and_one(now, moved)
 
 
 def squared_slope(halves: list[np.ndarray]) -> float:
@@ -141,30 +189,41 @@ def differences(images: np.ndarray, distances: np.ndarray) -> np.ndarray:
     )
 
 
-def products(halves: list[np.ndarray], weights: LossWeights | None, block: int = 1) -> Products:
+def products(
+    halves: list[np.ndarray],
+    weights: LossWeights | None,
+    residuals: HalvesMean | None = None,
+    block: int = 1,
+    remembered: bool = False,
+) -> Products:
     """Return the products of two independent halves of J, (m, H, W, 3) each.
 
     Args:
         halves: derivative images.
         weights: derivatives of the loss; None if only `squares` is needed.
+        residuals: mean of ℓ' over steps, for `scores`; None for that of `weights`.
         block: side of the blocks of pixels over which all but `squares` are summed.
+        remembered: whether all steps share the derivative images. Their noise times that of the references then moves the solution, and
+            `scores` include it.
     """
     m = len(halves[0])
-    hessian, noise, gradient_noise, scores_of = (np.zeros((m, m)) for _ in range(4))
-    total = Products(np.zeros(m), hessian, noise, gradient_noise, scores_of, np.zeros(m))
+    total = Products.zero(m)
     for rows in _rows(halves[0], max(block, 1)):
         one, other = (half[:, rows].astype(np.float64) for half in halves)
         total.squares += (one * other).sum(axis=(1, 2, 3))
         if weights is None:
             continue
-        first, second, at_one, at_other = (
-            x[rows].astype(np.float64) for x in (weights.first, weights.second, weights.one, weights.other)
+        mean = residuals or HalvesMean(weights.one, weights.other)
+        first, second, *at = (
+            x[rows].astype(np.float64)
+            for x in (weights.first, weights.second, weights.one, weights.other, mean.one, mean.other)
         )
         if block > 1:
-            one, other, first, at_one, at_other = (_pooled(x, block) for x in (one, other, first, at_one, at_other))
+            one, other, first, *at = (_pooled(x, block) for x in (one, other, first, *at))
             second = _pooled(second, block) / _pooled(np.ones_like(second), block)
-        of_halves = [(part * at).sum(axis=3) for part, at in ((one, at_one), (other, at_other))]
-        total.scores += scores.covariance(of_halves[0], of_halves[1])
+        both = [0.5 * (one + other)] * 2 if remembered else [one, other]
+        of_halves = [(part * of).sum(axis=3) for part, of in zip((one, other, *both), at, strict=True)]
+        total.scores += scores.covariance(of_halves[2], of_halves[3])
         half = 0.5 * (of_halves[0] - of_halves[1]).reshape(m, -1)
         total.gradient_noise += half @ half.T
         noise_of_halves = 0.5 * (one - other)

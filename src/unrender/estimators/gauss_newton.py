@@ -25,9 +25,11 @@ from unrender.estimators.capabilities import (
     Smoothing,
 )
 from unrender.estimators.derivative_images import (
-    DerivativeMean,
+    HalvesMean,
     LossWeights,
+    Products,
     differences,
+    mean_residuals,
     noise_weights,
     products,
     running_mean,
@@ -46,6 +48,8 @@ _SETTLED = 0.5
 """Maximum step, in units of the widths, after which the shift is halved."""
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
 """Stream of `explained`, and relative eigenvalue below which its matrix counts as singular."""
+_RESIDUAL_ERRORS = 2.0
+"""Standard errors of the sum of squared residuals from which on references have noise."""
 _IMAGE = 2
 """Stream of a view's key for the image. Lower streams are for the two halves of the derivative images."""
 
@@ -60,13 +64,15 @@ class GaussNewtonState:
         point: parameters of the last estimate, (n,); None before the first.
         variances: running mean of the variance of each view's image, (H, W, 1); () without `noise_limit` and before the first estimate.
         derivatives: mean derivative images of each view; () without `remember` and before the first estimate.
+        residuals: mean derivatives of the loss of each view, moved along to `point`; () before the first estimate.
     """
 
     widths: dict[str, float]
     shift: float = 0.0
     point: np.ndarray | None = None
     variances: tuple[np.ndarray, ...] = ()
-    derivatives: tuple[DerivativeMean, ...] = ()
+    derivatives: tuple[HalvesMean, ...] = ()
+    residuals: tuple[HalvesMean, ...] = ()
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
         """Return an empty state: widths are estimated again."""
@@ -82,8 +88,8 @@ class GaussNewton:
     J is the central difference of renders with the same random numbers, at ± a width. The width of each parameter is chosen so that
     both renders differ from the image as much as a shift by `shift` pixels would. It is also the unit of trust regions (`Smoothing`).
     Images and derivative images have independent samples. H is the symmetrised product of two independent halves of the derivative
-    images, so no product contains squared noise. Their difference estimates what noise would add (`HessianNoise`). The residuals of two
-    halves of the image give the gradient's covariance from the references' noise (`ScoreCovariance`).
+    images, so no product contains squared noise. Their difference estimates what noise would add (`HessianNoise`). The mean
+    residuals of two halves of all images give the gradient's covariance from the references' noise (`ScoreCovariance`).
 
     Bias: J is the derivative averaged over ± the width, so g and H are those of nearby parameters. The expected gradient vanishes where
     the expected image equals the reference, for a loss whose derivative is linear in the image. H neglects the curvature of the image,
@@ -159,19 +165,21 @@ class GaussNewton:
             widths = {key: min(width, point.largest[key]) for key, width in widths.items()}
             state = GaussNewtonState(widths, self.coarse or self.shift, point.theta)
             for index in range(_PASSES):
-                system = point.system(state, key.fold(1 + index), derivatives=False)
+                system = point.system(state, key.fold(1 + index))
                 state = self._next(state, system, point, _FIRST_CHANGE)
-        moved = _moved(state, point.theta, parameters)
+        step = np.zeros_like(point.theta) if state.point is None else point.theta - state.point
+        moved = float(np.max(np.abs(step) / trees.repeat_per_element(state.widths, parameters), initial=0.0))
         state = self._sharpened(state, point.theta, moved)
-        system = point.system(state, key.fold(0), moved=moved)
+        system = point.system(state, key.fold(0), step, moved)
+        found = system.products
         estimate = Estimate(
             system.loss,
-            trees.unravel(system.gradient, parameters),
+            trees.unravel(found.gradient, parameters),
             (
-                Hessian(system.hessian),
-                HessianNoise(system.noise),
-                GradientNoise(system.gradient_noise),
-                ScoreCovariance(system.scores),
+                Hessian(found.hessian),
+                HessianNoise(found.noise),
+                GradientNoise(found.gradient_noise),
+                ScoreCovariance(found.scores if system.references_have_noise else np.zeros_like(found.scores)),
                 Smoothing(dict(state.widths)),
             ),
             {"samples": point.samples, "images": system.images},
@@ -187,7 +195,7 @@ class GaussNewton:
     def _next(self, state: GaussNewtonState, system: _System, point: _Point, change: float) -> GaussNewtonState:
         """Return the state with updated widths, at which renders differ from the image as much as the target shift, in the root mean
         square over the elements of a parameter. Widths change by at most the factor `change`."""
-        squares, slopes = (trees.parts(x, point.parameters) for x in (system.squares, system.slopes))
+        squares, slopes = (trees.parts(x, point.parameters) for x in (system.products.squares, system.slopes))
         widths = {}
         for key, width in state.widths.items():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
@@ -198,14 +206,8 @@ class GaussNewton:
             widths=widths,
             variances=tuple(system.variances) or state.variances,
             derivatives=tuple(system.derivatives) or state.derivatives,
+            residuals=tuple(system.residuals) or state.residuals,
         )
-
-
-def _moved(state: GaussNewtonState, point: np.ndarray, parameters: Tree) -> float:
-    """Return the largest change of an element since the last estimate, in units of the widths; 0 before the first."""
-    if state.point is None:
-        return 0.0
-    return float(np.max(np.abs(point - state.point) / trees.repeat_per_element(state.widths, parameters), initial=0.0))
 
 
 def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
@@ -241,31 +243,28 @@ class _System:
     """Sums over all views, for n elements.
 
     Attributes:
-        loss: loss at the parameters.
-        gradient, hessian, noise, gradient_noise, scores: (n,), then (n, n) each.
-        squares: squared derivative images, summed over their pixels, (n,).
+        products: products of derivative images.
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
+        loss: loss at the parameters.
         images: images by view.
         variances: running mean of the variance of each view's image.
         derivatives: mean derivative images of each view.
+        residuals: mean derivatives of the loss of each view.
     """
 
-    loss: float
-    gradient: np.ndarray
-    hessian: np.ndarray
-    noise: np.ndarray
-    gradient_noise: np.ndarray
-    scores: np.ndarray
-    squares: np.ndarray
+    products: Products
     slopes: np.ndarray
-    images: dict[int, Array]
+    loss: float = 0.0
+    images: dict[int, Array] = field(default_factory=dict)
     variances: list[np.ndarray] = field(default_factory=list)
-    derivatives: list[DerivativeMean] = field(default_factory=list)
+    derivatives: list[HalvesMean] = field(default_factory=list)
+    residuals: list[HalvesMean] = field(default_factory=list)
 
-    @classmethod
-    def zero(cls, n: int) -> _System:
-        hessian, noise, gradient_noise, scores = (np.zeros((n, n)) for _ in range(4))
-        return cls(0.0, np.zeros(n), hessian, noise, gradient_noise, scores, np.zeros(n), np.zeros(n), {})
+    @property
+    def references_have_noise(self) -> bool:
+        """Return whether the mean residuals are more than the noise of renderings, which is all that exact references leave."""
+        squares = np.array([mean.shared() for mean in self.residuals]).reshape(-1, 2).sum(axis=0)
+        return bool(squares[0] > _RESIDUAL_ERRORS * math.sqrt(squares[1]))
 
 
 @dataclass(frozen=True)
@@ -303,15 +302,15 @@ class _Point:
         sensors = {key: -1 if known[key].sensor is None else known[key].sensor for key in parameters}
         self._sensors = trees.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
 
-    def system(self, state: GaussNewtonState, key: Key, derivatives: bool = True, moved: float = 0.0) -> _System:
-        """Return gradient and Hessian for the state's widths, after a step of length `moved`. Without `derivatives`, only compute the
-        quantities that the next widths need."""
-        total = _System.zero(self.theta.size)
+    def system(self, state: GaussNewtonState, key: Key, step: np.ndarray | None = None, moved: float = 0.0) -> _System:
+        """Return gradient and Hessian for the state's widths, after a step (n,) of length `moved` in units of the widths. Without a step,
+        only compute the quantities that the next widths need."""
+        total = _System(Products.zero(self.theta.size), np.zeros(self.theta.size))
         steps = trees.repeat_per_element(state.widths, self.parameters)
         for view, sensor_view in enumerate(self.problem.views):
             elements = np.flatnonzero((self._sensors == -1) | (self._sensors == sensor_view.sensor))
             own = key.fold(view)
-            images = self._images(view, own) if derivatives else None
+            images = self._images(view, own) if step is not None else None
             if images:
                 total.images[view] = images.mean
                 total.loss += arrays.number(self.problem.loss_value(view, images.mean))
@@ -320,18 +319,18 @@ class _Point:
                 continue
             points, distances = self._points(elements, steps)
             halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
-            mean = DerivativeMean(differences(halves[0], distances), differences(halves[1], distances))
+            mean = HalvesMean(differences(halves[0], distances), differences(halves[1], distances))
             if images and self.options.remember:
                 if state.derivatives:
                     mean = state.derivatives[len(total.derivatives)].and_one(mean, moved)
                 total.derivatives.append(mean)
-            found, pairs = products([mean.one, mean.other], weights, int(state.shift)), np.ix_(elements, elements)
-            total.gradient[elements] += found.gradient
-            total.hessian[pairs] += found.hessian
-            total.noise[pairs] += found.noise
-            total.gradient_noise[pairs] += found.gradient_noise
-            total.scores[pairs] += found.scores
-            total.squares[elements] += found.squares
+            residuals = None
+            if weights is not None and step is not None:
+                before = state.residuals[len(total.residuals)] if state.residuals else None
+                residuals = mean_residuals(before, weights, mean, step[elements], moved)
+                total.residuals.append(residuals)
+            own_products = products([mean.one, mean.other], weights, residuals, int(state.shift), self.options.remember)
+            total.products.add(own_products, elements)
             total.slopes[elements] += squared_slope(halves)
         return total
 

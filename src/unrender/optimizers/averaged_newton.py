@@ -42,9 +42,6 @@ _OF_LINEAR = 1e4
 """Factor of the trust region along parameters in which images are linear."""
 _OF_WIDTH = 0.1
 """Share of a width below which the end of a step along such a parameter counts as 0."""
-_LEAST_WEIGHT, _SCORE_ERRORS = 0.05, 2.0
-"""Least weight of the latest covariance of scores, because earlier residuals include the distance to the solution; standard errors by which
-the covariance must exceed 0."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +62,7 @@ class AveragedNewtonState:
         radii: radius of the trust region of each element, (n,), in its units.
         step: last step, in units of the parameters, (n,).
         end: planned parameters after the last step, (n,). The parameters differ from it where their bounds are.
-        scores: mean covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; 0 if there is none.
-        score_variances: variance of the diagonal of `scores`, (n,).
+        scores: latest covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; 0 if there is none.
     """
 
     learning_rates: dict[str, float]
@@ -82,7 +78,6 @@ class AveragedNewtonState:
     step: np.ndarray
     end: np.ndarray
     scores: np.ndarray
-    score_variances: np.ndarray
 
 
 @register
@@ -149,9 +144,7 @@ class AveragedNewton:
         n = trees.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
         radii = np.full(n, np.inf if self.trust_radius is None else self.trust_radius)
-        return AveragedNewtonState(
-            own, square, row, square, square, row, row, row, square, radii, row, row, square, row
-        )
+        return AveragedNewtonState(own, square, row, square, square, row, row, row, square, radii, row, row, square)
 
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
@@ -162,7 +155,7 @@ class AveragedNewton:
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
             return trees.unravel(np.zeros_like(x), parameters), state
         hessian = 0.5 * (hessian + hessian.T)
-        added, fluctuation, fresh = (
+        added, fluctuation, scores = (
             _finite(estimate.get(kind), hessian) for kind in (HessianNoise, GradientNoise, ScoreCovariance)
         )
         scale = coordinate_scales(estimate, state, parameters)
@@ -172,7 +165,6 @@ class AveragedNewton:
         shares, counts = state.shares.copy(), state.counts.copy()
         lengths, scatter, radii = np.zeros_like(x), state.scatter.copy(), state.radii.copy()
         outwards = _outwards(state, x)
-        scores, score_variances = state.scores.copy(), state.score_variances.copy()
         for block in _blocks((matrix != 0.0) | (hessian != 0.0)):
             both = np.ix_(block, block)
             news = gradient[block] - (matrix[both] @ x[block] - target[block])
@@ -185,10 +177,6 @@ class AveragedNewton:
             matrix[both] += weight * (hessian[both] - matrix[both])
             noise[both] += weight * (added[both] - noise[both])
             gradient_noise[both] += weight * (fluctuation[both] - gradient_noise[both])
-            recent = max(weight, _LEAST_WEIGHT)
-            change = np.diag(fresh)[block] - np.diag(scores)[block]
-            score_variances[block] = (1.0 - recent) ** 2 * score_variances[block] + (recent * change) ** 2
-            scores[both] += recent * (fresh[both] - scores[both])
             shares[block] = (1.0 - weight) ** 2 * shares[block] + weight**2
             target[block] += weight * (hessian[both] @ x[block] - gradient[block] - target[block])
             own = region[block]
@@ -202,7 +190,7 @@ class AveragedNewton:
             lengths[block] = _length(x[block], step[block], scale[block], own > scale[block])
         return trees.unravel(step, parameters), AveragedNewtonState(
             state.learning_rates, matrix, target, noise, gradient_noise, shares, counts, lengths, scatter, radii, step, x + step,
-            scores, score_variances,
+            scores,
         )  # fmt: skip
 
     def averages(self, keys: Iterable[str]) -> frozenset[str]:
@@ -225,7 +213,7 @@ class AveragedNewton:
             eigenvalues, directions = np.linalg.eigh(state.matrix[both] / np.outer(units, units))
             weak = eigenvalues <= self.damping * eigenvalues.max()
             inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / np.outer(units, units)
-            middle = state.scatter[both] + _significant(state.scores[both], state.score_variances[block], units**2)
+            middle = state.scatter[both] + positive_part(state.scores[both])
             error = np.sqrt(np.abs(np.diag(inverse @ middle @ inverse)))
             errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.inf, error)
         split = trees.parts(errors[None], parameters)
@@ -332,19 +320,6 @@ def _outwards(state: AveragedNewtonState, x: np.ndarray) -> np.ndarray:
     rounding = 4.0 * float(np.finfo(np.float32).eps) * np.abs(x)
     stopped = (np.abs(missed) > np.maximum(_STOPPED * np.abs(step), rounding)) & (missed * step > 0.0)
     return np.where(stopped & ~stopped[step != 0.0].all(), np.sign(missed), 0.0)
-
-
-def _significant(scores: np.ndarray, variances: np.ndarray, units: np.ndarray) -> np.ndarray:
-    """Return the covariance of scores (n, n) reduced by its own noise: 0 for exact references, and nearly all of a large one.
-
-    Args:
-        scores: mean covariance.
-        variances: of its diagonal, (n,).
-        units: by which the diagonal is divided, (n,).
-    """
-    size, variance = float(np.sum(np.diag(scores) / units)), float(np.sum(variances / units**2))
-    share = 1.0 - _SCORE_ERRORS**2 * variance / size**2 if size > 0.0 else 0.0
-    return max(share, 0.0) * positive_part(scores)
 
 
 def _blocks(connected: np.ndarray) -> list[np.ndarray]:

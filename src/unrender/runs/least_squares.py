@@ -106,8 +106,8 @@ def check_numbers(
 
     The derivatives J of the pictures are differences of renders, along directions of which the pictures change independently. The
     covariance of the numbers is (JᵀJ)⁻¹ C (JᵀJ)⁻¹, with the covariance C of Jᵀ r (`statistics.scores`) from the residual r after the step
-    below. It contains the references' noise. If it is large relative to the numbers, the references do not determine them. Where the step
-    −(JᵀJ)⁻¹ Jᵀ r is long, the run ended early.
+    below, in each pixel that of a fit without the pixel. It contains the references' noise. If it is large relative to the numbers, the
+    references do not determine them. Where the step −(JᵀJ)⁻¹ Jᵀ r is long, the run ended early.
 
     Textures and grids move along directions that trade off against the numbers, see `beside_fields`. Other unknowns are fixed, and so
     are those with a prior. Steps are reported for losses with a linear derivative only: others have their minimum elsewhere.
@@ -248,9 +248,8 @@ class _Fit:
         residual, noise = (0.5 * (residuals[0] + sign * residuals[1]) for sign in (1.0, -1.0))
         along = -inverse @ np.where(hidden, 0.0, np.tensordot(slopes, residual, axes=2))
         after = residuals + np.tensordot(along, slopes, axes=1)  # a run that ended early leaves more
-        whole = covariance(*after)
-        freedom = residual.size - len(whole)
-        whole *= residual.size / freedom if freedom > 0 else math.inf
+        whole = covariance(*scores.without_own_pixel(after, slopes, inverse))
+        whole *= 1.0 if residual.size > len(whole) else math.inf
         error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (whole, covariance(noise, noise)))
         step = numbers.inside((numbers.point + changes @ along)[None])[0] - numbers.point
         flat = squares + _ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+_MOST_LEVERAGE = 0.9
+"""Largest leverage of a pixel; noise of the slopes may make it larger."""
+_AGREE_ERRORS = 3.0
+"""Standard errors from which on neighbours share their noise."""
 _FEWEST_PIXELS = 256
 """Number of pixels below which neighbours count as independent: their sums would cover too much of the image."""
 
@@ -11,21 +15,56 @@ _FEWEST_PIXELS = 256
 def covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return an estimate of the covariance of Σ_p s_p over the pixels p of a picture, (n, n).
 
-    The scores s_p are derivative times residual, summed over the channels, so channels may share their noise. Products with the eight
-    neighbours are included, because wide film filters make their noise correlated. Pictures of fewer than 256 pixels leave these out.
+    The scores s_p are derivative times residual, summed over the channels, so channels may share their noise. Wide film filters make the
+    noise of neighbours correlated. Where the scores show that, products with the eight neighbours are included. They are left out
+    elsewhere, since they have much noise, and in pictures of fewer than 256 pixels.
 
     Args:
         one, other: (n, H, W), two estimates of the scores with independent rendering noise, which then adds no bias. Equal arrays
             include it.
     """
-    from scipy.ndimage import uniform_filter1d  # takes long to import
-
-    around = other
-    if one[0].size >= _FEWEST_PIXELS:
-        for axis in (1, 2):
-            around = 3.0 * uniform_filter1d(around, 3, axis=axis, mode="constant")
+    shared = one[0].size >= _FEWEST_PIXELS and _neighbours_agree(0.5 * (one + other))
+    around = _with_neighbours(other) if shared else other
     product = one.reshape(len(one), -1) @ around.reshape(len(one), -1).T
     return 0.5 * (product + product.T)
+
+
+def _neighbours_agree(values: np.ndarray) -> bool:
+    """Return whether neighbours have more products of equal sign than independent noise, for one of n elements, (n, H, W).
+
+    If the noise is independent, Σ_p s_p Σ_q s_q over the neighbours q has mean 0 and the variance 2 Σ_p s_p² Σ_q s_q².
+    """
+    squares = np.square(values)
+    sums = (values * (_with_neighbours(values) - values)).sum(axis=(1, 2))
+    variances = 2.0 * (squares * (_with_neighbours(squares) - squares)).sum(axis=(1, 2))
+    return bool((sums > _AGREE_ERRORS * np.sqrt(np.maximum(variances, 0.0))).any())
+
+
+def _with_neighbours(values: np.ndarray) -> np.ndarray:
+    """Return the sums over each pixel and its eight neighbours, (n, H, W)."""
+    from scipy.ndimage import uniform_filter1d  # takes long to import
+
+    for axis in (1, 2):
+        values = 3.0 * uniform_filter1d(values, 3, axis=axis, mode="constant")
+    return values
+
+
+def without_own_pixel(residuals: np.ndarray, slopes: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Return the residuals that each pixel would have if the fit had left it out, (..., P, C).
+
+    A fit follows the noise of its pixels, so that what remains is less than the noise, by (1 − h)² for a pixel of leverage h = J_p (JᵀJ)⁻¹
+    J_pᵀ (Efron's jackknife; HC3 of MacKinnon and White 1985).
+
+    Args:
+        residuals: residuals of the fit, (..., P, C).
+        slopes: J, (n, P, C).
+        inverse: (JᵀJ)⁻¹, (n, n).
+    """
+    leverages = np.einsum("kpc,kpd->pcd", np.tensordot(inverse, slopes, axes=1), slopes)
+    values, vectors = np.linalg.eigh(leverages)
+    left = 1.0 - np.clip(values, 0.0, _MOST_LEVERAGE)
+    along = np.einsum("pcd,...pc->...pd", vectors, residuals)
+    return np.einsum("pcd,...pd->...pc", vectors, along / left)
 
 
 def positive_part(matrix: np.ndarray) -> np.ndarray:

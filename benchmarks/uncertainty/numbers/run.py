@@ -1,0 +1,164 @@
+"""Coverage of the standard errors of numbers: how often the truth lies within one and two of them, over 100 seeds of three problems.
+
+Each seed has a reference of its own with noise, and a run of `auto` of a fixed number of steps. The standard errors count the noise of
+both. Runs without a run folder have those of the optimizer. Those with one have a least-squares test at the end, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+import unrender as ur
+from benchmarks import figures, markdown
+from benchmarks.internals import mi, parts
+from benchmarks.runner import records
+from benchmarks.runner.records import Record
+
+MERGE = ("problems",)
+QUICK: dict[str, Any] = {"problems": ("lamp",), "seeds": 2, "folder_seeds": 1, "steps": 10}
+_SIZE, _DEPTH = 16, 4
+_QUANTILES = 41
+_LIMITS = (1.0, 2.0)
+"""Numbers of standard errors of which coverage is counted."""
+
+
+def _floor() -> dict[str, Any]:
+    return parts.rectangle([0, 0, 0], [2, 0, 0], [0, 0, -2], parts.diffuse(0.6, 0.5, 0.4))
+
+
+def _lamp() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
+    """Return a point lamp of unknown position between a floor, a wall and a ball."""
+    scene = {
+        "floor": _floor(),
+        "wall": parts.rectangle([0, 1, -1.5], [2, 0, 0], [0, 1, 0], parts.diffuse(0.5)),
+        "ball": {"type": "sphere", "center": [0.4, 0.4, 0], "radius": 0.4, "bsdf": parts.diffuse(0.3, 0.5, 0.6)},
+        "lamp": {"type": "point", "position": [-0.6, 1.3, 0.5], "intensity": parts.colour(3.0)},
+    }
+    return scene, {"lamp.position": ([-0.2, 1.6, 0.2], [-0.6, 1.3, 0.5])}
+
+
+def _glass() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
+    """Return a ball of rough glass of unknown index of refraction and roughness between a floor and a sky."""
+    bsdf = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.5, "ext_ior": 1.0}
+    scene = {
+        "floor": _floor(),
+        "ball": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7, "bsdf": bsdf},
+        "lamp": parts.rectangle(
+            [-1, 2.4, 1.4], [0.5, 0, 0], [0, -0.3, -0.3], parts.diffuse(0.0), emitter=parts.light(6.0, 6.0, 6.0)
+        ),
+        "sky": {"type": "constant", "radiance": parts.colour(0.4)},
+    }
+    return scene, {"ball.bsdf.eta": (1.3, 1.5), "ball.bsdf.alpha.value": (0.35, 0.2)}
+
+
+def _fog() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
+    """Return a cube of fog of unknown extinction and albedo under a lamp and a sky."""
+    medium = {"type": "homogeneous", "sigma_t": 1.5, "albedo": parts.colour(0.8, 0.6, 0.4)}
+    to_world = mi.ScalarTransform4f().translate([0, 0.75, 0]).scale([0.9, 0.7, 0.7])
+    scene = {
+        "floor": _floor(),
+        "box": {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}, "interior": medium},
+        "lamp": {"type": "point", "position": [1.0, 2.5, 1.5], "intensity": parts.colour(8.0)},
+        "sky": {"type": "constant", "radiance": parts.colour(0.3)},
+    }
+    return scene, {
+        "box.interior_medium.sigma_t.value.value": (1.0, 1.5),
+        "box.interior_medium.albedo.value.value": ([0.5] * 3, [0.8, 0.6, 0.4]),
+    }
+
+
+SCENES = {"lamp": _lamp, "glass": _glass, "fog": _fog}
+
+
+def problem(name: str) -> ur.Problem:
+    """Return the problem of a name, without its reference."""
+    scene, unknown = SCENES[name]()
+    scene |= {"type": "scene", "sensor": parts.camera([0, 1.6, 4.2], [0, 0.4, 0], 40, _SIZE)}
+    return ur.Problem(
+        scene,
+        [ur.Parameter(key, initial=initial) for key, (initial, _) in unknown.items()],
+        [ur.View(np.ones((_SIZE, _SIZE, 3), np.float32))],
+        max_depth=_DEPTH,
+        truth={key: truth for key, (_, truth) in unknown.items()},
+        name=name,
+    )
+
+
+def _scores(result: ur.Result) -> list[float] | None:
+    """Return the errors of all numbers in their standard errors; None if a number has none."""
+    if set(result.standard_error) < set(result.parameters):
+        return None
+    scores = [(x - result.truth[key]) / result.standard_error[key] for key, x in result.parameters.items()]
+    return np.concatenate([np.ravel(x) for x in scores]).tolist()
+
+
+def _coverage(scores: list[list[float]], seeds: int) -> dict[str, Any]:
+    """Return the share of the numbers within each limit, and its standard error from the scatter over seeds."""
+    z = np.abs(scores)
+    inside = {f"{limit:g}": np.mean(z < limit, axis=1) for limit in _LIMITS}
+    return {
+        "runs": [len(scores), seeds],
+        "inside": {limit: float(x.mean()) for limit, x in inside.items()},
+        "error": {limit: float(x.std() / np.sqrt(len(x))) for limit, x in inside.items()},
+        "std": float(np.std(scores)),
+        "quantiles": np.quantile(scores, (np.arange(_QUANTILES) + 0.5) / _QUANTILES).tolist(),
+    }
+
+
+def run(
+    problems: tuple[str, ...] = ("lamp", "glass", "fog"),
+    seeds: int = 100,
+    folder_seeds: int = 30,
+    steps: int = 20,
+    reference_spp: int = 64,
+) -> Iterator[dict[str, Any]]:
+    """Coverage of each problem.
+
+    Args:
+        problems: names
+        seeds: runs of each without a run folder
+        folder_seeds: runs of each with one
+        steps: of a run
+        reference_spp: samples per pixel of the references, whose noise counts
+    """
+    for name in problems:
+        made, found = problem(name), {}
+        for kind, number in (("without a folder", seeds), ("with a folder", folder_seeds)):
+            scores = []
+            for seed in range(number):
+                reference = ur.render(made, made.truth, spp=reference_spp, seed=1000 + seed)
+                folder = records.scratch("uncertainty.numbers") if kind == "with a folder" else None
+                of = made.replaced(views=[ur.View(reference)])
+                result = ur.optimize(of, steps=steps, seed=seed, run_directory=folder, progress=False)
+                scores.append(_scores(result))
+            if known := [z for z in scores if z is not None]:
+                found[kind] = _coverage(known, number)
+                print(name, kind, {key: x for key, x in found[kind].items() if key != "quantiles"}, flush=True)
+        yield {"problems": {name: found}}
+
+
+def table(record: Record) -> str:
+    """Coverage."""
+    rows = []
+    for name, kinds in record["problems"].items():
+        for kind, entry in kinds.items():
+            shares = [f"{entry['inside'][limit]:.0%} ± {entry['error'][limit]:.0%}" for limit in entry["inside"]]
+            rows.append([name, kind, "{} of {}".format(*entry["runs"]), *shares, f"{entry['std']:.2f}"])
+    text = "{steps} steps, references of {reference_spp} samples per pixel. A seed's numbers count as one draw of the errors shown."
+    head = "problem | runs | with standard errors | within 1 (68 % is right) | within 2 (95 %) | standard deviation of z (1)"
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
+
+
+def plot(record: Record) -> figures.Figure:
+    """Quantiles of the scores over those of the normal distribution."""
+    normal = stats.norm.ppf((np.arange(_QUANTILES) + 0.5) / _QUANTILES).tolist()
+    panels = {
+        name: {kind: [(normal, entry["quantiles"])] for kind, entry in kinds.items()}
+        | {"calibrated": [(normal, normal)]}
+        for name, kinds in record["problems"].items()
+    }
+    return figures.curves(panels, "quantile of the normal distribution", "quantile of z", log="")
