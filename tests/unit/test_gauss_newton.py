@@ -270,6 +270,25 @@ def test_exact_references_add_nothing_to_standard_errors(monkeypatch: pytest.Mon
         np.testing.assert_allclose(error, alone.standard_error[key], rtol=0.02)
 
 
+@pytest.mark.parametrize("planted", [False, True])
+def test_the_way_to_the_solution_is_no_noise_of_the_references(planted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mean residuals of a linear image after three steps are those at the end. The planted fault leaves earlier ones where they were."""
+    if planted:
+        monkeypatch.setattr(derivative_images.HalvesMean, "plus", lambda mean, change: mean)
+    rng = np.random.default_rng(0)
+    slopes, reference = rng.normal(size=(2, 4, 5, 3)), rng.normal(size=(4, 5, 3))
+    mean, place, step = None, np.zeros(2), np.zeros(2)
+    for moved in (0.0, 0.3, 0.2):
+        residual = np.tensordot(place, slopes, axes=1) - reference
+        weights = derivative_images.LossWeights(residual, np.ones_like(residual), residual, residual)
+        derivatives = derivative_images.HalvesMean(slopes, slopes)
+        mean = derivative_images.mean_residuals(mean, weights, derivatives, step, moved)
+        step = rng.normal(0.0, 0.1, 2)
+        place = place + step
+    assert mean is not None
+    assert np.allclose(mean.one, residual, atol=1e-5) is not planted
+
+
 def test_an_element_that_changes_no_picture_has_an_infinite_standard_error() -> None:
     matrix = MATRIX.copy()
     matrix[:, 1] = 0.0
@@ -457,6 +476,23 @@ def test_derivatives_of_many_steps_leave_the_gradient_less_noise(remember: bool)
             estimate, state = estimator.estimate(made, TRUTH, state, Key(seed))
             states.append(float(estimate.gradient["b"][0]))
     assert bool(np.std(states[40:]) < 0.4 * np.std(states[:8])) is remember
+
+
+@pytest.mark.parametrize("planted", [False, True])
+def test_derivatives_of_many_steps_damp_as_those_of_single_steps(planted: bool) -> None:
+    """A direction of noise alone: σ N falls with the number of steps, and not with its square, which is the planted fault."""
+    hessian, noise, number = np.diag([1.0, 1e-6]), np.diag([0.0, 1.0]), 16
+    lengths, steps = {}, {}
+    for shared in (False, True):
+        optimizer, tree = AveragedNewton(trust_radius=None), {"x": np.zeros(2)}
+        state = optimizer.init(tree)
+        for step in range(1, number + 1):
+            matrix = noise / step if shared else noise
+            capabilities = Hessian(hessian), HessianNoise(matrix, shared and not planted)
+            steps, state = optimizer.update(Estimate(0.0, {"x": np.array([0.0, 1e-3])}, capabilities), state, tree)
+        lengths[shared] = abs(steps["x"][1])
+    ratio = lengths[True] / lengths[False]
+    assert ratio > 4.0 if planted else 0.5 < ratio < 2.0
 
 
 def test_widths_stay_within_the_bounds() -> None:
