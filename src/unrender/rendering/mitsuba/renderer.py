@@ -72,6 +72,7 @@ class MitsubaRenderer:
         self.max_depth = self.light_paths.max_depth
         self.notices = (
             *self.light_paths.notices,
+            *self.pair.loaded().graph.missing_attributes(),
             *merge_notices(keys, self.pair.loaded().equal),
             *mask_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), keys),
             *(f"{name}: the moving sphere is rendered as a mesh" for name in self.pair.loaded().meshed),

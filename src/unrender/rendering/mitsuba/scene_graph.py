@@ -84,10 +84,22 @@ class ObjectGraph:
         return [
             node
             for node in self.nodes
-            if node.class_name() == "MeshAttribute"
-            and re.search(r'name = "(.*)"', str(node))[1] == name  # pyright: ignore[reportOptionalSubscript]
-            and any(shape in chain for chain in self.chains(node))
+            if _attribute(node) == name and any(shape in chain for chain in self.chains(node))
         ]
+
+    def missing_attributes(self) -> list[str]:
+        """Return one notice for each attribute that a texture reads from a shape without it. Mitsuba reads 0 there, in silence."""
+        lines = []
+        for node in self.nodes:
+            if not (name := _attribute(node)):
+                continue
+            holders = (next((x for x in chain if isinstance(x, mi.Shape)), None) for chain in self.chains(node))
+            missing = {x.id() for x in holders if x is not None and not np.any(x.has_attribute(name))}
+            lines += [
+                f"{shape}: it has no attribute {name}, which a texture of its material reads as 0; store it in the mesh's PLY file"
+                for shape in sorted(missing)
+            ]
+        return list(dict.fromkeys(lines))
 
     def chains(self, node: Any, above: tuple[Any, ...] = ()) -> Iterator[list[Any]]:
         """Yield every chain of objects from `node` up to the scene. `above` contains the nodes already visited."""
@@ -131,6 +143,12 @@ class ObjectGraph:
                         f"scene: the {kind} of {name} ({item.class_name()}) is hidden from mitsuba.traverse, so its previous state is "
                         "unknown; declare it in the plugin's traverse(), or use --method plain"
                     )
+
+
+def _attribute(node: Any) -> str:
+    """Return the attribute of shapes that a texture reads; "" for other objects."""
+    match = re.search(r'name = "(.*)"', str(node)) if node.class_name() == "MeshAttribute" else None
+    return "" if match is None else match[1]
 
 
 def _held(owner: Any) -> list[tuple[str, Any]]:
