@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -209,7 +210,8 @@ def ellipsoids(folder: Path) -> Any:
 def distances(folder: Path) -> Any:
     axis = np.linspace(-0.5, 0.5, 6)
     z, y, x = np.meshgrid(axis, axis, axis, indexing="ij")
-    return mi.TensorXf((np.sqrt(x * x + y * y + z * z) - 0.35).astype(np.float32)[..., None])
+    box = np.maximum(np.maximum(abs(x) - 0.35, abs(y) - 0.25), abs(z) - 0.15)  # a ball would hide rotations
+    return mi.TensorXf(box.astype(np.float32)[..., None])
 
 
 def centred(folder: Path) -> Any:
@@ -277,10 +279,37 @@ def merge(folder: Path) -> Description:
     )
 
 
+_ANGLES, _PARTS = 4, 8
+_MEASURED = {
+    "description": np.frombuffer(b"grey", np.uint8),
+    "phi_i": np.zeros(1, np.float32),
+    "theta_i": np.linspace(0.0, 0.5 * np.pi, _ANGLES, dtype=np.float32),
+    "ndf": np.ones((2, _PARTS), np.float32),
+    "sigma": np.ones((2, _PARTS), np.float32),
+    "vndf": np.ones((1, _ANGLES, _PARTS, _PARTS), np.float32),
+    "rgb": np.full((1, _ANGLES, 3, _PARTS, _PARTS), 0.3, np.float32),
+    "luminance": np.ones((1, _ANGLES, _PARTS, _PARTS), np.float32),
+    "jacobian": np.ones(1, np.uint8),
+}
+"""Fields of a grey, isotropic measurement (Dupuy and Jakob 2018)."""
+
+
+def tensor_file(fields: Mapping[str, np.ndarray]) -> bytes:
+    """Return Mitsuba's tensor file of arrays of bytes and of single precision."""
+    kinds, head, body = {"uint8": 1, "float32": 10}, b"tensor_file\0\1\0" + struct.pack("<I", len(fields)), b""
+    start = len(head) + sum(13 + len(name) + 8 * x.ndim for name, x in fields.items())
+    for name, x in fields.items():
+        head += struct.pack("<H", len(name)) + name.encode()
+        head += struct.pack("<HBQ", x.ndim, kinds[str(x.dtype)], start + len(body))
+        head += struct.pack(f"<{x.ndim}Q", *x.shape)
+        body += x.tobytes()
+    return head + body
+
+
 def measured(polarized: bool) -> Build:
     def build(folder: Path) -> Description:
         path = folder / "measured.bsdf"
-        path.write_bytes(b"tensor_file\0\1\0" + b"\0" * 8)
+        path.write_bytes(tensor_file(_MEASURED))
         return scene(
             ball={
                 "type": "sphere",

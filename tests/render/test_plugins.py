@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -184,3 +185,24 @@ def test_normals_without_a_direction_are_refused_with_what_to_give() -> None:
 
 def test_texture_coordinates_that_a_mesh_does_not_have_are_refused() -> None:
     assert "it holds no values" in refusal(built("obj"), "ball.vertex_texcoords")
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "sphere", "with it"])
+def test_an_attribute_that_a_shape_lacks_is_named(kind: str) -> None:
+    """Mitsuba renders it black, in silence."""
+    texture = {"type": "mesh_attribute", "name": "vertex_color"}
+    material = {"type": "diffuse", "reflectance": texture}
+    shape: Any = {"type": kind, "bsdf": material}
+    if kind == "with it":
+        properties = mi.Properties()
+        properties["bsdf"] = mi.load_dict(material)
+        shape = mi.Mesh("sheet", 3, 1, props=properties)
+        values = mi.traverse(shape)
+        values["vertex_positions"], values["faces"] = [0, 0, 0, 1, 0, 0, 0, 1, 0], [0, 1, 2]
+        values.update()
+        shape.add_attribute("vertex_color", 3, [0.5] * 9)
+    camera = {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}}
+    described = {"type": "scene", "camera": camera, "sheet": shape, "sky": {"type": "constant"}}
+    found = [line for line in MitsubaRenderer(lambda: described, 2).notices if "vertex_color" in line]
+    expected = "sheet: it has no attribute vertex_color, which a texture of its material reads as 0"
+    assert [line.split(";")[0] for line in found] == ([] if kind == "with it" else [expected])

@@ -94,7 +94,7 @@ class ObjectGraph:
             if not (name := _attribute(node)):
                 continue
             holders = (next((x for x in chain if isinstance(x, mi.Shape)), None) for chain in self.chains(node))
-            missing = {x.id() for x in holders if x is not None and not np.any(x.has_attribute(name))}
+            missing = {x.id() for x in holders if x is not None and not dr.any(x.has_attribute(name))}
             lines += [
                 f"{shape}: it has no attribute {name}, which a texture of its material reads as 0; store it in the mesh's PLY file"
                 for shape in sorted(missing)
