@@ -1,4 +1,5 @@
-"""Long campaigns of power cuts, kills and signals. `UNRENDER_CAMPAIGN=N` sets the number of faults of each kind; else they are skipped.
+"""Long campaigns of power cuts, kills and signals. `UNRENDER_CAMPAIGN=N` sets the number of faults of each kind; else
+they are skipped. `UNRENDER_CAMPAIGN_SEED` chooses other moments.
 
     UNRENDER_CAMPAIGN=50 python -m pytest -o faulthandler_timeout=0 tests/campaigns -s
 
@@ -22,7 +23,7 @@ from tests.campaigns.machine import Victims
 
 COUNT = int(os.environ.get("UNRENDER_CAMPAIGN", "0"))
 STEPS = 60
-SEED = 0
+SEED = int(os.environ.get("UNRENDER_CAMPAIGN_SEED", "0"))
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not COUNT, reason="set UNRENDER_CAMPAIGN to the number of faults"),
