@@ -30,6 +30,8 @@ _MEMORY = 0.8
 """Decay of the mean correlation of successive gradients."""
 _PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
 """Number of independent pairs of gradients with the same variance in a plain mean."""
+_LASTING_ERRORS = 2.0
+"""Standard errors 1/√n of the lasting fraction that are added to it before growth is taken back."""
 _MOST_GROWTH = 3.0
 """Largest rate relative to the first one, and relative to the growth of the parameters."""
 _REFINED = 0.3
@@ -43,11 +45,15 @@ class Agreement(TransformState):
     Attributes:
         correlation: {key: ρ, the mean correlation of successive gradients}.
         log_rate: {key: logarithm of the factor of the rate}.
+        log_most: {key: the same, if all agreement lasts}.
+        log_least: {key: the same, as if gradients had not agreed since the last change of smoothing}.
         sizes: {key: root mean square of the first parameters, 1 where that is 0, and at least the first rate}.
     """
 
     correlation: dict[str, float]
     log_rate: dict[str, float]
+    log_most: dict[str, float]
+    log_least: dict[str, float]
     sizes: dict[str, float]
 
 
@@ -62,6 +68,11 @@ class AgreementRate(StepTransform):
     long steps, and decays as t^-0.6 once they are noise. After T steps it grows at most as a power of t. ρ is multiplied by the fraction
     of the agreement that is not reused noise (`SmoothingChange.confirmed` and `lasting`). s = 1/(3 √n) is the standard error of ρ for
     random gradients of n elements.
+
+    Agreement that does not last comes from steps back and forth around the minimum, and what it added to the rate is taken back: the factor
+    of the rate is f η + (1 − f) η', where f is the lasting fraction plus two standard errors, 2/√n, and η' follows the same rule with
+    min(ρ, 0) in place of ρ since the last change of smoothing. Directions that no pixel determines would otherwise follow a random walk
+    with long steps.
 
     The rate is at most 3 times the first, times the growth of the parameter. At a step that reduces smoothing it is at most 0.3 times the
     first. Needs a `FittedSobolev` before it, which stores the last gradient.
@@ -86,21 +97,25 @@ class AgreementRate(StepTransform):
             key: max(_root_mean_square(x, arrays.number(arrays.total(x * x))) or 1.0, learning_rates[key])
             for key, x in parameters.items()
         }
-        return Agreement(dict.fromkeys(parameters, 1.0), dict.fromkeys(parameters, 0.0), sizes)
+        return Agreement(dict.fromkeys(parameters, 1.0), *(dict.fromkeys(parameters, 0.0) for _ in range(3)), sizes)
 
     def update(self, update: StepUpdate, state: Agreement) -> tuple[StepUpdate, Agreement]:
         """Adapt the learning rates. Waits for the device, because correlations and sizes of the parameters are read."""
         previous = update.require_previous("AgreementRate")
         if update.made > 0:
-            correlation, log_rate = {}, {}
+            correlation, log_rate, log_most, log_least = {}, {}, {}, {}
             for key, (cosine, size) in _measured(update.gradient, previous, update.parameters).items():
                 rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
                 fit, shape = update.smoothing.get(key, SMOOTHING_UNCHANGED), arrays.shape(update.gradient[key])
-                change = self._change(min(rho, rho * min(fit.confirmed, fit.lasting)), shape, update.made)
                 grown = 1.0 if key in self.unsized else max(1.0, size / state.sizes[key])
-                most = math.log(_MOST_GROWTH * grown if fit.gain == 1.0 else _REFINED if fit.gain > 1.0 else 1.0)
-                log_rate[key] = min(state.log_rate[key] + change, most)
-            state = replace(state, correlation=correlation, log_rate=log_rate)
+                limit = math.log(_MOST_GROWTH * grown if fit.gain == 1.0 else _REFINED if fit.gain > 1.0 else 1.0)
+                change = self._change(min(rho, rho * min(fit.confirmed, fit.lasting)), shape, update.made)
+                before = state.log_most if fit.gain == 1.0 else state.log_rate
+                most = log_most[key] = min(before[key] + change, limit)
+                least = state.log_least[key] + self._change(min(rho, 0.0), shape, update.made)
+                least = log_least[key] = min(least, most) if fit.gain == 1.0 else most
+                log_rate[key] = _between(least, most, fit.lasting, math.prod(shape))
+            state = replace(state, correlation=correlation, log_rate=log_rate, log_most=log_most, log_least=log_least)
         factors = {key: update.factors.get(key, 1.0) * math.exp(state.log_rate[key]) for key in update.gradient}
         return replace(update, factors=factors), state
 
@@ -116,6 +131,12 @@ class AgreementRate(StepTransform):
         rise = max(0.0, 2.0 * (correlation - error) - 1.0) * min(1.0, _EARLY / made)
         change = self.growth * (rise - 2.0 * max(0.0, -correlation - error))
         return change - power / (made + _DELAY)
+
+
+def _between(least: float, most: float, lasting: float, count: int) -> float:
+    """Return the logarithm of f η + (1 − f) η', for the logarithms of η' and η, the lasting fraction and the number of elements."""
+    share = min(1.0, lasting + _LASTING_ERRORS / math.sqrt(max(1, count)))
+    return math.log((1.0 - share) * math.exp(least) + share * math.exp(most))
 
 
 def _root_mean_square(x: Array, square: float) -> float:
