@@ -10,6 +10,7 @@ import pytest
 import unrender as ur
 from unrender.core.random import Key
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs.field_directions import _Adjoints
 from unrender.runs.least_squares import NumbersCheck, _Fit, _judged, check_numbers
 from unrender.runs.numbers import Differences, Numbers
 
@@ -276,6 +277,24 @@ def test_a_number_that_a_texture_can_replace_is_told_with_it():
     assert list(found.undetermined) == ["a"]
     assert "together with texture" in found.undetermined["a"]
     assert not check_numbers(made, values, made.initial_values(), FAR).undetermined  # planted: the texture is fixed
+
+
+@pytest.mark.parametrize("own", [True, False])
+@pytest.mark.parametrize("reference_noise", [0.25 * NOISE, NOISE])
+def test_a_factor_of_a_texture_is_told_with_it(monkeypatch: pytest.MonkeyPatch, reference_noise: float, own: bool):
+    """Pictures that blur the texture, as a diffuse surface blurs a sky, leave other directions approximate."""
+    random = np.random.default_rng(2)
+    texture = random.uniform(0.05, 1.0, (4, 4, 3))
+    cells = random.uniform(0.5, 1.0, (ROWS, 1)) * (1.0 + 0.3 * random.normal(0.0, 1.0, (ROWS, 48))) / 12.0
+    truth = {"scale": np.array(2.0), "texture": texture}
+    renderer = AnalyticRenderer(truth, np.column_stack([cells @ texture.ravel(), cells]), 0.5, noise=0.02, shape=SHAPE)
+    view = ur.View((renderer.exact(truth) + random.normal(0.0, reference_noise, (*SHAPE, 3))).astype(np.float32))
+    made = ur.Problem(renderer, [ur.Parameter(key, initial=0.5 * x) for key, x in truth.items()], [view])
+    values = {key: x.astype(np.float32) for key, x in renderer.values(["scale", "texture"]).items()}
+    if not own:  # planted fault
+        monkeypatch.setattr(_Adjoints, "scaled", lambda self: {"texture": np.zeros((0, 4, 4, 3))})
+    found = check_numbers(made, values, made.initial_values(), FAR, ur.sensitivity(made, values))
+    assert ("together with texture" in found.undetermined.get("scale", "")) is own
 
 
 def test_the_step_of_a_number_beside_a_texture_is_that_of_all_unknowns():

@@ -46,7 +46,7 @@ def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tupl
         and numbers.problem.unknowns[key].prior is None
         and values.any()
     ]
-    states = 2 * _ROUNDS * (1 + numbers.count)
+    states = 2 * _ROUNDS * (1 + numbers.count) + 2 * len(chosen)
     return tuple(chosen) if states * sum(sensitivities[key].size for key in chosen) <= _MOST_VALUES else ()
 
 
@@ -60,8 +60,9 @@ def beside_fields(
 ) -> tuple[Numbers, Differences] | None:
     """Return numbers with directions of textures and grids that trade off against them, and the differences along both.
 
-    The first directions approximate, by one adjoint, the picture changes of the numbers and of the residual. The next ones
-    approximate the remainder. There are none if the time is over, or if no texture or grid changes the pictures.
+    The first directions are each texture's and grid's own values, which trade off exactly against a factor of them, such as the scale of
+    an environment map. The next ones approximate, by one adjoint, the picture changes of the numbers and of the residual, and then the
+    remainder. There are none if the time is over, or if no texture or grid changes the pictures.
 
     Args:
         numbers: the numbers alone.
@@ -84,8 +85,11 @@ def beside_fields(
         started = time.perf_counter()
         if not len(targets) or started + longest > until:
             break
-        made = made.beside(adjoints.of(targets))
-        columns = np.eye(len(made.point))[:, -len(targets) :]
+        directions = adjoints.of(targets)
+        if index == 0:
+            directions = {k: np.concatenate([x, directions[k]]) for k, x in adjoints.scaled().items()}
+        before_these, made = len(made.point), made.beside(directions)
+        columns = np.eye(len(made.point))[:, before_these:]
         first = made.differences(_FIRST * columns, key.fold(3 + 2 * index))
         changes = np.sqrt(np.maximum(*first.squares()) / first.one[0].size)
         factors = np.clip(change / np.maximum(changes, 1e-30), 1.0 / _CHANGE, 1.0 / _FIRST)
@@ -96,7 +100,7 @@ def beside_fields(
         active = active[squares[active] < _SHRINKS * before[active]]
         targets = remainder.average()[active]
         longest = max(longest, time.perf_counter() - started)
-    return _independent(made, differences, _joined(parts)) if parts else None
+    return _independent(made, differences, _joined(parts), len(keys)) if parts else None
 
 
 def _longer(differences: Differences, rows: int) -> Differences:
@@ -121,23 +125,39 @@ def _remainder(numbers: Differences, of: Differences) -> Differences:
     return Differences(numbers.directions, one, other)
 
 
-def _independent(
-    numbers: Numbers, differences: Differences, of_fields: Differences
-) -> tuple[Numbers, Differences] | None:
-    """Return the numbers with those sums of directions that change the pictures independently, and all differences."""
-    matrix = of_fields.matrix()
+def _sums(matrix: np.ndarray, first: int) -> np.ndarray | None:
+    """Return sums (K, k) of K directions that change the pictures independently; None for none.
+
+    The first ones are combined among themselves only, since sums with others would not trade off exactly.
+
+    Args:
+        matrix: products of the pictures' changes along the directions, (K, K).
+        first: number of the first directions.
+    """
     if not np.isfinite(matrix).all():
         return None
-    eigenvalues, vectors = np.linalg.eigh(matrix)
-    used = eigenvalues > max(_INDEPENDENT * eigenvalues[-1], 0.0)
-    if not used.any():
+    least, parts = _INDEPENDENT * float(np.linalg.eigvalsh(matrix)[-1]), []
+    among = np.linalg.pinv(matrix[:first, :first], rcond=_INDEPENDENT, hermitian=True) @ matrix[:first, first:]
+    own, others = np.eye(len(matrix))[:, :first], np.eye(len(matrix))[:, first:]
+    for basis in (own, others - own @ among):
+        eigenvalues, vectors = np.linalg.eigh(basis.T @ matrix @ basis)
+        used = eigenvalues > max(least, 0.0)
+        parts.append(basis @ vectors[:, used] * np.sqrt(matrix.trace() / len(matrix) / eigenvalues[used]))
+    sums = np.concatenate(parts, axis=1)
+    return sums if sums.size else None
+
+
+def _independent(
+    numbers: Numbers, differences: Differences, of_fields: Differences, first: int
+) -> tuple[Numbers, Differences] | None:
+    """Return the numbers with those sums of directions that change the pictures independently, and all differences."""
+    if (sums := _sums(of_fields.matrix(), first)) is None:
         return None
-    sums = vectors[:, used] * np.sqrt(matrix.trace() / len(matrix) / eigenvalues[used])
     factors = (of_fields.directions @ sums)[numbers.count :]
     longest = np.maximum(np.abs(factors).max(axis=0), 1.0)
     fields = {key: np.tensordot((factors / longest).T, x, axes=1) for key, x in numbers.fields.items()}
     alone = numbers.alone()
-    count = int(used.sum())
+    count = sums.shape[1]
     made, one, other = (
         alone.beside(fields),
         *(np.tensordot((sums / longest).T, x, axes=1) for x in (of_fields.one, of_fields.other)),
@@ -185,6 +205,15 @@ class _Adjoints:
         lengths = [np.abs(x).reshape(len(x), -1).max(axis=1) / self._reach[key] for key, x in directions.items()]
         longest = np.maximum(np.max(lengths, axis=0), 1e-300)
         return {key: x / longest.reshape(-1, *(1,) * (x.ndim - 1)) for key, x in directions.items()}
+
+    def scaled(self) -> dict[str, np.ndarray]:
+        """Return {key: (k, *shape)}: for each of the k textures and grids its own values, scaled so that their largest is that allowed."""
+        values = {key: np.asarray(self._numbers.values[key], np.float64) for key in self._reach}
+        scales = [self._reach[key] / max(float(np.abs(x).max()), 1e-300) for key, x in values.items()]
+        return {
+            key: np.stack([scale * x * (key == of) for of, scale in zip(values, scales, strict=True)])
+            for key, x in values.items()
+        }
 
 
 def _diagonal(sensitivity: np.ndarray) -> np.ndarray:

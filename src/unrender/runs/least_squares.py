@@ -16,7 +16,7 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.display import formatting
-from unrender.runs.field_directions import beside_fields
+from unrender.runs.field_directions import beside_fields, fields_of
 from unrender.runs.numbers import Differences, Numbers
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
@@ -43,6 +43,8 @@ _CHANNELS = 3.0
 """Channels that share their noise."""
 _ERRORS = 3.0
 """Standard errors by which the change along a direction must exceed its noise."""
+_ROUNDING = 1e-10
+"""Square of a change, relative to the largest, that rounding may leave."""
 _DOUBTFUL = 0.1
 """Standard error, as a share of a number's size, from which on the references leave it open."""
 _FURTHER, _STEP_ERRORS = 0.05, 4.0
@@ -168,6 +170,8 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
     if not (np.isfinite(matrix).all() and matrix.any()):
         return NumbersCheck()  # pictures that are not finite, or that no number changes
     now = time.perf_counter()
+    if now > until and fields_of(numbers, sensitivities):
+        return NumbersCheck(unchecked=numbers.keys)  # errors beside known textures would be too small
     half = now + 0.5 * (until - now) if math.isfinite(until) else until
     if beside := beside_fields(numbers, differences, sensitivities, change, key.fold(_FIELDS), half):
         numbers, differences = beside
@@ -223,7 +227,7 @@ class _Fit:
         """Fit differences along directions to two independent residuals (2, P, 3)."""
         matrix, (squares, errors) = differences.matrix(), differences.squares()
         # Along these no change is seen: the variance is at least that of the largest change that noise may hide.
-        hidden = squares <= _ERRORS * errors
+        hidden = squares <= _ERRORS * errors + _ROUNDING * float(np.abs(squares).max())
         matrix[hidden, :] = matrix[:, hidden] = 0.0
         least = 1e-12 * float(np.abs(squares).max()) + 1e-200
         np.fill_diagonal(matrix, np.where(hidden, np.maximum(squares, 0.0) + _ERRORS * errors + least, np.diag(matrix)))
