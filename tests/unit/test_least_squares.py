@@ -295,6 +295,7 @@ def test_a_factor_of_a_texture_is_told_with_it(monkeypatch: pytest.MonkeyPatch, 
         monkeypatch.setattr(_Adjoints, "scaled", lambda self: {"texture": np.zeros((0, 4, 4, 3))})
     found = check_numbers(made, values, made.initial_values(), FAR, ur.sensitivity(made, values))
     assert ("together with texture" in found.undetermined.get("scale", "")) is own
+    assert found.errors["scale"][0] <= 2.0 or np.isinf(found.errors["scale"][0])  # beyond its size it has none
 
 
 def test_the_step_of_a_number_beside_a_texture_is_that_of_all_unknowns():

@@ -294,7 +294,8 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
                 f"{key}: the run ended before it settled: a least-squares step from its end moves it by {_numbers(fit.step[of])}, with the "
                 f"standard error {_numbers(of_step[of])}; give more seconds, or resume the run"
             )
-    errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (error, fit.step, fit.own))
+    known = np.where(error > sizes, np.inf, error)  # beyond its own size an error is not linear
+    errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, fit.own))
     return NumbersCheck(undetermined, unfinished, errors, steps, noise)
 
 
