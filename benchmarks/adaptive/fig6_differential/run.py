@@ -198,7 +198,7 @@ def run(
             found["variance"][name].append(point)
             print(name, point, flush=True)
         if name in DESCENTS and "descents" in part:
-            label = f"{name}, falling rate" if falling else name
+            label = f"{name}, {steps} steps, falling rate" if falling else name
             found["descents"] = {label: descents(problem, count, rate, steps, seeds, kinds, falling)}
         yield found
 
