@@ -73,6 +73,13 @@ def test_stated_errors_contain_the_distance_from_the_solution():
     assert scores_of_early_ends(steps=False).std() > 2.0  # planted: the references' noise alone
 
 
+@pytest.mark.parametrize("values", [{"a": np.zeros(3)}, {"a": np.zeros(2), "b": np.zeros(())}])
+def test_values_of_other_keys_or_shapes_are_one_line(values: dict[str, np.ndarray]):
+    with pytest.raises(ur.InputError) as caught:
+        ur.runs.uncertainty(problem(MATRIX), values)
+    assert "\n" not in str(caught.value)
+
+
 def test_the_noise_of_the_check_is_no_distance_and_no_number_is_known_better_than_it():
     errors, steps, noise = ({"a": np.array(x)} for x in ([3.0, 3.0, np.inf], [5.0, 0.5, 1.0], [4.0, 4.0, 1.0]))
     check = NumbersCheck(errors=errors, steps=steps, noise=noise)
