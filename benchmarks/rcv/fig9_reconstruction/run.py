@@ -237,12 +237,15 @@ def table(record: Record) -> str:
             row = f"{{problem}} | {{loss}} | {{seconds:g}} s{clock} | {method} ({{spp}} spp, {{rate:g}}) | {{final!m}} | {{best:.3f}}"
             rows.append([markdown.fill(row, found), *others])
     head = "problem | loss | budget | method (spp, rate) | final error | best on the way | × rcv's final | its best at"
+    by_time = markdown.table(f"{head} | rcv gets there at", rows)
+    if "equal steps" not in record:
+        return by_time
     at_equal_steps = markdown.records(
         "at equal steps: problem, loss, image + adjoint | steps | method | rate | final error",
         "{name} | {steps[0]} | {method} | {rate:g} | {final!m}",
-        markdown.named(record.get("equal steps", {}), "name", "methods", "method"),
+        markdown.named(record["equal steps"], "name", "methods", "method"),
     )
-    return markdown.blocks(markdown.table(f"{head} | rcv gets there at", rows), at_equal_steps)
+    return markdown.blocks(by_time, at_equal_steps)
 
 
 def plot(record: Record) -> figures.Figure:
