@@ -78,6 +78,13 @@ def test_a_start_is_kept_where_it_is_near_or_places_have_no_bounds(
     np.testing.assert_allclose(first(plan)["place"], start)
 
 
+def test_a_start_whose_difference_is_noise_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = problem(monkeypatch, [2.0, 7.0])
+    changes = iter([-1e-9, *[-1e-6] * 1000])
+    monkeypatch.setattr(starts, "_squares", lambda *_: (np.full(64, next(changes)), 1.0))
+    assert not any("starts at another place" in reason for reason in method("auto").plan(made).reasons)
+
+
 def test_noise_is_no_better_place(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures that no place changes differ by noise alone."""
     made = problem(monkeypatch, [9.5, 0.5])

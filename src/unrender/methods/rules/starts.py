@@ -56,7 +56,8 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan) -> Plan:
             continue
         if (total := float(squares.sum())) < least:
             best, factor, least, change = place, own, total, first[0] - squares
-    share = least / max(float(first[0].sum()), 1e-300)
+    start = float(first[0].sum())
+    share = max(least, 0.0) / start if start > 0.0 else math.inf  # noise may leave a negative difference
     if not share < _BETTER or not change.mean() > _ERRORS * change.std() / math.sqrt(change.size):
         return plan
     chosen = {**best, **{key: factor * initial[key] for key in lights if factor != 1.0}}
