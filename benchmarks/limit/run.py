@@ -2,7 +2,8 @@
 
 N paths in each pixel have the information N Jᵀ Σ⁻¹ J about the unknowns. J is the derivative of the pixels at the truth, Σ the covariance
 of a pixel's channels for one path. With the squared error of the start as the variance of a prior, C, no estimate has a mean squared error
-below tr((N Jᵀ Σ⁻¹ J + C⁻¹)⁻¹) / n. The efficiency of a run is the number of paths with which the limit has the run's error, over the
+below tr((N Jᵀ Σ⁻¹ J + C⁻¹)⁻¹) / n that takes the unknowns as independent. Neighbouring texels are alike, and `auto` smooths them: it may be
+below this limit. The efficiency of a run is the number of paths with which the limit has the run's error, over the
 number of paths that the run has traced for images and adjoints. It does not depend on the machine.
 
 J is from central differences of images with equal random numbers. The product of two independent estimates of J has no bias, but noise may
@@ -192,7 +193,10 @@ def table(record: Record) -> str:
         efficiency = [f"{low:.2g} to {high:.2g} ({step})" for step, (high, low) in entry["efficiency"].items()]
         auto, high, low = entry["end"]
         rows.append([name, f"{entry['paths']:.0f}", f"{auto:.3f}", f"{low:.3f} to {high:.3f}", *efficiency])
-    text = "{steps} steps, {seeds} seeds, medians. Efficiency: paths of the limit over those of `auto`, to the error of `auto`."
+    text = (
+        "{steps} steps, {seeds} seeds, medians. Efficiency: paths of the limit over those of `auto`, to the error of `auto`; from 1 on, "
+        "`auto` is below the limit, which takes texels as independent."
+    )
     head = "problem | paths in a pixel | auto at the end | limit | efficiency (steps) | later | at the end"
     return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
 
