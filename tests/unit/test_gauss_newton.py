@@ -478,23 +478,6 @@ def test_derivatives_of_many_steps_leave_the_gradient_less_noise(remember: bool)
     assert bool(np.std(states[40:]) < 0.4 * np.std(states[:8])) is remember
 
 
-@pytest.mark.parametrize("planted", [False, True])
-def test_derivatives_of_many_steps_damp_as_those_of_single_steps(planted: bool) -> None:
-    """A direction of noise alone: σ N falls with the number of steps, and not with its square, which is the planted fault."""
-    hessian, noise, number = np.diag([1.0, 1e-6]), np.diag([0.0, 1.0]), 16
-    lengths, steps = {}, {}
-    for shared in (False, True):
-        optimizer, tree = AveragedNewton(trust_radius=None), {"x": np.zeros(2)}
-        state = optimizer.init(tree)
-        for step in range(1, number + 1):
-            matrix = noise / step if shared else noise
-            capabilities = Hessian(hessian), HessianNoise(matrix, shared and not planted)
-            steps, state = optimizer.update(Estimate(0.0, {"x": np.array([0.0, 1e-3])}, capabilities), state, tree)
-        lengths[shared] = abs(steps["x"][1])
-    ratio = lengths[True] / lengths[False]
-    assert ratio > 4.0 if planted else 0.5 < ratio < 2.0
-
-
 def test_widths_stay_within_the_bounds() -> None:
     """An element that hardly changes the picture has no wider differences than an eighth of its range."""
     renderer = AnalyticRenderer(TRUTH, MATRIX * np.array([1.0, 1.0, 1e-4]), 0.1, 0.1, shape=(4, 5))

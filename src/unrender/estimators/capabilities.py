@@ -87,12 +87,10 @@ class HessianNoise(Capability):
     Attributes:
         matrix: (n, n), positive semidefinite: Σ ℓ'' N Nᵀ over pixels, with the noise N of the derivative images. Damping by it prevents
             steps along noisy directions.
-        shared: whether all steps share the noise, as those of one mean do. Means over steps do not reduce it then.
     """
 
     name: ClassVar[str] = "hessian_noise"
     matrix: Array
-    shared: bool = False
 
 
 @dataclass(frozen=True)

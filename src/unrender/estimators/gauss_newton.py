@@ -177,7 +177,7 @@ class GaussNewton:
             trees.unravel(found.gradient, parameters),
             (
                 Hessian(found.hessian),
-                HessianNoise(found.noise, self.remember),
+                HessianNoise(found.noise),
                 GradientNoise(found.gradient_noise),
                 ScoreCovariance(found.scores if system.references_have_noise else np.zeros_like(found.scores)),
                 Smoothing(dict(state.widths)),

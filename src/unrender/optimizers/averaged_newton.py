@@ -91,9 +91,9 @@ class AveragedNewton:
     valid where they were made. With exact models of a quadratic loss, the first step is Newton's.
 
     With noisy derivatives (`HessianNoise`, N), the step is (A + σ N)⁻¹ (b − A x), with the mean of N and the sum σ of the models' squared
-    weights, or σ = 1 if all steps share the noise. σ N is what noise would add to A if A were built from the mean derivatives. Directions
-    that consist of noise hardly move until there are enough steps. A + σ N is scaled to a unit diagonal, and the magnitudes of its
-    eigenvalues are at least `damping` times the largest. A damped direction takes more steps to the same solution.
+    weights. σ N is what noise would add to A if A were built from the mean derivatives. Directions that consist of noise hardly move
+    until there are enough steps. A + σ N is scaled to a unit diagonal, and the magnitudes of its eigenvalues are at least `damping` times
+    the largest. A damped direction takes more steps to the same solution.
 
     Parameters that A does not connect take separate steps, each in its own trust region: the minimum of the model for ‖s‖ <= Δ. Lengths
     are in coordinates x / η with each parameter's learning rate η, times the σ of smoothed derivatives or the widths of differences
@@ -158,8 +158,6 @@ class AveragedNewton:
         added, fluctuation, scores = (
             _finite(estimate.get(kind), hessian) for kind in (HessianNoise, GradientNoise, ScoreCovariance)
         )
-        hessian_noise = estimate.get(HessianNoise)
-        shared = hessian_noise is not None and hessian_noise.shared
         scale = coordinate_scales(estimate, state, parameters)
         region = scale * self._reaches(parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
@@ -184,7 +182,7 @@ class AveragedNewton:
             own = region[block]
             radii[block] = radius = self._radius(radii[block].min(), state.step[block] / own, own * gradient[block])
             slope = matrix[both] @ x[block] - target[block]
-            damped = matrix[both] + (1.0 if shared else shares[block].max()) * noise[both]
+            damped = matrix[both] + shares[block].max() * noise[both]
             rough = shares[block].max() * gradient_noise[both]
             step[block] = own * self._step(
                 own[:, None] * damped * own, own * slope, own[:, None] * rough * own, outwards[block], radius
