@@ -49,8 +49,8 @@ def test_noise_of_the_adjoint_would_be_counted_without_separate_paths(monkeypatc
     """Planted: both factors on the same paths, whose product has the variance of the derivative in it."""
     real = module._projections
 
-    def same(problem: Problem, session: Any, parameters: Any, keys: Any, spp: int, key: Any, half: int, views: Any):
-        return real(problem, session, parameters, keys, spp, key, 0, views)
+    def same(problem: Problem, session: Any, parameters: Any, keys: Any, spp: int, key: Any, half: int, *more: Any):
+        return real(problem, session, parameters, keys, spp, key, 0, *more)
 
     monkeypatch.setattr(module, "_projections", same)
     assert z_score() > 8

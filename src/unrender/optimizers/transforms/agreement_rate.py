@@ -97,7 +97,8 @@ class AgreementRate(StepTransform):
             key: max(_root_mean_square(x, arrays.number(arrays.total(x * x))) or 1.0, learning_rates[key])
             for key, x in parameters.items()
         }
-        return Agreement(dict.fromkeys(parameters, 1.0), *(dict.fromkeys(parameters, 0.0) for _ in range(3)), sizes)
+        zeros = dict.fromkeys(parameters, 0.0)
+        return Agreement(dict.fromkeys(parameters, 1.0), zeros, zeros, zeros, sizes)
 
     def update(self, update: StepUpdate, state: Agreement) -> tuple[StepUpdate, Agreement]:
         """Adapt the learning rates. Waits for the device, because correlations and sizes of the parameters are read."""
