@@ -20,6 +20,8 @@ from benchmarks.runner.options import add_options, defaults
 from benchmarks.runner.timing import ratio, turns
 
 ALL = benchmarks()
+LONGEST_NOTES = 40
+"""Lines of notes without the commands of the paper's figures."""
 TOY = ["--seeds", "2", "--tuning-seeds", "1", "--steps", "3", "5", "--rates", "1"]
 
 
@@ -49,6 +51,16 @@ def test_notes_are_dated_by_the_figures_they_speak_of(benchmark: Benchmark) -> N
         record["date"]
     ]
     assert record["command"].startswith(f"python -m benchmarks {benchmark.name}")
+
+
+def test_notes_are_short(benchmark: Benchmark) -> None:
+    notes, heading, commands = (
+        (benchmark.folder / "notes.md").read_text().partition("\nCommands of the paper's figures:\n")
+    )
+    assert len(notes.splitlines()) <= LONGEST_NOTES
+    listed = [line for line in commands.splitlines() if line]
+    assert all(re.fullmatch(r"- .*: `python -m benchmarks .*`", line) for line in listed)
+    assert bool(listed) == bool(heading)
 
 
 def test_every_benchmark_has_a_page(tmp_path: Path) -> None:
