@@ -224,12 +224,63 @@ def test_it_is_stored_and_made_again() -> None:
         ({"estimator": {"type": "Adam"}}, "plan.toml: estimator: Adam is not an estimator"),
         ({"settings": {"map": {"colour": 1}}}, "plan.toml: settings: map: expected parameterisation"),
         ({"settings": {"map": {"preconditioner": {"type": "Adam"}}}}, "plan.toml: settings: map: "),
+        ({"settings": {"map": {"coarse_to_fine": 3}}}, "plan.toml: settings: map: expected a table such as"),
+        ({"settings": {"mop": {"start_factor": 2.0}}}, "plan.toml: settings: mop is not an unknown; did you mean"),
+        ({"settings": 3}, "plan.toml: settings: expected a table of settings by key, got 3"),
+        ({"settings": {"gain": 3}}, "plan.toml: settings: gain: expected parameterisation"),
+        *(
+            ({"settings": {"gain": {"start": start}}}, "plan.toml: settings: gain: start must be a")
+            for start in (3, "a", "ab", {"x": 1}, [float("nan")], [float("inf")], ["a"], [True], [[1.0]])
+        ),
+        (
+            {"settings": {"gain": {"start": [1e39]}}},
+            "plan.toml: settings: gain: start must be at most 3.4e+38, got 1e+39",
+        ),
+        *(
+            (
+                {"settings": {"gain": {"start_factor": factor}}},
+                "plan.toml: settings: gain: start_factor must be a finite number > 0",
+            )
+            for factor in ("ab", float("nan"), 0.0, -1.0, [1.0], True)
+        ),
     ],
 )
 def test_a_plan_that_says_something_else_is_refused_in_one_line(table: Any, words: str) -> None:
     made = problem()
     with pytest.raises(InputError, match=re.escape(words)):
         Plan.from_table(made, method("plain").plan(made).table() | table, "plan.toml")
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"gain": {"start": []}}, "parameter gain: start: expected 1 numbers, got 0"),
+        ({"gain": {"start": [1.0, 2.0]}}, "parameter gain: start: expected 1 numbers, got 2"),
+        ({"gain": {"start": [-50.0]}}, "parameter gain: start: expected numbers of at least 0, got -50 to -50"),
+        (
+            {"map": {"start": [0.5] * 8 + [1.5]}},
+            "parameter map: start: expected numbers of at least 0 and at most 1, got 0.5 to 1.5",
+        ),
+        ({"gain": {"start_factor": 1e38}}, "parameter gain: start_factor: 1e+38 times the initial value is infinite"),
+        ({"gain": {"parameterisation": 3}}, "parameter gain: parameterisation: expected"),
+    ],
+)
+def test_a_plan_with_an_unsuitable_start_is_refused_in_one_line(settings: Any, words: str) -> None:
+    made = problem()
+    plan = Plan.from_table(made, method("plain").plan(made).table() | {"settings": settings}, "plan.toml")
+    for run in (plan.configured, lambda: optimize(made, plan, steps=1, progress=False)):
+        with pytest.raises(InputError, match=re.escape(words)):
+            run()
+
+
+def test_a_start_of_a_plan_is_inside_the_bounds() -> None:
+    made = problem()
+    for settings in ({"start": [0.0] * 4 + [1.0] * 5}, {"start_factor": 8.0}):
+        plan = Plan.from_table(made, method("plain").plan(made).table() | {"settings": {"map": settings}}, "plan.toml")
+        begun = np.asarray(plan.configured().start()["map"])
+        assert (begun > 0.0).all()
+        assert (begun < 1.0).all()
+        np.testing.assert_allclose(begun.max(), 1.0, atol=1e-3)
 
 
 @pytest.mark.parametrize("loss", [losses.L1(), losses.L2(), losses.RelativeL2()])
@@ -375,6 +426,18 @@ def test_lights_far_from_the_references_start_at_a_multiple(
 def test_lights_that_are_near_or_bounded_start_where_they_were_asked_to(monkeypatch: pytest.MonkeyPatch) -> None:
     for made in (lit(monkeypatch, 2.0, 6.0), lit(monkeypatch, 30.0, 40.0, bounded=True)):
         assert all(own.start_factor is None for own in method("auto").plan(made).settings.values())
+
+
+def test_a_light_that_suits_the_loss_keeps_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A light that is far too bright for the squared difference from saturated references has no censored loss."""
+    given = lit(monkeypatch, 3.0, 40.0)
+    values = {**LIT, "map": np.full((3, 3, 1), 0.5), "lamp": np.array([40.0])}
+    reference, reasons = np.minimum(given.renderer.exact(values), 1.0), {}
+    for loss in (losses.L2(), losses.Censored(losses.L2(), 1.0)):
+        made = given.replaced(views=[View(reference)], loss=loss)
+        reasons[made.loss] = method("auto").plan(made).reasons
+    starts = [any(reason.startswith("lights start") for reason in each) for each in reasons.values()]
+    assert starts == [True, False]
 
 
 def test_cameras_take_gauss_newton_steps_unless_images_or_pixels_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

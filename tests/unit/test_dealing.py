@@ -322,6 +322,17 @@ def test_what_cannot_be_dealt_is_refused_in_one_line() -> None:
         pass
 
 
+@pytest.mark.parametrize("own", ["llvm_ad_rgb", "llvm_ad_spectral", None])
+@pytest.mark.parametrize("name", ["scalar_spectral", "scalar_rgb", "llvm_spectral", "llvm", "", "cuda_ad_mono", None])
+def test_workers_have_a_supported_variant(name: Any, own: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("unrender.app.distributed.distribute.current", lambda: own)
+    with (
+        pytest.raises(ur.InputError, match=r"^workers: .*expected 'auto', 'cuda_ad_rgb'.*'llvm_ad_spectral'$"),
+        ur.app.distribute(analytic.problem(views=2), 2, variant=name),
+    ):
+        pass
+
+
 def test_cores_are_shared_by_as_many_workers_as_there_are_views(monkeypatch: pytest.MonkeyPatch) -> None:
     def connect(workers: Workers, name: str, store_bytes: int, most: int) -> Any:
         assert store_bytes == 256 << 20

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from unrender import losses
 from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import starts
@@ -23,9 +24,15 @@ SHAPE, TRUTH = (8, 8), {"place": np.array([2.0, 7.0]), "lamp": np.array([4.0])}
 
 
 def problem(
-    monkeypatch: pytest.MonkeyPatch, start: Any, bounds: Any = (0.0, 10.0), lamp: float = 4.0, **traits: Any
+    monkeypatch: pytest.MonkeyPatch,
+    start: Any,
+    bounds: Any = (0.0, 10.0),
+    lamp: float = 4.0,
+    most: float | None = None,
+    prior: Any = None,
+    **traits: Any,
 ) -> Problem:
-    """Two numbers, by default of the picture's form, and a lamp."""
+    """Two numbers, by default of the picture's form, and a lamp whose upper bound is `most`."""
     matrix = np.random.default_rng(1).uniform(-1.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 3))
     renderer = AnalyticRenderer(TRUTH, matrix, 0.0, 0.3, shape=SHAPE)
     known = renderer.parameters()
@@ -34,8 +41,24 @@ def problem(
         "lamp": dataclasses.replace(known["lamp"], brightness="light"),
     }
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: changed)
-    unknown = [Parameter("place", initial=start, bounds=bounds), Parameter("lamp", initial=lamp, bounds=(0, None))]
+    unknown = [
+        Parameter("place", initial=start, bounds=bounds, prior=prior),
+        Parameter("lamp", initial=lamp, bounds=(0, most)),
+    ]
     return Problem(renderer, unknown, [View(renderer.exact(TRUTH))], truth=TRUTH)
+
+
+def restricted(
+    monkeypatch: pytest.MonkeyPatch, start: Any, lamp: float, loss: losses.Loss, reference: Any, mask: Any = None
+) -> Problem:
+    """The same with images without noise that have no negative values, and another reference."""
+    made = problem(monkeypatch, start, lamp=lamp)
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 3))
+    matrix[:, 0] *= np.linspace(0.0, 1.0, len(matrix))
+    matrix[:, 1] *= np.linspace(1.0, 0.0, len(matrix))
+    renderer = AnalyticRenderer(TRUTH, matrix, 0.0, 0.0, shape=SHAPE)
+    view = View(reference(renderer.exact(TRUTH)), mask=mask)
+    return Problem(renderer, made.parameters, [view], truth=TRUTH, loss=loss)
 
 
 def first(plan: Plan) -> dict[str, np.ndarray]:
@@ -81,7 +104,7 @@ def test_a_start_is_kept_where_it_is_near_or_places_have_no_bounds(
 def test_a_start_whose_difference_is_noise_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     made = problem(monkeypatch, [2.0, 7.0])
     changes = iter([-1e-9, *[-1e-6] * 1000])
-    monkeypatch.setattr(starts, "_squares", lambda *_: (np.full(64, next(changes)), 1.0))
+    monkeypatch.setattr(starts, "_losses", lambda *_: (np.full((4, 64), next(changes)), 1.0))
     assert not any("starts at another place" in reason for reason in method("auto").plan(made).reasons)
 
 
@@ -90,6 +113,69 @@ def test_noise_is_no_better_place(monkeypatch: pytest.MonkeyPatch) -> None:
     made = problem(monkeypatch, [9.5, 0.5])
     monkeypatch.setattr(starts.FreshPictures, "images", lambda *_: [np.random.default_rng(0).normal(size=(4, 64, 3))])
     assert not any("another place" in reason for reason in method("auto").plan(made).reasons)
+
+
+@pytest.mark.parametrize("white", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("lamp", [4.0, 40.0])
+def test_places_are_judged_by_the_loss_of_the_problem(
+    white: float, lamp: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Saturated references say nothing against brighter pictures, so a start with the true place has the least loss."""
+    censored = losses.Censored(losses.L2(), white)
+    made = restricted(monkeypatch, [2.0, 7.0], lamp, censored, lambda image: np.minimum(image, white))
+    plan = method("auto").plan(made)
+    begun, values = first(plan), made.initial_values()
+    own, given = (float(made.loss_value(0, made.renderer.array(made.renderer.exact(x)))) for x in (begun, values))
+    assert own <= 0.5 * given or all(np.array_equal(begun[key], values[key]) for key in values)
+    if lamp == 4.0:
+        assert given < 1e-12  # of rounding
+        assert not any("another place" in reason for reason in plan.reasons)
+
+
+def test_a_far_start_is_left_with_a_loss_of_saturated_references(monkeypatch: pytest.MonkeyPatch) -> None:
+    censored = losses.Censored(losses.L2(), 6.0)
+    made = restricted(monkeypatch, [9.5, 0.5], 4.0, censored, lambda image: np.minimum(image, 6.0))
+    begun = first(method("auto").plan(made))
+    assert np.linalg.norm(begun["place"] - TRUTH["place"]) < 3.5
+
+
+@pytest.mark.parametrize("lamp", [4.0, 0.5])
+def test_masked_pixels_count_nothing(lamp: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The masked half of the reference is of another place, which has less squared difference from the whole reference."""
+    mask = np.ones(SHAPE, np.float32)
+    mask[4:] = 0.0
+
+    def reference(image: np.ndarray) -> np.ndarray:
+        return np.concatenate([image[:4], image[4:] + 100.0])
+
+    made = restricted(monkeypatch, [2.0, 7.0], lamp, losses.L2(), reference, mask)
+    assert not any("another place" in reason for reason in method("auto").plan(made).reasons)
+    far = restricted(monkeypatch, [9.5, 0.5], lamp, losses.L2(), reference, mask)
+    begun = first(method("auto").plan(far))
+    assert np.linalg.norm(begun["place"] - TRUTH["place"]) < 3.5
+    assert begun["lamp"] == pytest.approx(4.0, rel=0.5)
+
+
+def test_lights_stay_within_their_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = problem(monkeypatch, [9.5, 0.5], lamp=0.5, most=2.0)
+    plan = method("auto").plan(made)
+    assert any("another place" in reason for reason in plan.reasons)
+    begun = first(plan)["lamp"]
+    assert begun == pytest.approx(2.0, rel=1e-3)
+    assert begun < 2.0
+    assert optimize(made, plan, steps=1, progress=False).initial["lamp"] < 2.0
+
+
+def test_a_number_with_a_prior_keeps_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = problem(monkeypatch, [9.5, 0.5], prior={"near": 5.0, "std": 100.0})
+    np.testing.assert_allclose(first(method("auto").plan(made))["place"], [9.5, 0.5])
+
+
+def test_limits_of_a_common_factor_keep_each_value_inside() -> None:
+    values = [(np.array([1.0, 4.0, 0.0]), (0.5, 8.0)), (np.array([-2.0]), (-3.0, None))]
+    assert starts._limits(values) == (0.5, 1.5)
+    assert starts._limits([(np.ones(2), (None, None))]) == (1e-2, 1e2)
+    assert starts._limits([]) == (1e-2, 1e2)
 
 
 @pytest.mark.parametrize("role", ["value", "direction"])

@@ -102,8 +102,8 @@ def use(variant: str = "auto") -> str:
         VariantError: the variant does not exist, or this machine cannot run it: no working GPU, no LLVM, or an LLVM that is so old
             that it would abort the process. The message contains the command that installs what is missing.
     """
-    if variant not in ("auto", *VARIANTS):
-        raise VariantError(f"{_unsupported(variant)}{_EXPECTED}")
+    if refusal := unsupported(variant):
+        raise VariantError(refusal)
     mi = _mitsuba()
     chosen = variant
     if variant == "auto":
@@ -142,7 +142,12 @@ def with_colours_of(variant: str, other: str | None) -> str:
     return next(v for v in VARIANTS if v[:4] == variant[:4] and same_colours(v, other or variant))
 
 
-def _unsupported(variant: str) -> str:
+def unsupported(variant: str) -> str:
+    """Return why a name is neither "auto" nor a supported variant, and what was expected, in one line; "" if it is."""
+    return "" if variant in ("auto", *VARIANTS) else f"{_lacking(str(variant))}{_EXPECTED}"
+
+
+def _lacking(variant: str) -> str:
     """Return what a variant lacks, for a message."""
     parts = variant.split("_")
     if parts[0] not in ("scalar", "llvm", "cuda", "metal"):
@@ -225,8 +230,8 @@ def ensure() -> str:
     name = current()
     if name is None:
         return use()
-    if name not in VARIANTS:
-        raise VariantError(f"Mitsuba's variant: {_unsupported(name)}{_EXPECTED}; call unrender.use() instead")
+    if refusal := unsupported(name):
+        raise VariantError(f"Mitsuba's variant: {refusal}; call unrender.use() instead")
     return use(name)
 
 

@@ -107,8 +107,7 @@ class FreshPictures:
     def picture(self, parameters: Mapping[str, np.ndarray] | Tree, problem: Problem | None = None) -> Picture:
         """Render the parameters; `problem` is needed for parameters of another mesh."""
         images = self.images(parameters, problem)
-        parts = [self._losses(frame, of) for frame, of in zip(self.frames, images, strict=True)]
-        losses = np.concatenate(parts, axis=1)
+        losses = self.losses(images)
         # The penalty has no noise, so each part gets an equal share.
         losses += penalty(problem or self._problem, parameters) / losses.shape[1]
         return Picture(tuple(images), losses)
@@ -130,6 +129,12 @@ class FreshPictures:
                 total += arrays.numpy(images).reshape(total.shape)
             images_by_frame.append(total / self._launches)
         return images_by_frame
+
+    def losses(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the pseudo-values (K, N) of the loss without priors and regularizers, from images (K, N, 3) of each frame."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            parts = [self._losses(frame, of) for frame, of in zip(self.frames, images, strict=True)]
+        return np.concatenate(parts, axis=1)
 
     def residual(self, images: Sequence[np.ndarray]) -> float:
         """Return the mean square difference over pixels and channels between images (K, N, 3) of each frame and the references."""

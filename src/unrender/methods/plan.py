@@ -9,6 +9,7 @@ from typing import Any
 
 from unrender.core import tables
 from unrender.core.errors import InputError
+from unrender.core.text import did_you_mean
 from unrender.estimators.base import Estimator
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.transforms.fitted_sobolev import FittedSobolev
@@ -86,7 +87,12 @@ class Plan:
         for name, method in zip(_COMPONENTS, ("estimate", "update"), strict=True):
             if not callable(getattr(made[name], method, None)):
                 raise InputError(f"{where}: {name}: {type(made[name]).__name__} is not an {name}")
-        settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in table.get("settings", {}).items()}
+        given = table.get("settings", {})
+        if not isinstance(given, Mapping):
+            raise InputError(f"{where}: settings: expected a table of settings by key, got {given!r:.60}")
+        if other := next((key for key in given if key not in problem.unknowns), None):
+            raise InputError(f"{where}: settings: {other} is not an unknown{did_you_mean(other, problem.unknowns)}")
+        settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in given.items()}
         return cls(problem, made["estimator"], made["optimizer"], settings)
 
 
@@ -154,8 +160,9 @@ def _settings(table: Any, where: str) -> ParameterSettings:
     made: dict[str, Any] = dict(table)
     if "preconditioner" in made:
         made["preconditioner"] = tables.component(made["preconditioner"], "preconditioner", where=where)
-    if "coarse_to_fine" in made:
-        made["coarse_to_fine"] = tables.build(CoarseToFine, made["coarse_to_fine"])
-    if "start" in made:
-        made["start"] = tuple(made["start"])
-    return ParameterSettings(**made)
+    try:
+        if "coarse_to_fine" in made:
+            made["coarse_to_fine"] = tables.options(CoarseToFine, made["coarse_to_fine"], "{ steps = [100] }")
+        return ParameterSettings(**made)
+    except InputError as error:
+        raise InputError(f"{where}: {str(error).removeprefix('settings: ')}") from error

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from unrender.core import checks
 from unrender.core.errors import InputError, KeyedError
 from unrender.parameterisations.base import Parameterisation
 from unrender.preconditioners.base import Preconditioner
@@ -21,6 +22,8 @@ from unrender.scene.prior import Prior
 from unrender.scene.remeshing import Remeshing
 
 __all__ = ["Parameter", "ParameterSettings", "tied", "ties_of"]
+
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -79,8 +82,11 @@ class ParameterSettings:
         parameterisation: parameterisation or its name; None for no choice.
         preconditioner: linear map of gradients and steps; None for no choice.
         coarse_to_fine: resolutions over the steps; None for no choice.
-        start_factor: factor of the initial values before the first step; None for no choice.
+        start_factor: factor of the initial values before the first step, above 0; None for no choice. The product is moved into the bounds.
         start: values before the first step, in place of the initial ones; None for no choice.
+
+    Raises:
+        InputError: a start that is no list of finite numbers, or another factor.
     """
 
     parameterisation: Parameterisation | str | None = None
@@ -88,6 +94,23 @@ class ParameterSettings:
     coarse_to_fine: CoarseToFine | None = None
     start_factor: float | None = None
     start: tuple[float, ...] | None = None
+
+    def __post_init__(self):
+        if self.start_factor is not None:
+            _single("start_factor", checks.number("settings", "start_factor", self.start_factor, above=0.0))
+        if self.start is None:
+            return
+        if not isinstance(self.start, (list, tuple)):
+            raise InputError(f"settings: start must be a list of numbers, got {self.start!r:.60}")
+        values = tuple(_single("start", checks.number("settings", "start", value)) for value in self.start)
+        object.__setattr__(self, "start", values)
+
+
+def _single(name: str, value: float) -> float:
+    """Return a number. Raises `InputError` for one that is infinite in single precision."""
+    if abs(value) > _LARGEST:
+        raise InputError(f"settings: {name} must be at most {_LARGEST:.3g}, got {value:g}")
+    return value
 
 
 def ties_of(parameters: Sequence[Parameter]) -> tuple[Tie, ...]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from unrender.core import arrays
+from unrender.core import arrays, checks
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.parameterisations.base import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.parameter_errors import ErrorMeasure
@@ -82,6 +84,28 @@ class Unknown:
             return inside
         length = float(np.linalg.norm(arrays.numpy(inside)))
         return inside / arrays.scalar(length, inside) if 0.0 < length < 1e-3 or length > 1e3 else inside
+
+    def placed(self, start: Sequence[float]) -> np.ndarray:
+        """Return a value before the first step from a list of its elements. Raises `InputError` for values outside the bounds."""
+        where, low, high = f"parameter {self.parameter.key}: start", *self.bounds
+        if len(start) != self.initial.size:
+            raise InputError(f"{where}: expected {self.initial.size} numbers, got {len(start)}")
+        values = np.asarray(start, np.float32).reshape(self.initial.shape)
+        below = low is not None and (values < np.float32(low)).any()
+        if below or (high is not None and (values > np.float32(high)).any()):
+            span = f"{values.min():g} to {values.max():g}"
+            raise InputError(f"{where}: expected numbers of {' and '.join(checks.limits(low, high))}, got {span}")
+        return np.asarray(self.project(values), np.float32)
+
+    def multiplied(self, factor: float) -> np.ndarray:
+        """Return the nearest value inside the bounds to a multiple of the initial one. Raises `InputError` if it is infinite."""
+        with np.errstate(over="ignore"):
+            values = np.asarray(self.project(np.float32(factor) * self.initial), np.float32)
+        if not np.isfinite(values).all():
+            raise InputError(
+                f"parameter {self.parameter.key}: start_factor: {factor:g} times the initial value is infinite"
+            )
+        return values
 
     def shape(self, step: int | None = None) -> tuple[int, ...]:
         """Return its shape at a step; None for the scene's."""

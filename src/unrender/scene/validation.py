@@ -176,24 +176,28 @@ def configure(unknown: Unknown, settings: ParameterSettings, info: ParameterInfo
     own = {n: x for n, x in chosen.items() if getattr(unknown.parameter, n) is None}
     changes: dict[str, Any] = dict(own)
     if factor is not None:
-        changes["first"] = np.float32(factor) * unknown.initial
+        changes["first"] = unknown.multiplied(factor)
     if start is not None:
-        if np.shape(start) != (unknown.initial.size,):
-            raise InputError(
-                f"parameter {unknown.parameter.key}: start: expected {unknown.initial.size} numbers, got {np.shape(start)}"
-            )
-        changes["first"] = np.reshape(np.asarray(start, np.float32), unknown.initial.shape)
+        changes["first"] = unknown.placed(start)
     if "parameterisation" in own:
-        pair = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
+        with _about(unknown, "parameterisation"):
+            pair = _check_parameterisation(own["parameterisation"], unknown.bounds, unknown.initial)
         changes |= {"parameterisation": pair[0], "transform": pair[1]}
     if "preconditioner" in own:
         changes["preconditioner"] = _check_preconditioner(unknown.parameter.key, own["preconditioner"], info)
     if "coarse_to_fine" in own:
-        try:
+        with _about(unknown, "coarse_to_fine"):
             _check_resolutions(own["coarse_to_fine"], info)
-        except InputError as error:
-            raise InputError(f"parameter {unknown.parameter.key}: coarse_to_fine: {error}") from error
     return replace(unknown, parameter=replace(unknown.parameter, **own), **changes)
+
+
+@contextmanager
+def _about(unknown: Unknown, field: str) -> Iterator[None]:
+    """Put the parameter and a field before the message of an `InputError`."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"parameter {unknown.parameter.key}: {field}: {error}") from error
 
 
 def _known(index: int, key: Any, known: Mapping[str, ParameterInfo]) -> ParameterInfo:

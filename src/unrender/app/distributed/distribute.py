@@ -15,7 +15,7 @@ from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.ray_hosts import RayHosts
 from unrender.app.distributed.transfer import packed
 from unrender.backend.limits import cores
-from unrender.backend.variant import check_threads, current, same_colours, with_colours_of
+from unrender.backend.variant import check_threads, current, same_colours, unsupported, with_colours_of
 from unrender.core.errors import InputError
 from unrender.scene.problem import Problem
 
@@ -62,7 +62,8 @@ def distribute(
 
     Raises:
         InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; the problem cannot be sent,
-            has too few views, or does not fit a worker's memory; workers are lost repeatedly, or render other colours than this process.
+            has too few views, or does not fit a worker's memory; workers are lost repeatedly; their variant is not supported, or renders
+            other colours than this process.
     """
     _check_colours(variant)
     parsed = workers if isinstance(workers, Workers) else Workers.parse(str(workers), "workers")
@@ -89,7 +90,9 @@ def distribute(
 
 
 def _check_colours(variant: str) -> None:
-    """Raise `InputError` for a variant of workers whose gradients would be those of other pictures than this process's."""
+    """Raise `InputError` for a variant that is not supported, or whose gradients would be those of other pictures than this process's."""
+    if refusal := unsupported(variant):
+        raise InputError(f"workers: {refusal}")
     own = current()
     if variant != "auto" and own is not None and not same_colours(variant, own):
         raise InputError(

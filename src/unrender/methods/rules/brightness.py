@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.methods.rules.constants import Constants
 from unrender.scene.problem import Problem
@@ -32,7 +33,9 @@ def start_factors(problem: Problem, keys: Sequence[str], constants: Constants) -
     halves, so noise does not bias them. The other unknowns are at their start, so factors are no better than these.
 
     A start that is ten times too bright costs Adam more steps than one that is ten times too dark: its second moments remember the first
-    gradients, which are a hundred times as large as the later ones.
+    first gradients, which are a hundred times as large as the later ones.
+
+    The problem's own loss must be less, too. A saturated reference, for example, says nothing against a brighter image.
 
     Args:
         problem: Problem with views and scene.
@@ -42,26 +45,27 @@ def start_factors(problem: Problem, keys: Sequence[str], constants: Constants) -
     if not keys or not problem.loss.pixelwise:
         return {}
     try:
-        factors, change = _least_squares(problem, keys)
+        factors, change, less = _least_squares(problem, keys)
     except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects
         return {}
     far = max((max(f, 1.0 / f) for f in factors.values() if f > 0.0), default=1.0) > constants.far_light
     usable = all(math.isfinite(f) and 1.0 / _LIMIT < f < _LIMIT for f in factors.values())
-    return factors if usable and far and change < _BETTER else {}
+    return factors if usable and far and change < _BETTER and less else {}
 
 
-def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, float], float]:
-    """Return the factors, and the ratio of the mean square residuals with and without them."""
+def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, float], float, bool]:
+    """Return the factors, the ratio of the mean square residuals with and without them, and whether the loss is less with them."""
     start, views = problem.initial_values(), _views(problem)
     pixels = sum(math.prod(problem.sizes[view]) for view in views)
     spp = power_of_two(min(max(_PATHS // pixels, _SPP[0]), _SPP[1]))
     states: list[Mapping[str, np.ndarray]] = [start, *({**start, key: 2.0 * start[key]} for key in keys)]
     count = len(keys)
-    matrix, vector, squares = np.zeros((count, count)), np.zeros(count), 0.0
+    matrix, vector, squares, means = np.zeros((count, count)), np.zeros(count), 0.0, {}
     for view in views:
         own = problem.views[view]
         weight = own.weight * own.pixel_weights(problem.sizes[view]).reshape(*problem.sizes[view], 1)
         halves = [np.stack([render(problem, x, view, spp, seed) for x in states]).astype(np.float64) for seed in _SEEDS]
+        means[view] = (halves[0] + halves[1]) / 2.0
         one, other = ((images[1:] - images[0]).reshape(count, -1) for images in halves)
         residuals = [(np.asarray(own.reference) - images[0]) * weight for images in halves]
         matrix += (one * np.broadcast_to(weight, residuals[0].shape).reshape(-1)) @ other.T
@@ -71,7 +75,14 @@ def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, flo
     step = np.linalg.solve(matrix, vector)
     after = squares - 2.0 * float(step @ vector) + float(step @ matrix @ step)
     factors = {key: 1.0 + float(x) for key, x in zip(keys, step, strict=True)}
-    return factors, max(after, 0.0) / squares if squares > 0.0 else 1.0
+    less = _loss(problem, means, step) < _loss(problem, means, np.zeros(count))
+    return factors, max(after, 0.0) / squares if squares > 0.0 else 1.0, less
+
+
+def _loss(problem: Problem, images: Mapping[int, np.ndarray], step: np.ndarray) -> float:
+    """Return the loss of views from the images of all states and the change of each light's factor."""
+    changed = {view: of[0] + np.tensordot(step, of[1:] - of[0], 1) for view, of in images.items()}
+    return sum(arrays.number(problem.loss_value(view, problem.renderer.array(x))) for view, x in changed.items())
 
 
 def _views(problem: Problem) -> list[int]:

@@ -15,6 +15,7 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules.traits import Traits
 from unrender.parameterisations.base import Bounds
 from unrender.scene.parameter import ParameterSettings
+from unrender.statistics.paired_losses import difference
 
 __all__ = ["best_start"]
 
@@ -23,18 +24,19 @@ _PER_DIMENSION, _MOST_PLACES = 8, 24
 _PATHS, _NUMBER = 1 << 15, 3
 """Paths of one picture, and index of their random numbers."""
 _BETTER, _ERRORS = 0.5, 4.0
-"""Ratio of the mean square differences from the references below which another place is taken, and standard errors of the change."""
+"""Ratio of the losses below which another place is taken, and standard errors of their difference."""
 _ROTATION = "rotation"
 """Part of the keys of angles, in radians."""
 _FACTORS = (1e-2, 1e2)
-"""Limits of the common factor of lights in a comparison."""
+"""Limits of the common factor of lights in a comparison, within their bounds."""
 
 
 def best_start(traits: Traits, keys: Sequence[str], plan: Plan) -> Plan:
     """Return the plan with the best start among places within the bounds of some unknowns, if its picture is much better.
 
     Gauss-Newton steps end in the nearest minimum. Places are compared in directions, and in numbers between two bounds that change the
-    form of the picture. A common factor of unknown lights is fitted at each place, because a step would find it.
+    form of the picture. Each place is judged by the problem's loss. A common factor of unknown lights is fitted there, because a step
+    would find it. Unknowns with a prior keep their start.
 
     Args:
         traits: Traits of the problem.
@@ -44,28 +46,32 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan) -> Plan:
     varied = [key for key in keys if _dimensions(traits, key)]
     if not varied:
         return plan
-    problem, initial = traits.problem, traits.problem.initial_values()
-    pictures = FreshPictures(problem, 0, _PATHS, _NUMBER)
-    lights = [key for key in traits.lights if key in keys]
-    first = _squares(pictures, initial, lights)
+    unknowns = plan.configured().unknowns
+    initial = {key: u.initial if u.first is None else u.first for key, u in unknowns.items()}
+    pictures = FreshPictures(traits.problem, 0, _PATHS, _NUMBER)
+    lights = [key for key in traits.lights if key in keys and unknowns[key].prior is None]
+    limits = _limits([(initial[key], unknowns[key].bounds) for key in lights])
+    first, _ = _losses(pictures, initial, lights, limits)
     best, factor, least = {}, 1.0, math.inf
     for place in _places(traits, varied):
         try:
-            squares, own = _squares(pictures, {**initial, **place}, lights)
+            losses, own = _losses(pictures, {**initial, **place}, lights, limits)
         except InputError:  # a value that the renderer rejects
             continue
-        if (total := float(squares.sum())) < least:
-            best, factor, least, change = place, own, total, first[0] - squares
-    start = float(first[0].sum())
-    share = max(least, 0.0) / start if start > 0.0 else math.inf  # noise may leave a negative difference
-    if not share < _BETTER or not change.mean() > _ERRORS * change.std() / math.sqrt(change.size):
+        if (total := _total(losses)) < least:
+            best, factor, least, change = place, own, total, difference(losses, first, sampled=True)
+    start = _total(first)
+    share = max(least, 0.0) / start if start > 0.0 else math.inf  # without its noise, a loss may be negative
+    if not share < _BETTER or not change.value > _ERRORS * change.standard_error:
         return plan
-    chosen = {**best, **{key: factor * initial[key] for key in lights if factor != 1.0}}
-    settings = {key: ParameterSettings(start=tuple(map(float, np.ravel(x)))) for key, x in chosen.items()}
-    reason = (
-        f"starts at another place within the bounds of {listed(varied)}, where the picture's mean square difference is {share:.0%} of that "
-        "at the initial values"
-    )
+    chosen = {**best, **{key: unknowns[key].project(factor * initial[key]) for key in lights if factor != 1.0}}
+    settings = {
+        key: replace(
+            plan.settings.get(key, ParameterSettings()), start=tuple(map(float, np.ravel(x))), start_factor=None
+        )
+        for key, x in chosen.items()
+    }
+    reason = f"starts at another place within the bounds of {listed(varied)}, where the loss is {share:.0%} of that at the initial values"
     return replace(plan, settings={**plan.settings, **settings}, reasons=(*plan.reasons, reason))
 
 
@@ -115,20 +121,47 @@ def _value(traits: Traits, key: str, point: np.ndarray) -> np.ndarray:
     return np.asarray(unknown.project(value), np.float32)
 
 
-def _squares(
-    pictures: FreshPictures, values: Mapping[str, np.ndarray], lights: Sequence[str]
+def _limits(lights: Sequence[tuple[np.ndarray, Bounds]]) -> Bounds:
+    """Return the limits of a common factor of values with bounds; 1 is within them."""
+    low, high = _FACTORS
+    for values, bounds in lights:
+        x = np.ravel(values).astype(np.float64)
+        below, above = (
+            default if end is None else end for end, default in zip(bounds, (-math.inf, math.inf), strict=True)
+        )
+        ends = np.sort([below / x[x != 0.0], above / x[x != 0.0]], axis=0)
+        low, high = float(ends[0].max(initial=low)), float(ends[1].min(initial=high))
+    return min(low, 1.0), max(high, 1.0)
+
+
+def _losses(
+    pictures: FreshPictures, values: Mapping[str, np.ndarray], lights: Sequence[str], limits: Bounds
 ) -> tuple[np.ndarray, float]:
-    """Return the squared difference from the references of each pixel, (N,), without noise, and the fitted factor of the lights."""
-    weights, references = pictures.weights, pictures.references
-    images = np.concatenate(pictures.images(values), axis=1)
-    halves, factor = [images[0::2].mean(axis=0), images[1::2].mean(axis=0)], 1.0
-    if lights:
-        double = np.concatenate(pictures.images({**values, **{key: 2.0 * values[key] for key in lights}}), axis=1)
-        of = [(double[half::2] - images[half::2]).mean(axis=0) for half in (0, 1)]
-        missing = [references - image for image in halves]
-        products = ((of[0] * missing[1] + of[1] * missing[0]).sum(axis=1) * weights).sum()
-        factor = 1.0 + float(products / max(2.0 * ((of[0] * of[1]).sum(axis=1) * weights).sum(), 1e-300))
-        factor = float(np.clip(factor, *_FACTORS))
-        halves = [image + (factor - 1.0) * own for image, own in zip(halves, of, strict=True)]
-    squares = ((halves[0] - references) * (halves[1] - references)).sum(axis=1) * weights
-    return np.where(np.isfinite(squares), squares, np.inf), factor
+    """Return the pseudo-values of the loss, (K, N), and the factor of the lights: 1 or that of least squares, whichever has less loss."""
+    images = pictures.images(values)
+    losses = pictures.losses(images)
+    if not lights:
+        return losses, 1.0
+    double = pictures.images({**values, **{key: 2.0 * values[key] for key in lights}})
+    own = [two - one for two, one in zip(double, images, strict=True)]
+    factor = float(np.clip(_factor(pictures, images, own), *limits))
+    others = pictures.losses([image + (factor - 1.0) * light for image, light in zip(images, own, strict=True)])
+    return (others, factor) if _total(others) < _total(losses) else (losses, 1.0)
+
+
+def _factor(pictures: FreshPictures, images: Sequence[np.ndarray], own: Sequence[np.ndarray]) -> float:
+    """Return the factor of least squares of the part `own` of the images. Products of independent halves have no bias from noise."""
+    image, light = (np.concatenate(parts, axis=1) for parts in (images, own))
+    of = [light[half::2].mean(axis=0) for half in (0, 1)]
+    missing = [pictures.references - image[half::2].mean(axis=0) for half in (0, 1)]
+    with np.errstate(invalid="ignore"):
+        products = (of[0] * missing[1] + of[1] * missing[0]).sum(axis=1)
+        squares = (2.0 * of[0] * of[1]).sum(axis=1)
+    weights = pictures.weights
+    used = (weights > 0.0) & np.isfinite(products) & np.isfinite(squares)
+    return 1.0 + float((products * weights)[used].sum() / max(float((squares * weights)[used].sum()), 1e-300))
+
+
+def _total(losses: np.ndarray) -> float:
+    """Return the loss without its noise, from pseudo-values (K, N)."""
+    return float(losses.mean(axis=0).sum())
