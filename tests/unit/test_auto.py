@@ -432,7 +432,8 @@ def test_a_light_that_suits_the_loss_keeps_its_start(monkeypatch: pytest.MonkeyP
     """A light that is far too bright for the squared difference from saturated references has no censored loss."""
     given = lit(monkeypatch, 3.0, 40.0)
     values = {**LIT, "map": np.full((3, 3, 1), 0.5), "lamp": np.array([40.0])}
-    reference, reasons = np.minimum(given.renderer.exact(values), 1.0), {}
+    renderer: Any = given.renderer
+    reference, reasons = np.minimum(renderer.exact(values), 1.0), {}
     for loss in (losses.L2(), losses.Censored(losses.L2(), 1.0)):
         made = given.replaced(views=[View(reference)], loss=loss)
         reasons[made.loss] = method("auto").plan(made).reasons

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -124,8 +124,8 @@ def test_places_are_judged_by_the_loss_of_the_problem(
     censored = losses.Censored(losses.L2(), white)
     made = restricted(monkeypatch, [2.0, 7.0], lamp, censored, lambda image: np.minimum(image, white))
     plan = method("auto").plan(made)
-    begun, values = first(plan), made.initial_values()
-    own, given = (float(made.loss_value(0, made.renderer.array(made.renderer.exact(x)))) for x in (begun, values))
+    begun, values, renderer = first(plan), made.initial_values(), cast(Any, made.renderer)
+    own, given = (float(made.loss_value(0, renderer.array(renderer.exact(x)))) for x in (begun, values))
     assert own <= 0.5 * given or all(np.array_equal(begun[key], values[key]) for key in values)
     if lamp == 4.0:
         assert given < 1e-12  # of rounding
