@@ -62,8 +62,7 @@ def distribute(
 
     Raises:
         InputError: Ray is not installed, there is no cluster at the address, or other users can enter it; the problem cannot be sent,
-            has too few views, or does not fit a worker's memory; workers are lost repeatedly; their variant is not supported, or renders
-            other colours than this process.
+            has too few views, or does not fit a worker's memory; workers are lost repeatedly, or have an unsuitable variant.
     """
     _check_colours(variant)
     parsed = workers if isinstance(workers, Workers) else Workers.parse(str(workers), "workers")
