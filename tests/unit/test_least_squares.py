@@ -10,7 +10,6 @@ import pytest
 import unrender as ur
 from unrender.core.random import Key
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs.field_directions import _Adjoints
 from unrender.runs.least_squares import NumbersCheck, _Fit, _judged, check_numbers
 from unrender.runs.numbers import Differences, Numbers
 
@@ -235,88 +234,6 @@ def test_small_values_have_a_small_margin_at_an_open_bound():
         parameter = ur.Parameter("a", initial=[scale, 0.0, 0.0], bounds=(0, None))
         unknown = ur.Problem(renderer, [parameter], [view]).unknowns["a"]
         np.testing.assert_allclose(unknown.project(np.zeros(3)), expected, rtol=1e-5)
-
-
-CELLS = NUMBERS.normal(0.0, 1.0, (ROWS, 48)) * (NUMBERS.random((ROWS, 48)) < 0.1)
-"""Derivatives by a texture of 4 × 4 texels, each of which few pixels see."""
-
-
-def beside_a_texture(shared: float) -> tuple[ur.Problem, np.ndarray]:
-    """Return two numbers beside a texture, and the matrix (ROWS, 2 + 48). The first number changes the picture as a sum of texels does, and
-    by √(1 − shared²) in another way."""
-    texels = CELLS @ np.random.default_rng(1).uniform(0.5, 1.0, 48)
-    other, alone = MATRIX[:, 0], MATRIX[:, 1]
-    first = shared * texels / np.linalg.norm(texels) + np.sqrt(1.0 - shared**2) * other / np.linalg.norm(other)
-    matrix = np.concatenate([10.0 * first[:, None], alone[:, None], CELLS], axis=1)
-    truth = {"a": np.array(0.6), "b": np.array(0.5), "texture": np.full((4, 4, 3), 0.5)}
-    renderer = AnalyticRenderer(truth, matrix, offset=2.0, noise=0.02, shape=SHAPE)
-    added = np.random.default_rng(5).normal(0.0, NOISE, (*SHAPE, 3))
-    view = ur.View((renderer.exact(truth) + added).astype(np.float32))
-    return ur.Problem(renderer, [ur.Parameter(key, initial=0.5 * x) for key, x in truth.items()], [view]), matrix
-
-
-def deviations(made: ur.Problem, matrix: np.ndarray) -> np.ndarray:
-    """Return the standard errors of the numbers by least squares of all 50 unknowns."""
-    target = np.asarray(made.views[0].reference, np.float64).reshape(-1) - 2.0
-    inverse = np.linalg.inv(matrix.T @ matrix)
-    residual = target - matrix @ (inverse @ matrix.T @ target)
-    freedom = len(matrix) / (len(matrix) - matrix.shape[1])
-    return np.sqrt(freedom * np.diag(inverse) * np.mean(residual**2))[:2]
-
-
-@pytest.mark.parametrize("shared", [0.0, 0.9, 0.99])
-def test_standard_errors_beside_a_texture_are_those_of_all_unknowns(shared: float):
-    """Within a third, as the directions of the texture are approximate. With the texture fixed, the first is too small by 1/√(1 − s²)."""
-    made, matrix = beside_a_texture(shared)
-    values = {key: x.astype(np.float32) for key, x in made.renderer.values(["a", "b", "texture"]).items()}
-    found = check_numbers(made, values, made.initial_values(), FAR, ur.sensitivity(made, values))
-    expected = deviations(made, matrix)
-    np.testing.assert_allclose([found.errors["a"][0], found.errors["b"][0]], expected, rtol=0.33)
-    fixed = check_numbers(made, values, made.initial_values(), FAR)
-    if shared >= 0.9:
-        assert fixed.errors["a"][0] < 0.6 * expected[0]
-
-
-def test_a_number_that_a_texture_can_replace_is_told_with_it():
-    made, _ = beside_a_texture(1.0)
-    values = {key: x.astype(np.float32) for key, x in made.renderer.values(["a", "b", "texture"]).items()}
-    found = check_numbers(made, values, made.initial_values(), FAR, ur.sensitivity(made, values))
-    assert list(found.undetermined) == ["a"]
-    assert "together with texture" in found.undetermined["a"]
-    assert not check_numbers(made, values, made.initial_values(), FAR).undetermined  # planted: the texture is fixed
-
-
-@pytest.mark.parametrize("own", [True, False])
-@pytest.mark.parametrize("reference_noise", [0.25 * NOISE, NOISE])
-def test_a_factor_of_a_texture_is_told_with_it(monkeypatch: pytest.MonkeyPatch, reference_noise: float, own: bool):
-    """Pictures that blur the texture, as a diffuse surface blurs a sky, leave other directions approximate."""
-    random = np.random.default_rng(2)
-    texture = random.uniform(0.05, 1.0, (4, 4, 3))
-    cells = random.uniform(0.5, 1.0, (ROWS, 1)) * (1.0 + 0.3 * random.normal(0.0, 1.0, (ROWS, 48))) / 12.0
-    truth = {"scale": np.array(2.0), "texture": texture}
-    renderer = AnalyticRenderer(truth, np.column_stack([cells @ texture.ravel(), cells]), 0.5, noise=0.02, shape=SHAPE)
-    view = ur.View((renderer.exact(truth) + random.normal(0.0, reference_noise, (*SHAPE, 3))).astype(np.float32))
-    made = ur.Problem(renderer, [ur.Parameter(key, initial=0.5 * x) for key, x in truth.items()], [view])
-    values = {key: x.astype(np.float32) for key, x in renderer.values(["scale", "texture"]).items()}
-    if not own:  # planted fault
-        monkeypatch.setattr(_Adjoints, "scaled", lambda self: {"texture": np.zeros((0, 4, 4, 3))})
-    found = check_numbers(made, values, made.initial_values(), FAR, ur.sensitivity(made, values))
-    assert ("together with texture" in found.undetermined.get("scale", "")) is own
-    assert found.errors["scale"][0] <= 2.0 or np.isinf(found.errors["scale"][0])  # beyond its size it has none
-
-
-def test_the_step_of_a_number_beside_a_texture_is_that_of_all_unknowns():
-    """The texture is still at its start, so the number has gone its way; with the texture fixed, it would stay there."""
-    made, matrix = beside_a_texture(0.9)
-    start = made.initial_values()
-    target = np.asarray(made.views[0].reference, np.float64).reshape(-1) - 2.0 - CELLS @ start["texture"].ravel()
-    numbers = np.linalg.lstsq(matrix[:, :2], target, rcond=None)[0].astype(np.float32)
-    values = {**start, "a": numbers[0], "b": numbers[1]}
-    full = np.linalg.lstsq(matrix, np.asarray(made.views[0].reference, np.float64).reshape(-1) - 2.0, rcond=None)[0]
-    found = check_numbers(made, values, start, FAR, ur.sensitivity(made, values))
-    np.testing.assert_allclose(found.steps["a"], full[0] - numbers[0], rtol=0.35)
-    assert "a" in found.unfinished or "a" in found.undetermined
-    assert abs(check_numbers(made, values, start, FAR).steps["a"][0]) < 0.2 * abs(found.steps["a"][0])
 
 
 def test_the_length_of_a_direction_is_neither_open_nor_unfinished(monkeypatch: pytest.MonkeyPatch):

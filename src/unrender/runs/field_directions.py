@@ -29,52 +29,65 @@ _SHRINKS = 0.9
 """Ratio of a number's squared remainder to that of the round before, up to which there is another round."""
 _RIDGE = 0.3
 """Sensitivity relative to the median below which cells hardly take part."""
+_UNRESOLVED = "their shares in the pictures are not resolved"
+"""Reason of a missing standard error: the directions found so far do not contain all that trades off against a number."""
 
 
-def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tuple[str, ...]:
-    """Return the keys of unknown textures, grids and lists.
+def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Return the keys of unknown textures, grids and lists that can move, and {key: reason} of all other unknowns, which stay fixed.
 
-    Those without a sensitivity or with a prior, and meshes, count as fixed. There are none if their states would need too much memory.
+    Unknowns that change none of the rendered pictures are in neither.
     """
-    known = numbers.problem.renderer.parameters()
-    chosen = [
-        key
-        for key, values in sensitivities.items()
-        if key not in numbers.keys
-        and known[key].perturbable
-        and not known[key].welded
-        and numbers.problem.unknowns[key].prior is None
-        and values.any()
-    ]
-    states = 2 * _ROUNDS * (1 + numbers.count) + 2 * len(chosen)
-    return tuple(chosen) if states * sum(sensitivities[key].size for key in chosen) <= _MOST_VALUES else ()
+    infos, problem = numbers.problem.renderer.parameters(), numbers.problem
+    sensors = {problem.views[view].sensor for view in numbers.views}
+    moved, fixed = [], {}
+    for key in numbers.values:
+        info, seen = infos[key], sensitivities.get(key)
+        if key in numbers.keys or not (info.sensor is None or info.sensor in sensors):
+            continue
+        if info.welded:
+            fixed[key] = "a mesh"
+        elif seen is not None and not seen.any():
+            continue
+        elif problem.unknowns[key].prior is not None:
+            fixed[key] = "it has a prior"
+        elif seen is None or not info.perturbable:
+            fixed[key] = "it has no derivative"
+        else:
+            moved.append(key)
+    states = 2 * _ROUNDS * (1 + numbers.count) + 2 * len(moved)
+    if states * sum(sensitivities[key].size for key in moved) > _MOST_VALUES:
+        return (), fixed | dict.fromkeys(moved, "it is too large")
+    return tuple(moved), fixed
 
 
 def beside_fields(
     numbers: Numbers,
     differences: Differences,
+    keys: Sequence[str],
     sensitivities: Mapping[str, np.ndarray],
     change: float,
     key: Key,
     until: float,
-) -> tuple[Numbers, Differences] | None:
-    """Return numbers with directions of textures and grids that trade off against them, and the differences along both.
+) -> tuple[Numbers, Differences, str] | None:
+    """Return numbers with directions of textures and grids that trade off against them, the differences along both, and a reason.
+
+    The reason says why directions are missing, so that standard errors would be too small; "" if none are. The result is None if the
+    time is over before the first directions.
 
     The first directions are each texture's and grid's own values, which trade off exactly against a factor of them, such as the scale of
     an environment map. The next ones approximate, by one adjoint, the picture changes of the numbers and of the residual, and then the
-    remainder. There are none if the time is over, or if no texture or grid changes the pictures.
+    remainder.
 
     Args:
         numbers: the numbers alone.
         differences: differences along each number.
+        keys: keys of the textures and grids, see `fields_of`; at least one.
         sensitivities: see `unrender.sensitivity`.
         change: root mean square of a difference.
         key: key of the random numbers.
         until: time after which nothing is started.
     """
-    keys = fields_of(numbers, sensitivities)
-    if not keys:
-        return None
     adjoints = _Adjoints(numbers, keys, sensitivities, key)
     active, squares = np.arange(numbers.count), differences.squares()[0]
     residual = numbers.pictures(numbers.point[None], key.fold(2)) - numbers.references()
@@ -100,7 +113,12 @@ def beside_fields(
         active = active[squares[active] < _SHRINKS * before[active]]
         targets = remainder.average()[active]
         longest = max(longest, time.perf_counter() - started)
-    return _independent(made, differences, _joined(parts), len(keys)) if parts else None
+    if not parts:
+        return None
+    missing = "" if not len(targets) else _UNRESOLVED if len(parts) == _ROUNDS else "no time was left"
+    if (independent := _independent(made, differences, _joined(parts), len(keys))) is None:
+        return numbers, differences, _UNRESOLVED
+    return *independent, missing
 
 
 def _longer(differences: Differences, rows: int) -> Differences:

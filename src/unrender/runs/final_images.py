@@ -10,18 +10,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from unrender.core import phases
-from unrender.core.text import listed
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
 from unrender.runs.image_sensitivity import Curvature, curvature
-from unrender.runs.least_squares import check_numbers, checked_keys, compile_check
+from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, of_residuals, pixel_noise
 from unrender.runs.result import Result
-from unrender.runs.verification import DIFFERS, misfit
+from unrender.runs.verification import misfit_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
-from unrender.scene.view import View
 from unrender.statistics import debiased
 
 _PICTURE_PATHS = 1 << 22
@@ -36,8 +34,6 @@ _LEAST_TESTS = 0.6
 """Seconds on an idle machine that the tests of undetermined parameters have together even if the budget is over."""
 _NUMBERS_SHARE = 0.05
 """Time limit of least squares of few numbers relative to the time of the steps; at least one second."""
-_FEW_NUMBERS, _OF_PICTURE = 24, 0.01
-"""Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image."""
 _TRIAL_PATHS = 1 << 18
 _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 """Paths of one pass over all views, and its most samples per pixel."""
@@ -141,15 +137,15 @@ def render_final_images(
             known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
         sensitivities, lines, warnings, deviations = known.sensitivity(), [], (), dict(result.standard_error)
         if not tested and result.steps:
-            unchecked = checked_keys(problem, result.parameters, result.initial)
-            lines, deviations = _unchecked(unchecked), _without(deviations, unchecked)
+            late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
+            lines, deviations = late.missing(), _without(deviations, late.unchecked)
         if everything:
             lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests)
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
-    differs = _misfit(problem, result, [problem.views[index] for index in chosen], ends)
-    warnings, deviations = (*warnings, *filter(None, differs)), {} if differs else deviations
+    if result.steps and (differs := misfit_of_views(problem, chosen, ends, result.warnings)):
+        warnings, deviations = (*warnings, differs) if differs not in result.warnings else warnings, {}
     return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share)
 
 
@@ -183,51 +179,16 @@ def _undetermined(
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
     text, deviations = "\n".join(lines), _without(result.standard_error, numbers.unchecked)
-    lines += [line for key, line in numbers.undetermined.items() if key not in text] + _unchecked(numbers.unchecked)
+    lines += [line for key, line in numbers.undetermined.items() if key not in text] + numbers.missing()
     deviations |= numbers.standard_errors(result.parameters, deviations)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
     return lines, unfinished, deviations
 
 
-def _misfit(
-    problem: Problem, result: Result, views: Sequence[View], ends: Sequence[tuple[np.ndarray, ...]]
-) -> list[str]:
-    """Return a warning, "" if the run has one already, if only few numbers are unknown and the images differ from the references.
-
-    Least squares of few numbers end where the difference is noise. Noise of the references does not count, since pixels do not share it.
-    """
-    few = sum(value.size for value in result.parameters.values()) <= _FEW_NUMBERS and len(ends[0]) == 2
-    if not few or not result.steps:
-        return []
-    if any(DIFFERS in line for line in result.warnings):
-        return [""]
-    references = [np.asarray(view.reference, np.float32) for view in views]
-    weights = np.concatenate([np.ravel(v.pixel_weights(x.shape[:2])) for v, x in zip(views, references, strict=True)])
-    pixels = [image.reshape(-1, 3) for image in references]
-    halves = [
-        np.concatenate([(end[half].reshape(-1, 3) - of) for end, of in zip(ends, pixels, strict=True)])[None]
-        for half in (0, 1)
-    ]
-    found = misfit(halves[0], halves[1], np.concatenate(pixels), weights, _OF_PICTURE)
-    if found is None:
-        return []
-    return [
-        f"{found.describe()}, which noise does not explain: the run needs more steps, another start or bounds (auto compares starts "
-        "within them), or something that is not among the unknowns is wrong"
-    ]
-
-
 def _without(errors: Mapping[str, np.ndarray], keys: Sequence[str]) -> dict[str, np.ndarray]:
     """Return the standard errors of other keys: those of a number that may not have converged are too small."""
     return {key: error for key, error in errors.items() if key not in keys}
-
-
-def _unchecked(keys: Sequence[str]) -> list[str]:
-    """Return a line about numbers that there was no time to test."""
-    if not keys:
-        return []
-    return [f"whether {listed(keys)} converged: no time was left to test it; use more seconds or fewer pixels"]
 
 
 def _chosen(problem: Problem) -> list[int]:

@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -62,10 +62,12 @@ class NumbersCheck:
     Attributes:
         undetermined: {key: line} of the numbers that the references leave open.
         unfinished: {key: line} of those that a least-squares step would still move.
-        errors: {key: standard errors} of all numbers, the references' noise included.
+        errors: {key: standard errors} of all numbers but the unchecked ones, the references' noise included.
         steps: {key: least-squares steps} of all numbers.
         noise: {key: standard errors of the steps by the noise of this check}.
-        unchecked: keys of the numbers that there was no time to test.
+        unchecked: keys of the numbers whose standard errors are unknown.
+        fixed: {key: reason} of unknowns that trade off against the numbers in directions that the test leaves out; {} if there was no
+            time for the test.
     """
 
     undetermined: Mapping[str, str] = field(default_factory=dict)
@@ -74,6 +76,18 @@ class NumbersCheck:
     steps: Mapping[str, np.ndarray] = field(default_factory=dict)
     noise: Mapping[str, np.ndarray] = field(default_factory=dict)
     unchecked: tuple[str, ...] = ()
+    fixed: Mapping[str, str] = field(default_factory=dict)
+
+    def missing(self) -> list[str]:
+        """Return a line that says why standard errors are unknown; [] if none are."""
+        if not self.unchecked:
+            return []
+        if not self.fixed:
+            return [
+                f"whether {listed(self.unchecked)} converged: no time was left to test it; use more seconds or fewer pixels"
+            ]
+        beside = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
+        return [f"standard errors of {listed(self.unchecked)}: they are unknown beside {beside}"]
 
     def standard_errors(
         self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] = MappingProxyType({})
@@ -112,7 +126,8 @@ def check_numbers(
     references do not determine them. Where the step −(JᵀJ)⁻¹ Jᵀ r is long, the run ended early.
 
     Textures and grids move along directions that trade off against the numbers, see `beside_fields`. Other unknowns are fixed, and so
-    are those with a prior. Steps are reported for losses with a linear derivative only: others have their minimum elsewhere.
+    are those with a prior. Standard errors beside these would be too small, so there are none: the numbers are `unchecked`. Steps are
+    reported for losses with a linear derivative only: others have their minimum elsewhere.
 
     Args:
         problem: problem with views and scene.
@@ -169,12 +184,15 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
     matrix = differences.matrix()
     if not (np.isfinite(matrix).all() and matrix.any()):
         return NumbersCheck()  # pictures that are not finite, or that no number changes
-    now = time.perf_counter()
-    if now > until and fields_of(numbers, sensitivities):
-        return NumbersCheck(unchecked=numbers.keys)  # errors beside known textures would be too small
-    half = now + 0.5 * (until - now) if math.isfinite(until) else until
-    if beside := beside_fields(numbers, differences, sensitivities, change, key.fold(_FIELDS), half):
-        numbers, differences = beside
+    moved, fixed = fields_of(numbers, sensitivities)
+    if moved:
+        now = time.perf_counter()
+        half = now + 0.5 * (until - now) if math.isfinite(until) else until
+        beside = beside_fields(numbers, differences, moved, sensitivities, change, key.fold(_FIELDS), half)
+        if beside is None:
+            return NumbersCheck(unchecked=numbers.keys)
+        numbers, differences, missing = beside
+        fixed |= dict.fromkeys(moved, missing) if missing else {}
     directions, repeats = _directions(differences, numbers.limits, change), 0
     weights = np.zeros(directions.shape[1])
     residuals = np.zeros((2, *numbers.references().shape))
@@ -189,7 +207,8 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
                 picture = numbers.pictures(numbers.point[None], own.fold(2 + 2 * index + half))[0]
                 residuals[half] += picture - numbers.references()
         repeats += 1
-    return _judged(numbers, _Fit.of(numbers, differences, residuals / (repeats * directions.shape[1])), widths)
+    found = _judged(numbers, _Fit.of(numbers, differences, residuals / (repeats * directions.shape[1])), widths)
+    return replace(found, errors={}, unchecked=numbers.keys, fixed=fixed) if fixed else found
 
 
 def _directions(differences: Differences, limits: np.ndarray, change: float) -> np.ndarray:

@@ -19,7 +19,9 @@ from unrender.runs.image_sensitivity import (
     neighbour_means,
     transposed,
 )
-from unrender.runs.least_squares import check_numbers
+from unrender.runs.least_squares import check_numbers, checked_keys
+from unrender.runs.numbers import tested_views
+from unrender.runs.verification import misfit_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render
 
@@ -52,10 +54,12 @@ class Uncertainty:
             numbers that the references do not determine.
         data_share: {key: array} of the textures' shapes, in [0, 1]: weight of the references in each element. The rest of its value was
             decided by the start, by smoothing, or by a prior.
+        missing: one line for each reason why numbers have no standard error.
     """
 
     standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
     data_share: Mapping[str, np.ndarray] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
 
 
 @exclusive("uncertainty")
@@ -65,7 +69,10 @@ def uncertainty(
     """Estimate the standard error of each texel of a problem's textures, and of each number.
 
     Numbers, 24 elements at most, are tested by least squares at `values`, together with directions of textures and grids that trade off
-    against them. Their standard errors contain the references' noise, and the distance from the least-squares solution.
+    against them. Their standard errors contain the references' noise, and the distance from the least-squares solution. Numbers have none
+    beside meshes, beside unknowns with a prior, beside textures that are too large or have no path gradient, and where there was no
+    time. `missing` tells the reason. Nor has any unknown of a problem of few numbers whose pictures differ from the references by more
+    than noise, in up to four views.
 
     For textures, with the pictures' residual r, their derivative J by the parameters, and the diagonal elements H of the Gauss-Newton
     JᵀJ, the variance of an element is that of a posterior with independent elements:
@@ -99,18 +106,30 @@ def uncertainty(
     as_tree(problem, values)  # refuses other keys and shapes
     until = time.perf_counter() + seconds
     known, maps = Curvature({}, {}, 0), Uncertainty()
-    if any(len(shape) >= MAP_AXES for shape in problem.shapes().values()):
-        spp = min(max(_PATHS // problem.pixels, _SPP[0]), _SPP[1])
-        key, views = Key(seed, 0, _STREAM), range(len(problem.views))
-        halves = [
-            [render(problem, values, view, spp, key.fold(2 * view + half).uint32()) for view in views]
-            for half in range(2)
-        ]
-        known = curvature(problem, values, seconds=seconds, seed=seed, noise=pixel_noise(problem, halves))
-        maps = of_residuals(problem, values, halves, known, seed)
+    keys = checked_keys(problem, values, problem.initial_values())
+    mapped = any(len(shape) >= MAP_AXES for shape in problem.shapes().values())
+    if mapped or keys:
+        views = range(len(problem.views)) if mapped else tested_views(problem)
+        halves = _halves(problem, values, views, seed)
+        if differs := misfit_of_views(problem, views, list(zip(*halves, strict=True))):
+            return Uncertainty(missing=(differs,))
+        if mapped:
+            known = curvature(problem, values, seconds=seconds, seed=seed, noise=pixel_noise(problem, halves))
+            maps = of_residuals(problem, values, halves, known, seed)
     left = until - time.perf_counter()
     numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity())
-    return Uncertainty({**numbers.standard_errors(values), **maps.standard_error}, maps.data_share)
+    errors = {**numbers.standard_errors(values), **maps.standard_error}
+    return Uncertainty(errors, maps.data_share, tuple(numbers.missing()))
+
+
+def _halves(
+    problem: Problem, values: Mapping[str, np.ndarray], views: Sequence[int], seed: int
+) -> list[list[np.ndarray]]:
+    """Return two independent pictures (H, W, 3) of each view."""
+    spp, key = min(max(_PATHS // problem.pixels, _SPP[0]), _SPP[1]), Key(seed, 0, _STREAM)
+    return [
+        [render(problem, values, view, spp, key.fold(2 * view + half).uint32()) for view in views] for half in range(2)
+    ]
 
 
 def of_residuals(

@@ -16,7 +16,7 @@ from unrender.runs.image_sensitivity import mask_roots
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two
 
-__all__ = ["Differences", "Numbers"]
+__all__ = ["Differences", "Numbers", "tested_views"]
 
 _MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
 """Elements of all numbers and of one, up to which they are tested."""
@@ -101,8 +101,7 @@ class Numbers:
 
     @classmethod
     def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> Numbers | None:
-        known, count = problem.renderer.parameters(), len(problem.views)
-        views = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
+        known, views = problem.renderer.parameters(), tested_views(problem)
         sensors = {problem.views[view].sensor for view in views}
         keys = [
             key
@@ -233,3 +232,9 @@ class Numbers:
             total += image.size
         least = 0.01 * math.sqrt(float(np.mean(np.square(self.references()))))
         return max(math.sqrt(squares / total), least, 1e-30)
+
+
+def tested_views(problem: Problem) -> list[int]:
+    """Return the indices of the rendered views, evenly spaced, four at most."""
+    count = len(problem.views)
+    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})

@@ -54,10 +54,12 @@ class Result:
         image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the reference
             and the image's expectation, without rendering noise; see `statistics.debiased`.
         standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings
-            and of the references, infinite where the images do not determine it. Runs with a run folder have it for all numbers, also
-            beside textures and grids, see `runs.least_squares`, unless there was no time for that test. Other runs have it if all
-            unknowns are numbers: for those optimised by `AveragedNewton`, and for means over enough steps, without the references' noise.
-            Textures of runs with a run folder have a map, see `unrender.runs.uncertainty`.
+            and of the references, infinite where the images do not determine it. Runs with a run folder have it for up to 24 elements of
+            numbers, also beside textures and grids. There is none beside unknowns that the test cannot move or has no time for; a line
+            of `undetermined` says so. Other runs have it if all unknowns are numbers: for those optimised by `AveragedNewton`, and for
+            means over enough steps, without the references' noise. Few numbers have none where the final picture differs from the
+            references by more than noise; a warning says so. Textures of runs with a run folder have a map, see
+            `unrender.runs.uncertainty`.
         data_share: {key: array} of the parameters' shapes, in [0, 1], for textures: weight of the references in each element, see
             `unrender.runs.uncertainty`. {} for runs without a run folder.
         phases: {phase: seconds} in order: "compiling", "steps", "checkpoints and callbacks", "final pictures", and, on the command line,

@@ -13,15 +13,18 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.display import formatting
+from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
-__all__ = ["DIFFERS", "Misfit", "Remembering", "misfit", "remembered"]
+__all__ = ["DIFFERS", "Misfit", "Remembering", "misfit", "misfit_of_numbers", "misfit_of_views", "remembered"]
 
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
 _FEW_PIXELS, _OF_FEW = 96, 0.2
 """Number of pixels below which the difference is also judged pixel by pixel, which includes the references' noise; its smallest size
 relative to the image in this case."""
+_FEW_NUMBERS, _OF_PICTURE = 24, 0.01
+"""Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,46 @@ def misfit(
     if found or fresh is None or np.count_nonzero(weights) >= _FEW_PIXELS:
         return found
     return significant(paired_losses.repeated(residuals, fresh, weights), _OF_FEW, True)
+
+
+def misfit_of_numbers(
+    problem: Problem, residuals: np.ndarray, references: np.ndarray, weights: np.ndarray, known: Sequence[str] = ()
+) -> str:
+    """Return a warning if only few numbers are unknown and the images differ from the references; else "".
+
+    Least squares of few numbers end where the difference is noise. Elsewhere their standard errors mean nothing. Noise of the references
+    does not count, since pixels do not share it.
+
+    Args:
+        problem: problem with the unknowns.
+        residuals: differences of K independent images from the references, (K, N, 3); one image tells nothing.
+        references: references, (N, 3).
+        weights: weight of each pixel, (N,), in [0, 1].
+        known: warnings of the run; one that says so already is returned.
+    """
+    elements = sum(math.prod(shape) for shape in problem.shapes().values())
+    if elements > _FEW_NUMBERS or len(residuals) < 2:
+        return ""
+    if told := next((line for line in known if DIFFERS in line), ""):
+        return told
+    found = misfit(residuals[0::2], residuals[1::2], references, weights, _OF_PICTURE)
+    if found is None:
+        return ""
+    return (
+        f"{found.describe()}, which noise does not explain: the run needs more steps, another start or bounds (auto compares starts "
+        "within them), or something that is not among the unknowns is wrong"
+    )
+
+
+def misfit_of_views(
+    problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]], known: Sequence[str] = ()
+) -> str:
+    """Return `misfit_of_numbers` of independent images (H, W, 3) of each of some views."""
+    references = [np.asarray(problem.views[view].reference, np.float32) for view in views]
+    weights = [problem.views[view].pixel_weights(x.shape[:2]) for view, x in zip(views, references, strict=True)]
+    pixels = np.concatenate([image.reshape(-1, 3) for image in references])
+    residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
+    return misfit_of_numbers(problem, residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), known)
 
 
 @runtime_checkable

@@ -21,7 +21,7 @@ from unrender.runs.number_means import averaged
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
-from unrender.runs.verification import misfit, remembered
+from unrender.runs.verification import misfit, misfit_of_numbers, remembered
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
@@ -146,6 +146,12 @@ class Verify(Callback):
         disagrees = memory is not None and memory.disagrees
         best_picture = places[best][0] if places else last
         lines = self._residual(problem, result, last)
+        if result.standard_error and not (lines or places):
+            differences = np.concatenate(last.images, axis=1) - pictures.references
+            differs = misfit_of_numbers(problem, differences, pictures.references, pictures.weights)
+            lines = [differs] if differs else []
+        if lines:
+            result = replace(result, standard_error={})
         # A Gauss-Newton step solves for all unknowns, so a run of few steps is no unfinished one.
         few = result.steps < (FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else FEW_STEPS)
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
