@@ -31,6 +31,26 @@ with private_folder() as folder:
     time.sleep(600)
 """
 
+ACTION = """
+import contextlib, ctypes, signal, sys
+from unrender.app.distributed.cluster import Workers, connect, connection
+def action():
+    found = ctypes.create_string_buffer(1024)
+    ctypes.CDLL(None).sigaction(signal.SIGTERM, None, found)
+    return found.raw[:8]  # of a pointer to the handler
+ray = connection.load_ray()
+signal.signal(signal.SIGTERM, lambda *_: None)
+begin, before, same = ray.init, action(), []
+def init(**options):
+    begin(**options)
+    same.append(action() == before)
+ray.init = init
+connection._kept_action = lambda number: contextlib.nullcontext()
+with connect(Workers(1), "llvm_ad_rgb", store_bytes=80 << 20):
+    same.append(action() == before)
+print(*same, action() == before)
+"""
+
 
 def below(root: int) -> list[int]:
     """A process and all that descend from it."""
@@ -149,6 +169,16 @@ def test_the_environment_is_as_before_afterwards(home: Path, monkeypatch: pytest
         assert folder.is_dir()
     assert not folder.exists()
     assert dict(os.environ) == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", ["1", "0"])
+def test_no_compiled_handler_of_sigterm_is_installed_while_ray_starts(setting: str, home: Path) -> None:
+    """Nothing else restores the action here. The planted fault is Ray without its setting."""
+    environment = os.environ | ({"RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "0"} if setting == "0" else {})
+    words = [sys.executable, "-c", ACTION]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout.split()) == (0, [str(setting == "1"), "True", "True"]), done.stderr
 
 
 def test_a_killed_driver_leaves_no_folder() -> None:

@@ -82,8 +82,10 @@ _SETTINGS = {
     "RAY_DISABLE_IMPORT_WARNING": "1",
     "RAY_ENABLE_UV_RUN_RUNTIME_ENV": "0",
     "RAY_IGNORE_UNHANDLED_ERRORS": "1",
+    "RAY_DISABLE_FAILURE_SIGNAL_HANDLER": "1",
 }
-"""No telemetry, no metrics, and only errors on standard error. Settings in the environment take precedence."""
+"""No telemetry, no metrics, only errors on standard error, and no handler of SIGTERM that prints a stack trace. Settings in the environment
+take precedence."""
 _STORE_BYTES = 256 << 20
 _ANSWER_SECONDS = 10.0
 _NAMESPACE = "unrender"
@@ -271,7 +273,10 @@ _LARGEST_ACTION = 1024
 
 @contextlib.contextmanager
 def _kept_action(number: int) -> Iterator[None]:
-    """Keep the system's action of a signal. Ray's compiled code sets one that prints a stack trace, and Python does not notice."""
+    """Keep the system's action of a signal. Ray's compiled code sets one that prints a stack trace, and Python does not notice.
+
+    It does so if its version does not know `RAY_DISABLE_FAILURE_SIGNAL_HANDLER`, or if a program has imported it without that setting.
+    """
     library, action = ctypes.CDLL(None), ctypes.create_string_buffer(_LARGEST_ACTION)
     library.sigaction(number, None, action)
     ended = threading.Event()
