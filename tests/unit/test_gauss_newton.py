@@ -14,10 +14,12 @@ from unrender.core.random import Key
 from unrender.estimators import derivative_images
 from unrender.estimators import gauss_newton as module
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import GradientNoise, Hessian, HessianNoise, Smoothing
+from unrender.estimators.capabilities import GradientNoise, Hessian, HessianNoise, ScoreCovariance, Smoothing
 from unrender.optimizers import AveragedNewton, averaged_newton
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs.callbacks import Callback
 from unrender.runs.folder import reader
+from unrender.runs.folder.state import not_finite, pack
 
 TRUTH = {"a": np.array([0.4, -0.2]), "b": np.array([0.7])}
 START = {"a": np.array([0.55, -0.1]), "b": np.array([0.5])}
@@ -172,6 +174,7 @@ def test_the_first_step_is_newtons_and_long_ones_end_at_the_trust_region() -> No
     x = np.zeros(3)
     steps, _ = optimizer.update(model(HESSIAN, MINIMUM, x), optimizer.init({"x": x}), {"x": x})
     np.testing.assert_allclose(steps["x"], MINIMUM, rtol=1e-9)
+    assert not not_finite(optimizer.init({"x": x}))  # which no checkpoint could store
     optimizer = AveragedNewton(trust_radius=0.1)
     sigma = {"sigma": Smoothing({"x": 2.0})}
     steps, _ = optimizer.update(model(HESSIAN, MINIMUM, x, **sigma), optimizer.init({"x": x}), {"x": x})
@@ -270,6 +273,63 @@ def test_exact_references_add_nothing_to_standard_errors(monkeypatch: pytest.Mon
         np.testing.assert_allclose(error, alone.standard_error[key], rtol=0.02)
 
 
+class Residuals(Callback):
+    """Bytes of the mean residuals after each step, and of all arrays that a checkpoint stores of the estimator."""
+
+    def __init__(self) -> None:
+        self.kept: set[int] = set()
+        self.stored: set[int] = set()
+
+    def on_step(self, run: Any, record: Any) -> None:
+        self.kept.add(sum(mean.one.nbytes + mean.other.nbytes for mean in run.state.estimator.residuals))
+        tensors = pack(run.snapshot()["estimator"]).tensors
+        self.stored.add(sum(x.nbytes for x in tensors.values()))
+
+
+def test_mean_residuals_are_kept_only_for_an_optimizer_that_states_errors() -> None:
+    """Of 20 pixels, 24 bytes each. A checkpoint of the others has the three parameters of the last step alone."""
+    seen = {}
+    for optimizer in (AveragedNewton(), ur.optimizers.Newton()):
+        one = seen[type(optimizer)] = Residuals()
+        ur.optimize(problem(), ur.GaussNewton(2, 2), optimizer, steps=3, callbacks=[one])
+    assert seen[AveragedNewton].kept == {20 * 24}
+    assert seen[AveragedNewton].stored == {20 * 24 + 3 * 8}
+    assert seen[ur.optimizers.Newton].kept == {0}
+    assert seen[ur.optimizers.Newton].stored == {3 * 8}
+
+
+@pytest.mark.mitsuba  # which a run folder asks for its version
+@pytest.mark.parametrize("most", [20, 19])
+def test_references_of_too_many_pixels_for_mean_residuals_leave_no_standard_errors(
+    most: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+) -> None:
+    """Rather than errors of the run's own noise alone. The problem has 20 pixels."""
+    monkeypatch.setattr("unrender.runs.verify.Verify.on_result", lambda self, descent, result: result)
+    monkeypatch.setattr(module, "REMEMBERED", most)
+    seen, parts = Residuals(), (ur.GaussNewton(4, 4), AveragedNewton())
+    whole = ur.optimize(problem(), *parts, steps=14, callbacks=[seen])
+    assert seen.kept == {20 * 24 if most == 20 else 0}
+    assert set(whole.standard_error) == ({"a", "b"} if most == 20 else set())
+    ur.optimize(problem(), *parts, steps=12, run_directory=tmp_path / "run")
+    again = ur.resume(tmp_path / "run", problem(), steps=14)
+    assert not [line for line in again.warnings if "checkpoint" in line]
+    for key, value in whole.parameters.items():
+        np.testing.assert_array_equal(again.parameters[key], value)
+
+
+@pytest.mark.parametrize("scores", [(), (ScoreCovariance(np.full((3, 3), np.nan)),)], ids=["none", "not finite"])
+def test_an_estimate_without_the_noise_of_the_references_leaves_no_standard_errors(scores: Any) -> None:
+    optimizer, rng, x = AveragedNewton(), np.random.default_rng(0), np.zeros(3)
+    state = optimizer.init({"x": x})
+    for told in (True, False, True):
+        for noise in 1e-3 * rng.normal(size=(10, 3)):
+            more = (ScoreCovariance(np.zeros((3, 3))),) if told else scores
+            estimate = Estimate(0.0, {"x": HESSIAN @ x + noise}, (Hessian(HESSIAN), *more))
+            steps, state = optimizer.update(estimate, state, {"x": x})
+            x = x + steps["x"]
+        assert bool(optimizer.standard_errors(state, {"x": x})) is told
+
+
 @pytest.mark.parametrize("planted", [False, True])
 def test_the_way_to_the_solution_is_no_noise_of_the_references(planted: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean residuals of a linear image after three steps are those at the end. The planted fault leaves earlier ones where they were."""
@@ -312,7 +372,11 @@ def test_a_direction_that_hardly_shows_has_an_infinite_standard_error(ratio: flo
         place = np.concatenate([tree["x"], tree["y"]])
         gradient = hessian @ place + noise
         steps, state = optimizer.update(
-            Estimate(0.0, {"x": gradient[:2], "y": gradient[2:]}, (Hessian(hessian),)), state, tree
+            Estimate(
+                0.0, {"x": gradient[:2], "y": gradient[2:]}, (Hessian(hessian), ScoreCovariance(np.zeros((3, 3))))
+            ),
+            state,
+            tree,
         )
         tree = {key: x + steps[key] for key, x in tree.items()}
     errors = optimizer.standard_errors(state, tree)

@@ -259,6 +259,19 @@ def test_a_block_is_the_estimate_of_the_numbers_alone() -> None:
     np.testing.assert_array_equal(own.estimate.hessian, expected.hessian)
 
 
+def test_a_block_keeps_no_mean_residuals() -> None:
+    """No error is stated of a block, which takes the other unknowns as known. Alone, 24 bytes per pixel are kept."""
+    asked, estimator = problem(), block()
+    point = asked.initial()
+    _, state = estimator.estimate(asked, point, estimator.init(asked, point), Key(3))
+    assert state.perturbed.widths  # pyright: ignore[reportAttributeAccessIssue]
+    assert state.perturbed.residuals == ()  # pyright: ignore[reportAttributeAccessIssue]
+    alone = asked.with_parts(renderer=HeldParameters(asked.renderer, {"map": point["map"]}))
+    inner, part = ur.GaussNewton(8, 4), {"pose": point["pose"]}
+    _, own = inner.estimate(alone, part, inner.init(alone, part), Key(3))
+    assert sum(mean.one.nbytes + mean.other.nbytes for mean in own.residuals) == 24 * asked.pixels
+
+
 def test_auto_gives_poses_beside_a_texture_a_block_of_their_own() -> None:
     plan = method("auto").plan(problem())
     assert isinstance(plan.estimator, ur.estimators.HybridGradient)

@@ -10,6 +10,7 @@ import numpy as np
 from unrender.statistics import scores
 
 __all__ = [
+    "REMEMBERED",
     "HalvesMean",
     "LossWeights",
     "Products",
@@ -21,6 +22,8 @@ __all__ = [
     "squared_slope",
 ]
 
+REMEMBERED = 1 << 19
+"""Largest number of pixels, times elements for derivative images, of images whose mean over steps is kept. Both halves take 12 MiB."""
 _VALUES = 1 << 22
 """Maximum number of image values that are converted to double precision at once."""
 _MEMORY = 0.3
@@ -162,7 +165,7 @@ def mean_residuals(
         step: last step, (m,).
         moved: its length in units of the differences' widths.
     """
-    now = HalvesMean(weights.one, weights.other)
+    now = HalvesMean(weights.one.astype(np.float32), weights.other.astype(np.float32))
     if before is None:
         return now
     slopes = 0.5 * (derivatives.one + derivatives.other)
@@ -201,7 +204,7 @@ def products(
     Args:
         halves: derivative images.
         weights: derivatives of the loss; None if only `squares` is needed.
-        residuals: mean of ℓ' over steps, for `scores`; None for that of `weights`.
+        residuals: mean of ℓ' over steps, for `scores`; None for no scores.
         block: side of the blocks of pixels over which all but `squares` are summed.
         remembered: whether all steps share the derivative images. Their noise times that of the references then moves the solution, and
             `scores` include it.
@@ -213,17 +216,17 @@ def products(
         total.squares += (one * other).sum(axis=(1, 2, 3))
         if weights is None:
             continue
-        mean = residuals or HalvesMean(weights.one, weights.other)
+        means = () if residuals is None else (residuals.one, residuals.other)
         first, second, *at = (
-            x[rows].astype(np.float64)
-            for x in (weights.first, weights.second, weights.one, weights.other, mean.one, mean.other)
+            x[rows].astype(np.float64) for x in (weights.first, weights.second, weights.one, weights.other, *means)
         )
         if block > 1:
             one, other, first, *at = (_pooled(x, block) for x in (one, other, first, *at))
             second = _pooled(second, block) / _pooled(np.ones_like(second), block)
         both = [0.5 * (one + other)] * 2 if remembered else [one, other]
-        of_halves = [(part * of).sum(axis=3) for part, of in zip((one, other, *both), at, strict=True)]
-        total.scores += scores.covariance(of_halves[2], of_halves[3])
+        of_halves = [(part * of).sum(axis=3) for part, of in zip((one, other, *both), at, strict=False)]
+        if residuals is not None:
+            total.scores += scores.covariance(of_halves[2], of_halves[3])
         half = 0.5 * (of_halves[0] - of_halves[1]).reshape(m, -1)
         total.gradient_noise += half @ half.T
         noise_of_halves = 0.5 * (one - other)

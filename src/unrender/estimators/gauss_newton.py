@@ -25,6 +25,7 @@ from unrender.estimators.capabilities import (
     Smoothing,
 )
 from unrender.estimators.derivative_images import (
+    REMEMBERED,
     HalvesMean,
     LossWeights,
     Products,
@@ -64,7 +65,7 @@ class GaussNewtonState:
         point: parameters of the last estimate, (n,); None before the first.
         variances: running mean of the variance of each view's image, (H, W, 1); () without `noise_limit` and before the first estimate.
         derivatives: mean derivative images of each view; () without `remember` and before the first estimate.
-        residuals: mean derivatives of the loss of each view, moved along to `point`; () before the first estimate.
+        residuals: mean derivatives of the loss of each view, moved along to `point`; () without scores and before the first estimate.
     """
 
     widths: dict[str, float]
@@ -116,6 +117,9 @@ class GaussNewton:
             with noise, so a few noisy pixels, such as those of a visible lamp, do not outweigh the others; > 0. None for equal weights.
         remember: whether derivative images are averaged over steps while steps are short relative to the widths. Their noise is then
             small relative to the derivatives also for elements that hardly change the image. Not for large pictures of many elements.
+        scores: whether residuals are averaged over steps for `ScoreCovariance`, which standard errors need. Problems of more than
+            `REMEMBERED` pixels in all views have no scores, since the mean takes 24 bytes per pixel. Runs whose optimizer states no
+            errors do without.
     """
 
     spp: int = 256
@@ -127,6 +131,7 @@ class GaussNewton:
     largest: Mapping[str, float] = field(default_factory=dict)
     noise_limit: float | None = None
     remember: bool = False
+    scores: bool = True
 
     def __post_init__(self):
         for key, width in self.largest.items():
@@ -142,8 +147,9 @@ class GaussNewton:
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient and its covariances, a Hessian and its noise."""
-        return Capabilities(Gradient, GradientNoise, Hessian, HessianNoise, ScoreCovariance)
+        """A gradient and its noise, a Hessian and its noise; with `scores`, the covariance by the references' noise."""
+        scores = (ScoreCovariance,) if self.scores else ()
+        return Capabilities(Gradient, GradientNoise, Hessian, HessianNoise, *scores)
 
     def init(self, problem: Problem, parameters: Tree) -> GaussNewtonState:
         """Return the state before the first step. Raise `InputError` for a parameter that cannot be perturbed or has a preconditioner,
@@ -172,6 +178,8 @@ class GaussNewton:
         state = self._sharpened(state, point.theta, moved)
         system = point.system(state, key.fold(0), step, moved)
         found = system.products
+        noisy = system.references_have_noise
+        scores = (ScoreCovariance(found.scores if noisy else np.zeros_like(found.scores)),) if point.scores else ()
         estimate = Estimate(
             system.loss,
             trees.unravel(found.gradient, parameters),
@@ -179,8 +187,8 @@ class GaussNewton:
                 Hessian(found.hessian),
                 HessianNoise(found.noise),
                 GradientNoise(found.gradient_noise),
-                ScoreCovariance(found.scores if system.references_have_noise else np.zeros_like(found.scores)),
                 Smoothing(dict(state.widths)),
+                *scores,
             ),
             {"samples": point.samples, "images": system.images},
         )
@@ -206,7 +214,7 @@ class GaussNewton:
             widths=widths,
             variances=tuple(system.variances) or state.variances,
             derivatives=tuple(system.derivatives) or state.derivatives,
-            residuals=tuple(system.residuals) or state.residuals,
+            residuals=tuple(system.residuals),
         )
 
 
@@ -283,6 +291,7 @@ class _Point:
     Attributes:
         samples: number of paths traced so far.
         largest: largest width of each parameter, infinite if there is none.
+        scores: whether residuals are averaged over steps.
     """
 
     def __init__(self, options: GaussNewton, problem: Problem, parameters: Tree):
@@ -290,6 +299,7 @@ class _Point:
         self.session: RenderSession = problem.renderer.prepare(list(parameters), None, derivatives=False)
         self.theta = trees.ravel(parameters)
         self.samples = 0
+        self.scores = options.scores and problem.pixels <= REMEMBERED
         ranges = {key: (unknown.bounds[0], unknown.bounds[1]) for key, unknown in problem.unknowns.items()}
         self.largest = {
             key: min(
@@ -325,7 +335,7 @@ class _Point:
                     mean = state.derivatives[len(total.derivatives)].and_one(mean, moved)
                 total.derivatives.append(mean)
             residuals = None
-            if weights is not None and step is not None:
+            if self.scores and weights is not None and step is not None:
                 before = state.residuals[len(total.residuals)] if state.residuals else None
                 residuals = mean_residuals(before, weights, mean, step[elements], moved)
                 total.residuals.append(residuals)

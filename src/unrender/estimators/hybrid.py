@@ -151,6 +151,8 @@ class HybridGradient:
             raise InputError(
                 f"HybridGradient: averaged needs a path that provides a variance, such as MetaEstimator(), got {type(self.path).__name__}"
             )
+        if isinstance(self.perturbed, GaussNewton):  # no error is stated of a block
+            object.__setattr__(self, "perturbed", replace(self.perturbed, scores=False))
         if self.keys is not None:
             if isinstance(self.keys, str) or not all(isinstance(key, str) for key in self.keys):
                 raise InputError(f"HybridGradient: keys must be a list of parameters' keys, got {self.keys!r:.80}")

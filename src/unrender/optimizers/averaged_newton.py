@@ -59,10 +59,10 @@ class AveragedNewtonState:
         lengths: length of the last step of the elements that moved together, in units of the trust region, (n,).
         scatter: covariance of `target` from noise, (n, n): the sum over models of the squared weight times the squared difference between
             the model's gradient and that of the previous mean.
-        radii: radius of the trust region of each element, (n,), in its units.
+        radii: radius of the trust region of each element, (n,), in its units; 0 without a limit.
         step: last step, in units of the parameters, (n,).
         end: planned parameters after the last step, (n,). The parameters differ from it where their bounds are.
-        scores: latest covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; 0 if there is none.
+        scores: latest covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; None if it is unknown.
     """
 
     learning_rates: dict[str, float]
@@ -77,7 +77,7 @@ class AveragedNewtonState:
     radii: np.ndarray
     step: np.ndarray
     end: np.ndarray
-    scores: np.ndarray
+    scores: np.ndarray | None
 
 
 @register
@@ -143,8 +143,8 @@ class AveragedNewton:
         own = rates.per_parameter("AveragedNewton", parameters, self.learning_rate, learning_rates)
         n = trees.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
-        radii = np.full(n, np.inf if self.trust_radius is None else self.trust_radius)
-        return AveragedNewtonState(own, square, row, square, square, row, row, row, square, radii, row, row, square)
+        radii = np.full(n, self.trust_radius or 0.0)
+        return AveragedNewtonState(own, square, row, square, square, row, row, row, square, radii, row, row, None)
 
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
@@ -156,8 +156,9 @@ class AveragedNewton:
             return trees.unravel(np.zeros_like(x), parameters), state
         hessian = 0.5 * (hessian + hessian.T)
         added, fluctuation, scores = (
-            _finite(estimate.get(kind), hessian) for kind in (HessianNoise, GradientNoise, ScoreCovariance)
+            _finite(estimate.get(kind)) for kind in (HessianNoise, GradientNoise, ScoreCovariance)
         )
+        added, fluctuation = (np.zeros_like(hessian) if x is None else x for x in (added, fluctuation))
         scale = coordinate_scales(estimate, state, parameters)
         region = scale * self._reaches(parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
@@ -200,10 +201,13 @@ class AveragedNewton:
     def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:
         """Return the standard errors of A⁻¹ b, from the scatter of the models' gradients about those of the mean.
 
-        They cover the run's own noise and that of the references, not the bias of finite differences. They need about ten models. They
+        They cover the run's own noise and that of the references, not the bias of finite differences. There are none if the last estimate
+        does not tell the references' noise (`ScoreCovariance`). They need about ten models. They
         are infinite for elements that change no image, or that have a share in a damped direction, which the images hardly determine.
         Parameters whose models have no noise at all have none.
         """
+        if state.scores is None:
+            return {}
         errors = np.full(len(state.matrix), np.inf)
         for block in _blocks(state.matrix != 0.0):
             both = np.ix_(block, block)
@@ -278,7 +282,7 @@ class AveragedNewton:
             variances = np.einsum("ki,kl,li->i", eigenvectors, noise, eigenvectors)
             curvatures = curvatures + variances / (curvatures * self.trust_radius**2)
         return eigenvectors @ trust_region_step(
-            curvatures, eigenvectors.T @ gradient, None if np.isinf(radius) else radius
+            curvatures, eigenvectors.T @ gradient, None if self.trust_radius is None else radius
         )
 
 
@@ -305,10 +309,12 @@ def _surprise(news: np.ndarray, noise: np.ndarray) -> float:
     return max(square - _SURPRISE_ERRORS * math.sqrt(2.0 / news.size), 1.0)
 
 
-def _finite(capability: GradientNoise | HessianNoise | ScoreCovariance | None, like: np.ndarray) -> np.ndarray:
-    """Return the matrix of a capability in double precision, or 0 if there is none, or it is not finite."""
-    matrix = np.zeros_like(like) if capability is None else arrays.numpy(capability.matrix).astype(np.float64)
-    return matrix if np.isfinite(matrix).all() else np.zeros_like(like)
+def _finite(capability: GradientNoise | HessianNoise | ScoreCovariance | None) -> np.ndarray | None:
+    """Return the matrix of a capability in double precision; None if there is none, or it is not finite."""
+    if capability is None:
+        return None
+    matrix = arrays.numpy(capability.matrix).astype(np.float64)
+    return matrix if np.isfinite(matrix).all() else None
 
 
 def _outwards(state: AveragedNewtonState, x: np.ndarray) -> np.ndarray:

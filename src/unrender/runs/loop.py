@@ -16,9 +16,10 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
 from unrender.estimators.coordinates import by_coordinates
+from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
-from unrender.optimizers.base import Optimizer
+from unrender.optimizers.base import Measuring, Optimizer
 from unrender.runs.mesh_guard import guarded
 from unrender.runs.noise import GradientNoise
 from unrender.runs.phase_times import COMPILING
@@ -39,6 +40,8 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
     problem, estimator = plan.configured(), plan.estimator
     optimizer = plan.bound_optimizer(problem)
     problem.executor.check(estimator)
+    if isinstance(estimator, GaussNewton) and not isinstance(optimizer, Measuring):
+        estimator = replace(estimator, scores=False)
     if optimizer.requires == Capabilities(LossFunction):  # a search, whose mean would differ from the loop's parameters
         for key in problem.coordinates.preconditioners:
             raise InputError(

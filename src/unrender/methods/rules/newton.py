@@ -76,7 +76,9 @@ def few_numbers(traits: Traits) -> Plan | None:
     estimator = _estimator(traits, keys, constants.pose_images)
     estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.remembered)
     if traits.poses:
-        trial = replace(estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None, remember=False)
+        trial = replace(
+            estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None, remember=False, scores=False
+        )
         trial = replace(trial, largest=widths_of(traits.options.sigma, problem, traits.poses))
         least = constants.explained if shapes else constants.explained_light
         if not problem.loss.linear or not explained(problem, trial) > least:
