@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,12 +19,15 @@ __all__ = [
     "mean_residuals",
     "noise_weights",
     "products",
+    "references_have_noise",
     "running_mean",
     "squared_slope",
 ]
 
 REMEMBERED = 1 << 19
 """Largest number of pixels, times elements for derivative images, of images whose mean over steps is kept. Both halves take 12 MiB."""
+_RESIDUAL_ERRORS = 2.0
+"""Standard errors of the sum of squared residuals from which on references have noise."""
 _VALUES = 1 << 22
 """Maximum number of image values that are converted to double precision at once."""
 _MEMORY = 0.3
@@ -170,6 +174,12 @@ def mean_residuals(
         return now
     slopes = 0.5 * (derivatives.one + derivatives.other)
     return before.plus(weights.second * np.tensordot(step, slopes, axes=1)).and_one(now, moved)
+
+
+def references_have_noise(residuals: Iterable[HalvesMean]) -> bool:
+    """Return whether the mean residuals of all views are more than the noise of renderings, which is all that exact references leave."""
+    squares = np.array([mean.shared() for mean in residuals]).reshape(-1, 2).sum(axis=0)
+    return bool(squares[0] > _RESIDUAL_ERRORS * math.sqrt(squares[1]))
 
 
 def squared_slope(halves: list[np.ndarray]) -> float:

@@ -33,6 +33,7 @@ from unrender.estimators.derivative_images import (
     mean_residuals,
     noise_weights,
     products,
+    references_have_noise,
     running_mean,
     squared_slope,
 )
@@ -49,8 +50,6 @@ _SETTLED = 0.5
 """Maximum step, in units of the widths, after which the shift is halved."""
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
 """Stream of `explained`, and relative eigenvalue below which its matrix counts as singular."""
-_RESIDUAL_ERRORS = 2.0
-"""Standard errors of the sum of squared residuals from which on references have noise."""
 _IMAGE = 2
 """Stream of a view's key for the image. Lower streams are for the two halves of the derivative images."""
 
@@ -178,7 +177,7 @@ class GaussNewton:
         state = self._sharpened(state, point.theta, moved)
         system = point.system(state, key.fold(0), step, moved)
         found = system.products
-        noisy = system.references_have_noise
+        noisy = references_have_noise(system.residuals)
         scores = (ScoreCovariance(found.scores if noisy else np.zeros_like(found.scores)),) if point.scores else ()
         estimate = Estimate(
             system.loss,
@@ -267,12 +266,6 @@ class _System:
     variances: list[np.ndarray] = field(default_factory=list)
     derivatives: list[HalvesMean] = field(default_factory=list)
     residuals: list[HalvesMean] = field(default_factory=list)
-
-    @property
-    def references_have_noise(self) -> bool:
-        """Return whether the mean residuals are more than the noise of renderings, which is all that exact references leave."""
-        squares = np.array([mean.shared() for mean in self.residuals]).reshape(-1, 2).sum(axis=0)
-        return bool(squares[0] > _RESIDUAL_ERRORS * math.sqrt(squares[1]))
 
 
 @dataclass(frozen=True)
