@@ -33,7 +33,7 @@ def start_factors(problem: Problem, keys: Sequence[str], constants: Constants) -
     halves, so noise does not bias them. The other unknowns are at their start, so factors are no better than these.
 
     A start that is ten times too bright costs Adam more steps than one that is ten times too dark: its second moments remember the first
-    first gradients, which are a hundred times as large as the later ones.
+    gradients, which are a hundred times as large as the later ones.
 
     The problem's own loss must be less, too. A saturated reference, for example, says nothing against a brighter image.
 
