@@ -157,7 +157,9 @@ def test_numbers_beside_a_texture_that_there_was_time_to_move_once_only(monkeypa
 
     monkeypatch.setattr(_Adjoints, "of", slow)
     found = check_numbers(made, values, made.initial_values(), 2.0, sensitivity)
-    assert_no_error_is_stated(made, found, ("a", "b"), "standard errors of a, b", "texture (no time was left)")
+    assert_no_error_is_stated(
+        made, found, ("a", "b"), "standard errors of a, b", "texture (no time was left; use more seconds)"
+    )
     monkeypatch.setattr(field_directions, "_ROUNDS", 1)
     found = check_numbers(made, values, made.initial_values(), FAR, sensitivity)
     assert_no_error_is_stated(made, found, ("a", "b"), "texture (their shares in the pictures are not resolved)")
@@ -203,6 +205,14 @@ def test_a_run_folder_states_no_error_of_numbers_beside_a_prior(tmp_path: Any):
     assert not {"a", "b"} & set(found.standard_error)
     (line,) = [line for line in found.undetermined if line.startswith("standard errors of")]
     assert line == "standard errors of a, b: they are unknown beside texture (it has a prior)"
+
+
+def test_a_number_that_is_undetermined_has_one_line():
+    check = NumbersCheck(undetermined={"a": "a: open"}, unchecked=("a", "b"), fixed={"texture": "it has a prior"})
+    assert check.missing(check.undetermined) == [
+        "standard errors of b: they are unknown beside texture (it has a prior)"
+    ]
+    assert not check.missing(check.unchecked)
 
 
 def test_a_number_beside_one_with_a_prior():

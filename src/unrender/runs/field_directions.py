@@ -29,8 +29,8 @@ _SHRINKS = 0.9
 """Ratio of a number's squared remainder to that of the round before, up to which there is another round."""
 _RIDGE = 0.3
 """Sensitivity relative to the median below which cells hardly take part."""
-_UNRESOLVED = "their shares in the pictures are not resolved"
-"""Reason of a missing standard error: the directions found so far do not contain all that trades off against a number."""
+_LATE, _UNRESOLVED = "no time was left; use more seconds", "their shares in the pictures are not resolved"
+"""Reasons of a missing standard error: the directions found so far do not contain all that trades off against a number."""
 
 
 def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tuple[tuple[str, ...], dict[str, str]]:
@@ -115,7 +115,7 @@ def beside_fields(
         longest = max(longest, time.perf_counter() - started)
     if not parts:
         return None
-    missing = "" if not len(targets) else _UNRESOLVED if len(parts) == _ROUNDS else "no time was left"
+    missing = "" if not len(targets) else _UNRESOLVED if len(parts) == _ROUNDS else _LATE
     if (independent := _independent(made, differences, _joined(parts), len(keys))) is None:
         return numbers, differences, _UNRESOLVED
     return *independent, missing

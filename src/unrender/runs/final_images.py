@@ -179,7 +179,9 @@ def _undetermined(
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
     text, deviations = "\n".join(lines), _without(result.standard_error, numbers.unchecked)
-    lines += [line for key, line in numbers.undetermined.items() if key not in text] + numbers.missing()
+    lines += [line for key, line in numbers.undetermined.items() if key not in text] + numbers.missing(
+        numbers.undetermined
+    )
     deviations |= numbers.standard_errors(result.parameters, deviations)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)

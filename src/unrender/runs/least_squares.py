@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -78,16 +78,15 @@ class NumbersCheck:
     unchecked: tuple[str, ...] = ()
     fixed: Mapping[str, str] = field(default_factory=dict)
 
-    def missing(self) -> list[str]:
-        """Return a line that says why standard errors are unknown; [] if none are."""
-        if not self.unchecked:
+    def missing(self, told: Collection[str] = ()) -> list[str]:
+        """Return a line that says why standard errors are unknown; [] if all are known, or if other lines `told` of these numbers."""
+        keys = [key for key in self.unchecked if key not in told]
+        if not keys:
             return []
         if not self.fixed:
-            return [
-                f"whether {listed(self.unchecked)} converged: no time was left to test it; use more seconds or fewer pixels"
-            ]
+            return [f"whether {listed(keys)} converged: no time was left to test it; use more seconds or fewer pixels"]
         beside = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
-        return [f"standard errors of {listed(self.unchecked)}: they are unknown beside {beside}"]
+        return [f"standard errors of {listed(keys)}: they are unknown beside {beside}"]
 
     def standard_errors(
         self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] = MappingProxyType({})
