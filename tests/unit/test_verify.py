@@ -14,6 +14,7 @@ import unrender as ur
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs import verify
 from unrender.runs.folder import reader
 from unrender.runs.folder.schema import NOT_VERIFIED
 from unrender.statistics import paired_losses
@@ -262,6 +263,25 @@ def test_pixels_are_drawn_where_there_are_many() -> None:
     assert result.verification["paths"] == 1 << 13
     assert result.verification["end"][0] == pytest.approx(loss, rel=0.15)
     assert result.status == "finished"
+
+
+@pytest.mark.parametrize(("views", "share"), [(1, 0.0), (30, 0.0), (30, 1.0)])
+def test_pictures_of_other_pixels_are_not_subtracted(views: int, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the end of a run that stands still, other or more pixels are rendered than before, unless both pictures have all."""
+    fresh: list[Any] = []
+    real = verify.misfit
+
+    def noted(*arguments: Any) -> Any:
+        fresh.append(arguments[-1])
+        return real(*arguments)
+
+    monkeypatch.setattr(verify, "_SHARE", share)
+    monkeypatch.setattr(verify, "misfit", noted)
+    result = ur.optimize(made(views=views), ur.PathGradient(spp=8), ur.optimizers.Adam(0.03), steps=300)
+    assert result.status == "finished"
+    assert (result.verification["paths"] > 1 << 15) is (share == 1.0)
+    assert fresh
+    assert all((x is None) is (views == 30) for x in fresh)
 
 
 class Noting(AnalyticRenderer):

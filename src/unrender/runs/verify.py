@@ -145,7 +145,7 @@ class Verify(Callback):
         memory = _memory(run, pictures, last)
         disagrees = memory is not None and memory.disagrees
         best_picture = places[best][0] if places else last
-        lines = self._residual(problem, result, last)
+        lines = self._residual(problem, result, pictures, last)
         if result.standard_error and not (lines or places):
             differences = np.concatenate(last.images, axis=1) - pictures.references
             differs = misfit_of_numbers(problem, differences, pictures.references, pictures.weights)
@@ -176,13 +176,14 @@ class Verify(Callback):
             warnings=[*result.warnings, *lines],
         )
 
-    def _residual(self, problem: Problem, result: Result, end: Picture) -> list[str]:
+    def _residual(self, problem: Problem, result: Result, pictures: FreshPictures, end: Picture) -> list[str]:
         """Return a warning if the images no longer improve, and still differ from the references by more than noise.
 
         Args:
             problem: problem of the run.
             result: result of the run.
-            end: the last image, with random numbers independent of those of earlier steps.
+            pictures: renderer of the last image, with random numbers independent of those of earlier steps.
+            end: the last image.
         """
         earlier = next((one for one in reversed(self._earlier) if one.is_compared(result.steps)), None)
         if self._pictures is None or earlier is None:
@@ -192,7 +193,8 @@ class Verify(Callback):
             return []
         least = _OF_PICTURE_SHORT if earlier.is_short else _OF_PICTURE
         references, weights = self._pictures.references, self._pictures.weights
-        fresh = np.concatenate(end.images, axis=1) - references
+        sampled = pictures.sampled or self._pictures.sampled  # each has other pixels then
+        fresh = None if sampled else np.concatenate(end.images, axis=1) - references
         found = misfit(last.residuals, earlier.residuals, references, weights, least, fresh)
         if found is None:
             return []
