@@ -39,6 +39,7 @@ def test_a_toml_problems_result_goes_home(unrender, run: Path, mitsuba_variant: 
     np.testing.assert_allclose([float(row["value"]) for row in rows], value, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_gallery_problems_maps_are_pictures(unrender, tmp_path: Path, mitsuba_variant: str) -> None:
     options = ["-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=2"]
     words = ["run", "indirect-room", *options, "--steps", 2, "--out", "room", "--variant", mitsuba_variant, *QUICK]

@@ -99,6 +99,7 @@ def test_run_of_the_gallery_s_problem_without_a_renderer(unrender, problem: Path
     assert "rate error 1 before, 0.0" in " ".join(answer.out.split())
 
 
+@pytest.mark.slow
 def test_run_takes_emitters_by_the_gradient_s_variance(unrender, problem: Path, mitsuba_variant: str):
     scene = problem.parent / "wall.xml"
     two = '<emitter type="constant"/><emitter type="point"><point name="position" value="0, 0, 1"/></emitter>'

@@ -258,6 +258,7 @@ def file(
     return folder / "problem.toml"
 
 
+@pytest.mark.slow
 def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
     made = ur.Problem.from_file(file(tmp_path))
     assert isinstance(made.renderer, ExpressionRenderer)

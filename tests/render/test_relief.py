@@ -33,6 +33,7 @@ def test_the_true_heights_render_the_references(problem: ur.Problem) -> None:
         assert np.abs((flat - reference) / noise).max() > 10
 
 
+@pytest.mark.slow
 def test_the_gradient_by_the_heights_is_the_slope_of_the_loss(problem: ur.Problem) -> None:
     """Along one direction: |z| < 4 against differences of the loss of Mitsuba's pictures, and a factor of 0.75 is found out."""
     width, direction = 0.05, _heights(SIZE.height_resolution)

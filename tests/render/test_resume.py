@@ -275,6 +275,7 @@ def test_a_problem_of_an_xml_scene_is_made_again_with_its_arrays(wall: Path) -> 
     assert ur.resume(folder).steps == 8
 
 
+@pytest.mark.slow
 def test_a_problem_made_in_python_is_to_be_handed_in(tmp_path: Path) -> None:
     from mitsuba import cornell_box
 

@@ -181,6 +181,7 @@ def test_a_known_pose_moves_an_object_in_one_view() -> None:
     assert np.abs(result.parameters[WALL] - 0.3).mean() < 0.05
 
 
+@pytest.mark.slow
 def test_lamps_of_three_pictures_are_told_apart() -> None:
     """Wall and lamp trade off in one picture; lamps that are lit one by one, of which one is known, tell them apart."""
     result = ur.optimize(lit_apart(), "auto", steps=150, progress=False)

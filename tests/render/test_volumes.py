@@ -140,6 +140,7 @@ def test_density_that_was_zero_everywhere_is_found() -> None:
     assert (gradient < 0).mean() > 0.9
 
 
+@pytest.mark.slow
 def test_a_grid_made_by_others_is_rendered_and_differentiated(assets: Path) -> None:
     """Mitsuba's tutorial volume: against `volpath`, and with a gradient that is finite and not zero."""
     smoke = {"type": "gridvolume", "filename": str(assets / "tutorials" / "volume.vol"), "to_world": _onto_the_cube()}

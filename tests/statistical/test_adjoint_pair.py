@@ -49,6 +49,7 @@ def test_the_previous_state_s_adjoint_is_the_derivative_of_its_image_on_the_shar
         assert found == pytest.approx(expected, rel=0.02), key
 
 
+@pytest.mark.slow
 def test_equal_states_have_equal_gradients() -> None:
     material, changes = MATERIALS[next(iter(MATERIALS))]
     renderer = MitsubaRenderer(scene(material()), DEPTH)

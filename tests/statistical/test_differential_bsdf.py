@@ -120,7 +120,8 @@ def test_it_is_the_finite_difference_of_images(alpha: float, monkeypatch: pytest
     assert worst(np.array(differences), wrong)[0] > limit
 
 
-@pytest.mark.parametrize("sides", quick(["one", "two"], "two"))
+@pytest.mark.slow
+@pytest.mark.parametrize("sides", ["one", "two"])
 def test_textures_and_other_parameters_keep_their_gradients(sides: str) -> None:
     """Each texel of a map of roughness, a reflectance and a floor's colour beside it, seen from both sides where there are two."""
     values = np.random.default_rng(4).uniform(0.05, 0.3, (2, 2, 1))

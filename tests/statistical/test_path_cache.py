@@ -220,6 +220,7 @@ def test_the_gradient_of_black_texels_has_their_indirect_light() -> None:
     assert slope(session._inner) != pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 def test_large_renderings_and_random_numbers_alone_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     session, current, previous = prepared("textures")
     request = SampleRequest(0, 2, 7)
