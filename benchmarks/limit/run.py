@@ -15,7 +15,7 @@ A channel of a colour is assumed to reach the same channel of the picture alone.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import method
+from benchmarks.races import Recorder
 from benchmarks.runner.records import Record
 from benchmarks.suite import scenes
 from benchmarks.suite.run import error_of, visible
@@ -124,18 +125,6 @@ def limit(problem: ur.Problem, fisher: np.ndarray, rows: dict[str, slice], paths
     return np.array(curves)
 
 
-class Curve(ur.protocols.Callback):
-    """Record (paths in a pixel, error) of each step."""
-
-    def __init__(self, error: Callable[[dict[str, Any]], float], pixels: int):
-        self.points: list[tuple[float, float]] = []
-        self._error, self._pixels = error, pixels
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """Add a point."""
-        self.points.append((record["samples"] / self._pixels, self._error(run.parameters)))
-
-
 def run(
     problem: tuple[str, ...] = (*GALLERY, *FOREIGN),
     assets: Path | None = None,
@@ -160,13 +149,14 @@ def run(
         else:
             opened = ur.gallery.problem(name, **GALLERY[name], loss="L2")
         unbiased, most, rows = information(opened, paths)
-        runs = []
+        error, runs = error_of(opened), []
         for seed in range(seeds):
-            curve = Curve(error_of(opened), opened.pixels)
-            ur.optimize(opened, method("auto").plan(opened), steps=steps, seed=seed, callbacks=[curve], progress=False)
-            runs.append(curve.points)
-        traced = np.array(runs[0])[:, 0]
-        errors = np.median([np.array(points)[:, 1] for points in runs], axis=0)
+            recorder = Recorder(lambda parameters, of=error: {"": of(parameters)}, {"": error(opened.initial())}, 0.0)
+            plan = method("auto").plan(opened)
+            ur.optimize(opened, plan, steps=steps, seed=seed, callbacks=[recorder], progress=False)
+            runs.append(np.array(recorder.points[""])[1:])
+        traced = runs[0][:, 1] / opened.pixels
+        errors = np.median([points[:, 2] for points in runs], axis=0)
         numbers = np.geomspace(traced[0] / 1e4, traced[-1], 200)
         least, lowest = (limit(opened, fisher, rows, numbers) for fisher in (unbiased, most))
         every = max(1, steps // 40)

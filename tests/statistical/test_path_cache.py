@@ -104,6 +104,12 @@ SCENES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...]]] = {
     "texture and emitters": (diffuse, (BALL, LAMP, "sky.data")),
     "emitters": (textured_lamp, ("lamp.emitter.radiance.data", "sky.radiance.value")),
     "twosided, film filter": (twosided, ("ball.bsdf.brdf_0.reflectance.data", FLOOR)),
+    "checkerboards": (
+        checkerboards,
+        ("ball.bsdf.reflectance.color0.data", "floor.bsdf.reflectance.color0.value", "sky.data"),
+    ),
+    "instances": (instances, ("ball.bsdf.reflectance.data", FLOOR)),
+    "early roulette": (roulette, (FLOOR, BALL, LAMP)),
 }
 
 
@@ -161,17 +167,6 @@ def compare(session: CachingSession, current: dict[str, Any], previous: dict[str
         )
         for key, value in other.items():
             assert_equal(one[key], value)
-
-
-MORE_SCENES: dict[str, tuple[Callable[[], dict[str, Any]], tuple[str, ...]]] = {
-    "checkerboards": (
-        checkerboards,
-        ("ball.bsdf.reflectance.color0.data", "floor.bsdf.reflectance.color0.value", "sky.data"),
-    ),
-    "instances": (instances, ("ball.bsdf.reflectance.data", FLOOR)),
-    "early roulette": (roulette, (FLOOR, BALL, LAMP)),
-}
-SCENES |= MORE_SCENES
 
 
 @pytest.mark.parametrize("name", quick(SCENES, "textures"))
