@@ -136,6 +136,10 @@ class FreshPictures:
             parts = [self._losses(frame, of) for frame, of in zip(self.frames, images, strict=True)]
         return np.concatenate(parts, axis=1)
 
+    def differences(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return the differences (K, N, 3) of images (K, N, 3) of each frame from the references."""
+        return np.concatenate(images, axis=1) - self.references
+
     def residual(self, images: Sequence[np.ndarray]) -> float:
         """Return the mean square difference over pixels and channels between images (K, N, 3) of each frame and the references."""
         means = np.concatenate([one.mean(axis=0) for one in images])

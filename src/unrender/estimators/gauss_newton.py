@@ -176,16 +176,16 @@ class GaussNewton:
         moved = float(np.max(np.abs(step) / trees.repeat_per_element(state.widths, parameters), initial=0.0))
         state = self._sharpened(state, point.theta, moved)
         system = point.system(state, key.fold(0), step, moved)
-        found = system.products
+        sums = system.products
         noisy = references_have_noise(system.residuals)
-        scores = (ScoreCovariance(found.scores if noisy else np.zeros_like(found.scores)),) if point.scores else ()
+        scores = (ScoreCovariance(sums.scores if noisy else np.zeros_like(sums.scores)),) if point.scores else ()
         estimate = Estimate(
             system.loss,
-            trees.unravel(found.gradient, parameters),
+            trees.unravel(sums.gradient, parameters),
             (
-                Hessian(found.hessian),
-                HessianNoise(found.noise),
-                GradientNoise(found.gradient_noise),
+                Hessian(sums.hessian),
+                HessianNoise(sums.noise),
+                GradientNoise(sums.gradient_noise),
                 Smoothing(dict(state.widths)),
                 *scores,
             ),

@@ -109,24 +109,10 @@ def render_final_images(
             take about half a second.
         tested: whether to estimate sensitivities and to test what the images determine.
     """
-    pictures: dict[str, np.ndarray] = {}
-    errors: dict[str, tuple[float, float]] = {}
-    ends: list[tuple[np.ndarray, ...]] = []
     with phases.phase("final pictures") as advance:
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
         chosen = _chosen(problem)
-        for place, index in enumerate(chosen):
-            reference = np.asarray(problem.views[index].reference, np.float32)
-            pictures[f"view{index}/reference"] = reference
-            for done, (which, values) in enumerate((("initial", result.initial), ("result", result.parameters))):
-                name = image_name(index, which)
-                of = problem.remeshed_from or problem if which == "initial" else problem
-                halves, error = _picture(of, values, index, samples, _SEEDS[which])
-                pictures[name] = sum(halves[1:], halves[0]) / len(halves)
-                ends += [halves] if which == "result" else []
-                errors |= {name: error} if error is not None else {}
-                advance((2 * place + done + 1) / (2 * len(chosen)))
-            pictures |= _maps(result, index, reference.shape[:2])
+        pictures, errors, ends = _pictures(problem, result, chosen, samples, advance)
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
         everything = tested and len(chosen) == len(problem.views)
@@ -135,7 +121,8 @@ def render_final_images(
         known, maps = Curvature({}, {}, 0), Uncertainty()
         if everything:
             known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
-        sensitivities, lines, warnings, deviations = known.sensitivity(), [], (), dict(result.standard_error)
+        sensitivities, deviations = known.sensitivity(), dict(result.standard_error)
+        lines, warnings = [], ()
         if not tested and result.steps:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
             lines, deviations = late.missing(), _without(deviations, late.unchecked)
@@ -145,8 +132,34 @@ def render_final_images(
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
     if result.steps and (differs := misfit_of_views(problem, chosen, ends, result.warnings)):
-        warnings, deviations = (*warnings, differs) if differs not in result.warnings else warnings, {}
+        deviations = {}
+        if differs not in result.warnings:
+            warnings = (*warnings, differs)
     return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share)
+
+
+def _pictures(
+    problem: Problem, result: Result, views: Sequence[int], spp: int, advance: Callable[[float], None]
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[float, float]], list[tuple[np.ndarray, ...]]]:
+    """Return the pictures of some views by name, their errors, and the halves of each view's final image."""
+    pictures: dict[str, np.ndarray] = {}
+    errors: dict[str, tuple[float, float]] = {}
+    ends: list[tuple[np.ndarray, ...]] = []
+    for place, index in enumerate(views):
+        reference = np.asarray(problem.views[index].reference, np.float32)
+        pictures[f"view{index}/reference"] = reference
+        for done, (which, values) in enumerate((("initial", result.initial), ("result", result.parameters))):
+            name = image_name(index, which)
+            of = problem.remeshed_from or problem if which == "initial" else problem
+            halves, error = _picture(of, values, index, spp, _SEEDS[which])
+            pictures[name] = sum(halves[1:], halves[0]) / len(halves)
+            if which == "result":
+                ends.append(halves)
+            if error is not None:
+                errors[name] = error
+            advance((2 * place + done + 1) / (2 * len(views)))
+        pictures |= _maps(result, index, reference.shape[:2])
+    return pictures, errors, ends
 
 
 def _maps(result: Result, view: int, shape: tuple[int, ...]) -> dict[str, np.ndarray]:

@@ -100,13 +100,13 @@ class NumbersCheck:
             values: {key: array} at the end of the run.
             known: {key: standard errors} from the run's own noise; errors are no smaller.
         """
-        found = {}
+        errors = {}
         for key, error in self.errors.items():
             square, noise = np.square(error), np.square(self.noise[key])
             square = square if key in known else np.maximum(square, noise)
             stated = np.sqrt(square + np.maximum(np.square(self.steps[key]) - noise, 0.0)).reshape(values[key].shape)
-            found[key] = np.maximum(stated, known.get(key, 0.0)).astype(np.float32)
-        return found
+            errors[key] = np.maximum(stated, known.get(key, 0.0)).astype(np.float32)
+        return errors
 
 
 @exclusive("check_numbers")
@@ -206,8 +206,8 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
                 picture = numbers.pictures(numbers.point[None], own.fold(2 + 2 * index + half))[0]
                 residuals[half] += picture - numbers.references()
         repeats += 1
-    found = _judged(numbers, _Fit.of(numbers, differences, residuals / (repeats * directions.shape[1])), widths)
-    return replace(found, errors={}, unchecked=numbers.keys, fixed=fixed) if fixed else found
+    check = _judged(numbers, _Fit.of(numbers, differences, residuals / (repeats * directions.shape[1])), widths)
+    return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed) if fixed else check
 
 
 def _directions(differences: Differences, limits: np.ndarray, change: float) -> np.ndarray:

@@ -285,8 +285,8 @@ def _residuals(problem: Problem, halves: Sequence[Sequence[np.ndarray]]) -> list
 
 def _unshared(residuals: Sequence[Sequence[np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return, for each view, estimates of the variance that neighbouring pixels do not share, (H - 1, W - 1, 3), and which are known."""
-    found = []
+    views = []
     for pair in zip(*residuals, strict=True):
         one, other = (0.5 * (x[1:, 1:] - x[:-1, 1:] - x[1:, :-1] + x[:-1, :-1]) for x in pair)
-        found.append((one * other, one != 0.0))
-    return found
+        views.append((one * other, one != 0.0))
+    return views

@@ -1,4 +1,4 @@
-"""Whether the pictures of a run agree with its references, and the control variates in its state."""
+"""Comparison of a run's pictures with its references, and the control variates in its state."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ def misfit(
         beyond = shared.score > paired_losses.SIGNIFICANT and error > smallest * size
         return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), by_pixel) if beyond else None
 
-    found = significant(paired_losses.systematic(one, weights, other), least, False)
-    if found or fresh is None or np.count_nonzero(weights) >= _FEW_PIXELS:
-        return found
+    difference = significant(paired_losses.systematic(one, weights, other), least, False)
+    if difference or fresh is None or np.count_nonzero(weights) >= _FEW_PIXELS:
+        return difference
     return significant(paired_losses.repeated(residuals, fresh, weights), _OF_FEW, True)
 
 
@@ -107,11 +107,11 @@ def misfit_of_numbers(
         return ""
     if told := next((line for line in known if DIFFERS in line), ""):
         return told
-    found = misfit(residuals[0::2], residuals[1::2], references, weights, _OF_PICTURE)
-    if found is None:
+    difference = misfit(residuals[0::2], residuals[1::2], references, weights, _OF_PICTURE)
+    if difference is None:
         return ""
     return (
-        f"{found.describe()}, which noise does not explain: the run needs more steps, another start or bounds (auto compares starts "
+        f"{difference.describe()}, which noise does not explain: the run needs more steps, another start or bounds (auto compares starts "
         "within them), or something that is not among the unknowns is wrong"
     )
 

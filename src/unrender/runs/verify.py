@@ -147,7 +147,7 @@ class Verify(Callback):
         best_picture = places[best][0] if places else last
         lines = self._residual(problem, result, pictures, last)
         if result.standard_error and not (lines or places):
-            differences = np.concatenate(last.images, axis=1) - pictures.references
+            differences = pictures.differences(last.images)
             differs = misfit_of_numbers(problem, differences, pictures.references, pictures.weights)
             lines = [differs] if differs else []
         if lines:
@@ -194,12 +194,12 @@ class Verify(Callback):
         least = _OF_PICTURE_SHORT if earlier.is_short else _OF_PICTURE
         references, weights = self._pictures.references, self._pictures.weights
         sampled = pictures.sampled or self._pictures.sampled  # each has other pixels then
-        fresh = None if sampled else np.concatenate(end.images, axis=1) - references
-        found = misfit(last.residuals, earlier.residuals, references, weights, least, fresh)
-        if found is None:
+        fresh = None if sampled else pictures.differences(end.images)
+        difference = misfit(last.residuals, earlier.residuals, references, weights, least, fresh)
+        if difference is None:
             return []
-        judged = found.by_pixel and problem.has_truth
-        if judged and found.error**2 <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
+        judged = difference.by_pixel and problem.has_truth
+        if judged and difference.error**2 <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
             return []
         cause = "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
         if any(unknown.prior is not None for unknown in problem.unknowns.values()):
@@ -208,7 +208,7 @@ class Verify(Callback):
         if earlier.is_short:
             still = f"has hardly improved since step {earlier.step} of {result.steps}"
             cause = f"it may need more steps, or {cause}"
-        return [f"{found.describe()}, and {still}: {cause}"]
+        return [f"{difference.describe()}, and {still}: {cause}"]
 
 
 @dataclass(frozen=True)
@@ -242,16 +242,11 @@ class _Earlier:
         noise = math.hypot(self.loss_error, _STILL_SHORT * earlier.loss_error)
         return _STILL_SHORT * earlier.loss + _SURE * noise < self.loss < math.inf
 
-    @property
-    def residual(self) -> np.ndarray:
-        """Return the mean image minus the references, (N, 3)."""
-        return self.residuals.mean(axis=0)
-
     @classmethod
     def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> _Earlier:
         """Render the parameters of a step."""
         picture = pictures.picture(values)
-        return cls(step, *picture.loss, np.concatenate(picture.images, axis=1) - pictures.references)
+        return cls(step, *picture.loss, pictures.differences(picture.images))
 
 
 def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Picture]:

@@ -15,7 +15,7 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules.traits import Traits
 from unrender.parameterisations.base import Bounds
 from unrender.scene.parameter import ParameterSettings
-from unrender.statistics.paired_losses import difference
+from unrender.statistics.paired_losses import difference, mean_and_error
 
 __all__ = ["best_start"]
 
@@ -58,9 +58,9 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan) -> Plan:
             losses, own = _losses(pictures, {**initial, **place}, lights, limits)
         except InputError:  # a value that the renderer rejects
             continue
-        if (total := _total(losses)) < least:
+        if (total := mean_and_error(losses)[0]) < least:
             best, factor, least, change = place, own, total, difference(losses, first, sampled=True)
-    start = _total(first)
+    start = mean_and_error(first)[0]
     share = max(least, 0.0) / start if start > 0.0 else math.inf  # without its noise, a loss may be negative
     if not share < _BETTER or not change.value > _ERRORS * change.standard_error:
         return plan
@@ -146,7 +146,7 @@ def _losses(
     own = [two - one for two, one in zip(double, images, strict=True)]
     factor = float(np.clip(_factor(pictures, images, own), *limits))
     others = pictures.losses([image + (factor - 1.0) * light for image, light in zip(images, own, strict=True)])
-    return (others, factor) if _total(others) < _total(losses) else (losses, 1.0)
+    return (others, factor) if mean_and_error(others)[0] < mean_and_error(losses)[0] else (losses, 1.0)
 
 
 def _factor(pictures: FreshPictures, images: Sequence[np.ndarray], own: Sequence[np.ndarray]) -> float:
@@ -160,8 +160,3 @@ def _factor(pictures: FreshPictures, images: Sequence[np.ndarray], own: Sequence
     weights = pictures.weights
     used = (weights > 0.0) & np.isfinite(products) & np.isfinite(squares)
     return 1.0 + float((products * weights)[used].sum() / max(float((squares * weights)[used].sum()), 1e-300))
-
-
-def _total(losses: np.ndarray) -> float:
-    """Return the loss without its noise, from pseudo-values (K, N)."""
-    return float(losses.mean(axis=0).sum())
