@@ -7,13 +7,13 @@
     result = ur.optimize(problem, estimator, ur.optimizers.Adam(learning_rate=1e-2), steps=300)
     result.save("out")
 
-Names are loaded when first used, so that `import unrender` is quick and works where Mitsuba does not (yet).
+Names are loaded when first used, so that `import unrender` is quick and works without a usable Mitsuba.
 """
 
 # ruff: noqa: E402
 from unrender.core.signals import end_at_once as _end_at_once
 
-_end_at_once()  # before anything that takes time
+_end_at_once()  # must precede slow imports
 
 import warnings
 from contextlib import suppress
@@ -70,7 +70,7 @@ _MODULES = {
     "smoothed": "estimators.smoothing",
     "statistics": "statistics",
 }
-"""Modules that are attributes without an import."""
+"""{attribute: module}. Each is imported at its first use."""
 _HOMES = {
     "Estimate": "estimators.base",
     "GaussNewton": "estimators.gauss_newton",
@@ -112,12 +112,12 @@ _MOVED = {
     "turntable": "app.turntable",
     "write_grid": "io.write_grid",
 }
-"""Names of the first drafts of this version, and where they are now. They go with version 0.2."""
+"""{former name: present name}. Former names emit a `DeprecationWarning`; version 0.2 removes them."""
 
-with suppress(VariantError):  # said again, in one line, by whatever needs Mitsuba first
-    _variant.prepare()  # before anything imports Dr.Jit, which reads the choice of LLVM once
+with suppress(VariantError):  # the first use of Mitsuba raises it again
+    _variant.prepare()  # must precede the import of Dr.Jit, which chooses LLVM once
 
-# The names of a first script. The other modules of `_MODULES` are for those who go further; `from unrender import *` leaves them out.
+# The names that a first script needs. `from unrender import *` leaves out the other modules of `_MODULES`.
 __all__ = [
     "Estimate",
     "GaussNewton",

@@ -1,7 +1,7 @@
-"""Protocols of components, for those who write their own, and the types that their methods take and return.
+"""Protocols of user-written components, and the types of their arguments and results.
 
-No class needs to inherit from a protocol: an object that has its methods is one (`typing.Protocol`). `Callback` is a base class, whose
-methods do nothing until they are overridden. Estimators state by capability types what they compute, optimizers what they require.
+An object implements a protocol by having its methods (`typing.Protocol`); it need not inherit. `Callback` is a base class, whose methods
+do nothing until they are overridden. Capability types state what an estimator computes and what an optimizer requires.
 """
 
 from unrender.estimators.base import Estimate, Estimator

@@ -105,6 +105,18 @@ def test_a_loaded_scene_has_one_state() -> None:
     assert ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(), steps=2).steps == 2
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_parameters_of_dr_jit_that_are_not_finite_are_one_line(bad: float) -> None:
+    """As those of NumPy: a later message would blame the loss."""
+    values = START.copy()
+    values[1, 2, 0] = bad
+    for one in (mi.TensorXf(values), values):
+        with pytest.raises(
+            InputError, match=rf"^parameter .*: expected finite numbers, got {bad} at \(1, 2, 0\), one of 1 of 48"
+        ):
+            ur.Renderer(surface, [TEXTURE], spp=1)({TEXTURE: one})
+
+
 def test_a_scene_of_another_variant_is_refused() -> None:
     Foreign = type("Scene", (), {"__module__": "mitsuba.scalar_rgb"})
     with pytest.raises(InputError, match="loaded under another variant than"):

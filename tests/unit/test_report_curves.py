@@ -103,3 +103,4 @@ def test_durations(seconds, text):
 
 def test_counts():
     assert [formatting.count(n) for n in (0, 999, 20_000, 1_500_000)] == ["0", "999", "20 k", "1.5 M"]
+    assert [formatting.count(n) for n in (999.6, 999_600, 999_400)] == ["1 k", "1 M", "999 k"]

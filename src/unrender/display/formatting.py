@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     import numpy as np
 
 LISTED = 4
-"""Elements of an array that are listed one by one."""
+"""Maximum number of elements of an array that are listed one by one."""
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNKNOWN = "–"
 
@@ -33,7 +33,7 @@ def number(value: float | None) -> str:
 def count(value: float) -> str:
     """Format a large number with a unit: 500, 20 k, 1.5 M."""
     for size, unit in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= size:
+        if abs(value) >= 0.9995 * size:  # three digits of anything from here on round to the next unit
             return f"{value / size:.3g} {unit}"
     return f"{value:.3g}"
 
@@ -57,7 +57,7 @@ def deviation(standard_error: float | None) -> str:
 
 
 def values(array: np.ndarray, standard_error: Sequence[float | None] | None = None) -> str:
-    """Format an array's elements, few of them with their standard errors; of many the least and the largest."""
+    """Format up to four elements, each with its standard error if known; of more elements, the minimum and the maximum."""
     if array.size == 0:
         return ""
     if array.size > LISTED:
@@ -72,7 +72,11 @@ def values(array: np.ndarray, standard_error: Sequence[float | None] | None = No
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a measured value >= 0 with its standard error: 0.0312 ± 0.0004. A value within two standard errors of 0: below 0.012."""
+    """Format a measured value >= 0 with its standard error: 0.0312 ± 0.0004.
+
+    A value within two standard errors of 0 becomes a limit, the root of the sum of their squares: below 0.012. Without a finite error
+    above 0, the value stands alone.
+    """
     if not (math.isfinite(value) and math.isfinite(error)):
         return number(value)
     if error <= 0:
@@ -86,6 +90,6 @@ def with_error(value: float, error: float) -> str:
 
 
 def phases(seconds: Mapping[str, float]) -> str:
-    """Format the seconds of each phase: "loading 2.1 s, steps 30 s". Phases below 0.05 s and below 1 % of the total are omitted."""
+    """Format the seconds of each phase: "loading 2.1 s, steps 30 s". Phases below both 0.05 s and 1 % of the total are omitted."""
     least = min(0.05, 0.01 * sum(seconds.values()))
     return ", ".join(f"{name} {duration(float(f'{spent:.2g}'))}" for name, spent in seconds.items() if spent >= least)

@@ -105,7 +105,7 @@ def in_notebook() -> bool:
 
 @contextmanager
 def shown() -> Iterator[None]:
-    """Display the phases of the calls within this context, if it is in a notebook. The bar disappears at the end."""
+    """Display a bar with the phases of the calls within this context, if `in_notebook`. It disappears at the end."""
     if not in_notebook():
         yield
         return

@@ -33,9 +33,10 @@ def shown_image(linear: np.ndarray, like: np.ndarray | None = None, largest: int
 
 
 def shown_map(values: np.ndarray, like: np.ndarray | None = None, largest: int = 320) -> np.ndarray | None:
-    """Convert a texture, or the middle slice of a volume, to colours (H, W, 3) in [0, 1]; None if the parameter is not an image.
+    """Convert a texture, or the middle slice of a volume, to colours (H, W, 3) in [0, 1]; None for what `is_map` excludes.
 
-    One channel is grey over the range of `like` (default: its own). Three channels are sRGB, scaled down if values exceed 1.
+    One channel is grey over the range of `like` (default: its own). Three or four channels are sRGB of the first three, divided by the
+    maximum of `like` if that exceeds 1. Sides are at most `largest`.
     """
     picture = plane(np.asarray(values))
     if picture is None:
@@ -56,7 +57,10 @@ _VALUES_IN_A_TABLE = 16
 
 
 def is_map(array: np.ndarray) -> bool:
-    """Return whether a parameter is displayed as an image: textures (H, W), (H, W, 1 | 3 | 4), volumes (Z, Y, X, 1 | 3 | 4)."""
+    """Return whether a parameter is displayed as an image: textures (H, W), (H, W, 1 | 3 | 4), volumes (Z, Y, X, 1 | 3 | 4).
+
+    At least two sides are longer than 1, and (H, W) has more than 16 elements.
+    """
     if array.size == 0:
         return False
     if array.ndim == 2:

@@ -40,7 +40,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Axis:
-    """A map from values to [0, 1], linear or logarithmic, with ticks."""
+    """A map from values to [0, 1], linear or logarithmic.
+
+    Attributes:
+        low, high: values at 0 and 1; positive if logarithmic.
+        ticks: (value, label).
+    """
 
     low: float
     high: float
@@ -57,7 +62,13 @@ class Axis:
 
 @dataclass(frozen=True)
 class Curve:
-    """A line in the chart's coordinates, as SVG paths."""
+    """A line in the chart's coordinates.
+
+    Attributes:
+        name: name in the legend.
+        path, band: attribute `d` of the SVG paths of the line and of its band; "" for no band.
+        colour: index into the page's colours, from 0 to 5.
+    """
 
     name: str
     path: str
@@ -70,12 +81,13 @@ class Chart:
     """A chart for the page's template.
 
     Attributes:
-        title, x_label: labels of the axes.
+        title, x_label: labels of the vertical and of the horizontal axis.
         description: text alternative.
         curves: curves in drawing order.
         x_ticks, y_ticks: (coordinate, label).
         logarithmic: whether the vertical axis is logarithmic.
         more: number of omitted lines.
+        width, height, frame: size of the chart, and borders of the area of its curves, in units of the coordinates.
     """
 
     title: str
@@ -99,7 +111,7 @@ def axis_format(axis: str) -> tuple[str, Callable[[float], str]]:
 
 
 def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | None:
-    """Return a chart of at most six lines, or None if there is nothing to draw.
+    """Return a chart of the first six lines with a finite value; None without one.
 
     Args:
         title: label of the vertical axis.

@@ -37,5 +37,5 @@ class Console(console.Console):
 
 
 def echo(text: Any) -> None:
-    """Print text, without markup."""
+    """Print text to standard output, without markup and with control characters escaped."""
     typer.echo(visible(str(text), _KEPT))

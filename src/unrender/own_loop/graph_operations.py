@@ -44,10 +44,10 @@ class _Render(dr.CustomOp):
 
 
 def with_drjit(backward: Callable[[tuple[Any, ...]], Tree], images: tuple[Any, ...], values: Tree) -> tuple[Any, ...]:
-    """Attach the images to `values` in Dr.Jit's derivative graph.
+    """Return the images, attached to `values` in Dr.Jit's derivative graph. Forward mode raises `RuntimeError`.
 
     Args:
-        backward: function from the loss derivatives with respect to the images to the gradient.
+        backward: function from the loss derivatives with respect to the images to the gradient, {key: tensor}.
         images: detached tensors.
         values: {key: tensor}, attached or not.
     """
@@ -58,7 +58,7 @@ def with_drjit(backward: Callable[[tuple[Any, ...]], Tree], images: tuple[Any, .
 def with_torch(
     backward: Callable[[tuple[Any, ...]], list[Any]], images: tuple[Any, ...], values: list[Any]
 ) -> tuple[Any, ...]:
-    """Attach the images, on the host, to `values` in PyTorch's derivative graph.
+    """Return the images, on the host, attached to `values` in PyTorch's derivative graph. Second derivatives are not supported.
 
     Args:
         backward: function from the loss derivatives with respect to the images to the gradient of each of `values`, on the host.

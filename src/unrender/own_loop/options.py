@@ -28,7 +28,13 @@ from unrender.scene.view import View
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a `Renderer`. Raises `InputError` for invalid or incompatible options."""
+    """Options of a `Renderer`, named as its arguments. Raises `InputError` for invalid or incompatible options.
+
+    Attributes:
+        single: whether a single sensor was passed, so that a call returns its image and not a tuple.
+        max_depth: maximum path length in segments, also if it is that of the scene's integrator.
+        references, loss: targets and loss of guided mini-batches; () and None without.
+    """
 
     keys: tuple[str, ...]
     image: ImageEstimator
@@ -39,7 +45,6 @@ class Options:
     coupled: bool
     sensors: tuple[int, ...]
     single: bool
-    """Return whether a single sensor was passed, so that a call returns its image and not a tuple."""
     max_depth: int
     seed: int
     references: tuple[Any, ...] = field(default=(), compare=False)
@@ -110,7 +115,10 @@ def open_scene(scene: Any, keys: Any, max_depth: int | None) -> tuple[RendererPo
 
 
 def problem_of(renderer: RendererPort, options: Options, sensors: tuple[int, ...], scene: Any) -> Problem:
-    """Return a problem whose views are these sensors. Sensors without a reference get a black one, because a view needs one."""
+    """Return a problem whose views are these sensors. Raises `InputError` for a sensor that the scene does not have.
+
+    Sensors without a reference get a black one, because a view needs one.
+    """
     sizes = renderer.resolutions()
     references = dict(zip(options.sensors, options.references, strict=True)) if options.references else {}
     for sensor in sensors:

@@ -21,7 +21,7 @@ from unrender.own_loop import saved
 from unrender.own_loop.options import Options, open_scene, problem_of
 from unrender.own_loop.saved import RendererState
 from unrender.own_loop.stream import Batch, Rendered, Stream
-from unrender.own_loop.values import Exchange, Given
+from unrender.own_loop.values import Exchange, LoopParameters
 from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
 from unrender.scene.bounds import off_ends
@@ -117,7 +117,7 @@ class Renderer:
         self._port, self._scene = port, scene
         self._streams: dict[str, Stream] = {}
         self._step = 0
-        self._last: tuple[Given, list[tuple[Stream, Rendered]]] | None = None
+        self._last: tuple[LoopParameters, list[tuple[Stream, Rendered]]] | None = None
         self._thread: threading.Thread | None = None
         self._variances: list[Tree] = []
         for name in self._names(None):
@@ -177,7 +177,14 @@ class Renderer:
         return self._exchange.gradient(self._backward(records, derivatives), inputs)
 
     def preview(self, values: Any = None, spp: int = 64, sensor: int | None = None, seed: int = 0) -> np.ndarray:
-        """Return an image (H, W, 3) of `values` in NumPy, rendered plainly with all pixels. The renderer's state is unchanged."""
+        """Return an image (H, W, 3) in NumPy, without a control variate. The renderer's state is unchanged.
+
+        Args:
+            values: parameters, see the class; None for the scene's.
+            spp: samples per pixel, >= 1.
+            sensor: index of a sensor; None for the renderer's first one.
+            seed: seed of the image, independent of the renderer's.
+        """
         chosen = self._options.sensors[0] if sensor is None else sensor
         problem = problem_of(self._port, self._options, (chosen,), self._scene)
         return render_view(problem, numpy(self._exchange.tree(self._exchange.read(values))), 0, spp, seed)
@@ -186,7 +193,7 @@ class Renderer:
 
     @property
     def batch(self) -> Batch:
-        """Pixels of the last render, in the framework of its values. Raises `InputError` if it rendered full images."""
+        """Pixels of the last render, in the framework of its values. Raises `InputError` without mini-batches, or before a render."""
         if self._last is None or (batch := self._last[1][0][1].batch) is None:
             raise InputError("Renderer: there is no mini-batch; it has pixels=All(), or nothing was rendered yet")
         self._check_thread("batch")
@@ -205,12 +212,14 @@ class Renderer:
         return Batch(indices[0], indices[1], frameworks.to_torch(on_host.weights, like))
 
     def gather(self, images: Any) -> Any:
-        """Select the pixels of the last render, (N, C), from an image (H, W, C), or from a list of images with several sensors.
+        """Return the pixels of the last render, (N, C), from an image (H, W, C), or from a list of images with several sensors.
 
-        Images are unchanged if the render was of full images.
+        Without mini-batches the images are returned unchanged.
 
         Args:
             images: in the framework of the rendered values, or NumPy.
+
+        Raises `InputError` for another number or size of images, or before the first render.
         """
         if self._options.all_pixels:
             return images
@@ -264,7 +273,10 @@ class Renderer:
         return saved.write(Path(path), self.state, self._options.describe())
 
     def load(self, path: str | Path) -> None:
-        """Continue from a state that `save` wrote. Raises `InputError` for a damaged file, or one with other options."""
+        """Continue from a state that `save` wrote, with its step and seed.
+
+        Raises `InputError` for a damaged file, or one with other options.
+        """
         loaded = saved.read(Path(path), self._options.describe(), self.state)
         streams = {name: self._stream(name) for name in loaded.streams}
         for name, stream in streams.items():
@@ -277,7 +289,9 @@ class Renderer:
     # ------------------------------------------------------------------ the two passes
 
     @exclusive("Renderer")
-    def _render(self, values: Any, sensor: int | None) -> tuple[Given, list[tuple[Stream, Rendered]], tuple[Any, ...]]:
+    def _render(
+        self, values: Any, sensor: int | None
+    ) -> tuple[LoopParameters, list[tuple[Stream, Rendered]], tuple[Any, ...]]:
         inputs = self._exchange.read(values)
         parameters = self._exchange.tree(inputs)
         self._exchange.warn_outside(parameters)
@@ -313,11 +327,13 @@ class Renderer:
                 f"Renderer: {what} in another thread than the last render, to whose image it belongs; use one Renderer per thread"
             )
 
-    def _with_torch(self, inputs: Given, images: tuple[Any, ...], backward: Callable[..., Tree]) -> tuple[Any, ...]:
+    def _with_torch(
+        self, inputs: LoopParameters, images: tuple[Any, ...], backward: Callable[..., Tree]
+    ) -> tuple[Any, ...]:
         from unrender.own_loop import graph_operations
 
         tensors = {key: value for key, value in inputs.values.items() if frameworks.is_torch(value)}
-        detached = Given("torch", {key: value.detach() for key, value in tensors.items()})
+        detached = LoopParameters("torch", {key: value.detach() for key, value in tensors.items()})
         device = images[0].device
 
         def gradients(derivatives: tuple[Any, ...]) -> list[Any]:

@@ -24,12 +24,12 @@ _HEADER = "__metadata__"
 
 @dataclass(frozen=True)
 class RendererState:
-    """State between steps.
+    """State of a `Renderer` between steps.
 
     Attributes:
         step: number of renders so far.
         seed: seed of the random numbers.
-        streams: {sensor, or "mini-batches": its state}.
+        streams: {index of the sensor as text, or "mini-batches": its state}.
     """
 
     step: int
@@ -38,14 +38,23 @@ class RendererState:
 
 
 def write(path: Path, state: RendererState, options: dict[str, Any]) -> Path:
-    """Write a state and its options. Raises `InputError` if it cannot be written."""
+    """Write a state and its options, and return the path. Raises `InputError` if they cannot be written."""
     packed = pack(state)
     notes = {"format": _FORMAT, "options": json.dumps(options), "state": json.dumps(packed.skeleton, allow_nan=False)}
     return files.write(path, safetensors.numpy.save(packed.tensors, metadata=notes), durable=True)
 
 
 def read(path: Path, options: dict[str, Any], pattern: RendererState) -> RendererState:
-    """Return the state in a file. Raises `InputError` for a file that `write` did not write, or with other options."""
+    """Return the state in a file.
+
+    Args:
+        path: file of `write`.
+        options: options that the file must have.
+        pattern: a state with the same components.
+
+    Raises:
+        InputError: the file is damaged, or has other options.
+    """
     size = path.stat().st_size if path.is_file() else 0
     data = bounded_files.read_bytes(path, min(size, _LARGEST), path.parent)
     length = int.from_bytes(data[:8], "little")

@@ -24,7 +24,7 @@ from unrender.statistics import meta
 
 @dataclass(frozen=True)
 class CoupledState:
-    """State between steps.
+    """State of coupled gradients between steps.
 
     Attributes:
         parameters: parameters of the last step with a gradient; None before the first.
@@ -67,16 +67,15 @@ def coupled_gradient(
     `MetaEstimator(coupled=True)`, per element, with w from the covariance of F and H. Differences are not divided by the step length (Eq.
     13), because g_n − g_{n−1} need not vanish with it.
 
-    Bias: as for MetaEstimator with shared statistics. The weight w depends on the samples that it weights, which pulls the gradient
-    toward zero, most in the first steps.
+    Bias: the weight w depends on the samples that it weights. This shrinks the gradient toward zero, most in the first steps.
 
     Args:
         session: session for both states.
         space: space in which they share samples.
-        parameters: the current ones.
+        parameters: θ_n.
         request: samples of the adjoint, in one group, independent of those of the image.
         derivative: g_n, (1, H, W, 3).
-        state: the last state.
+        state: state after the previous step. With other shapes than those of θ_n, the recursion starts again.
     """
     previous, earlier, elements = state.parameters, state.derivative, state.elements
     if previous is None or earlier is None or trees.shapes(previous) != trees.shapes(parameters):
@@ -91,7 +90,7 @@ def coupled_gradient(
 
 @dataclass(frozen=True)
 class Batch:
-    """Pixels of the last render, for a loss over a mini-batch: N of all P pixels of all sensors. Arrays of the renderer.
+    """Pixels of a mini-batch: N of the P pixels of all sensors. Arrays of the renderer, or of the loop in `Renderer.batch`.
 
     Attributes:
         sensors: index into `sensor=` for each pixel, (N,).
@@ -106,7 +105,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class StreamState:
-    """State between steps.
+    """State of a `Stream` between steps.
 
     Attributes:
         image: state of the image estimator.

@@ -20,7 +20,7 @@ from unrender.rendering.renderer import ParameterInfo, Renderer
 
 
 @dataclass(frozen=True)
-class Given:
+class LoopParameters:
     """Parameters in the loop's framework.
 
     Attributes:
@@ -31,13 +31,13 @@ class Given:
     framework: Framework
     values: dict[str, Any]
 
-    def detached(self) -> Given:
+    def detached(self) -> LoopParameters:
         """Return the same values, detached from the loop's graph."""
 
         def detach(x: Any) -> Any:
             return x.detach() if frameworks.is_torch(x) else dr.detach(x) if arrays.is_drjit(x) else x
 
-        return Given(self.framework, {key: detach(value) for key, value in self.values.items()})
+        return LoopParameters(self.framework, {key: detach(value) for key, value in self.values.items()})
 
 
 class Exchange:
@@ -57,14 +57,20 @@ class Exchange:
         self._on_device = arrays.is_drjit(renderer.array(np.zeros(1)))
         self._warned: set[str] = set()
 
-    def read(self, values: Any) -> Given:
-        """Read the loop's parameters, and check the keys. Raises `InputError`.
+    def read(self, values: Any) -> LoopParameters:
+        """Read the loop's parameters. Shapes and values are not checked, see `tree`.
 
-        They are a mapping with at least the keys (a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`), the array itself if there
-        is one key, or None for the scene's values.
+        Args:
+            values: a mapping with at least the keys (a dictionary, an optimizer of Dr.Jit, `mi.SceneParameters`), the array itself if
+                there is one key, or None for the scene's values.
+
+        Raises:
+            InputError: a key is missing, a value would be ignored, or the values are of several frameworks.
         """
         if values is None:
-            return Given("numpy", {key: arrays.numpy(x) for key, x in self._renderer.values(list(self._keys)).items()})
+            return LoopParameters(
+                "numpy", {key: arrays.numpy(x) for key, x in self._renderer.values(list(self._keys)).items()}
+            )
         if not isinstance(values, Mapping) and not (hasattr(values, "keys") and hasattr(values, "__getitem__")):
             if len(self._keys) > 1:
                 raise InputError(f"Renderer: expected {{key: array}} for {', '.join(self._keys)}, got {_kind(values)}")
@@ -76,7 +82,7 @@ class Exchange:
                 raise InputError(f"Renderer: no value for parameter {key}{did_you_mean(key, others)}")
         self._refuse_unused(values, others)
         parameters = {key: values[key] for key in self._keys}
-        return Given(frameworks.framework(parameters.values(), "Renderer"), parameters)
+        return LoopParameters(frameworks.framework(parameters.values(), "Renderer"), parameters)
 
     def _refuse_unused(self, values: Any, others: list[Any]) -> None:
         """Raise `InputError` for values that would be ignored.
@@ -94,13 +100,16 @@ class Exchange:
                 f"it was created for {', '.join(self._keys)}, and would ignore it"
             )
 
-    def tree(self, inputs: Given) -> Tree:
-        """Return the parameters as arrays of the renderer, detached. Raises `InputError` for a wrong shape."""
+    def tree(self, inputs: LoopParameters) -> Tree:
+        """Return the parameters as arrays of the renderer, detached. Raises `InputError` for a wrong shape or NaN."""
         if inputs.framework == "drjit" and self._on_device:
             from unrender.rendering.mitsuba.tensors import to_tensor
 
             tree = {key: self._fit(key, self._native(key, value, to_tensor)) for key, value in inputs.values.items()}
             dr.make_opaque(tree)
+            for key, value in tree.items():
+                if not arrays.all_finite(value):
+                    _refuse_values(key, arrays.numpy(value))
             return tree
         return {key: self._renderer.array(self._host(key, value)) for key, value in inputs.values.items()}
 
@@ -115,7 +124,7 @@ class Exchange:
             text = f"Renderer: {key} is expected to be {limits}, and has values outside: clip it after each step"
             warnings.warn(text, stacklevel=5)
 
-    def attached(self, inputs: Given) -> Tree:
+    def attached(self, inputs: LoopParameters) -> Tree:
         """Return the parameters as Dr.Jit arrays that are still attached to the loop's derivative graph."""
         import mitsuba as mi
 
@@ -130,7 +139,7 @@ class Exchange:
             for key, value in inputs.values.items()
         }
 
-    def image(self, image: Array, inputs: Given) -> Any:
+    def image(self, image: Array, inputs: LoopParameters) -> Any:
         """Convert an image of the renderer to the loop's framework: float32, or float64 if its parameters are."""
         match inputs.framework:
             case "numpy":
@@ -145,7 +154,7 @@ class Exchange:
     def derivative(self, derivative: Any, shape: tuple[int, ...]) -> Array:
         """Return the derivative of the loop's loss with respect to an image of this shape as the renderer's array.
 
-        Raises `InputError`.
+        Raises `InputError` for another shape, or values that are not finite.
         """
         got = frameworks.shape(derivative)
         if got != shape:
@@ -160,11 +169,11 @@ class Exchange:
             _refuse_derivative(values)
         return self._renderer.array(values)
 
-    def gradient(self, gradient: Tree, inputs: Given) -> dict[str, Any]:
+    def gradient(self, gradient: Tree, inputs: LoopParameters) -> dict[str, Any]:
         """Return a gradient as arrays of the loop, each of the type and shape of its parameter."""
         return {key: self._like(gradient[key], value, inputs) for key, value in inputs.values.items()}
 
-    def _like(self, gradient: Array, value: Any, inputs: Given) -> Any:
+    def _like(self, gradient: Array, value: Any, inputs: LoopParameters) -> Any:
         match inputs.framework:
             case "numpy":
                 return arrays.numpy(gradient).reshape(np.shape(value))
@@ -191,7 +200,7 @@ class Exchange:
     def _host(self, key: str, value: Any) -> np.ndarray:
         array = frameworks.host(value, f"parameter {key}")
         if not np.isfinite(array).all():
-            raise InputError(f"parameter {key}: expected finite numbers, got {_first_of(array)}")
+            _refuse_values(key, array)
         return self._fit(key, array)
 
     def _fit(self, key: str, value: Array) -> Array:
@@ -214,6 +223,10 @@ class Exchange:
 
 def _kind(value: Any) -> str:
     return type(value).__name__
+
+
+def _refuse_values(key: str, values: np.ndarray) -> None:
+    raise InputError(f"parameter {key}: expected finite numbers, got {_first_of(values)}")
 
 
 def _refuse_derivative(values: np.ndarray) -> None:
