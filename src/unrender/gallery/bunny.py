@@ -19,7 +19,7 @@ from unrender.scene.parameter import Parameter
 @register(name="bunny", position=19)
 @dataclass(frozen=True)
 class Bunny:
-    """The position and direction of an animal: three numbers, initially overlapping the reference.
+    """The position and direction of an animal: three numbers; the start overlaps the reference.
 
     One view. The unknowns are x and z of its translation, and its rotation about the vertical. There is no plateau: it starts a fraction
     of its size away, rotated by 30 degrees. The difficulty is that the three are correlated in the silhouette. The animal is made by
@@ -28,9 +28,7 @@ class Bunny:
 
     resolution: int = fields.resolution(48)
     mesh: str = meshes.option("PLY or OBJ file of an animal, y upwards, in place of the one made by code")
-    detail: int = fields.integer(
-        1, "how fine the mesh made by code is: 3600 vertices at 1, times the square", at_least=1, at_most=16
-    )
+    detail: int = fields.integer(1, "d: the mesh made by code has about 3600 d^2 vertices", at_least=1, at_most=16)
     reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(2, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)

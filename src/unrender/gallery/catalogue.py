@@ -18,7 +18,7 @@ _KIND = "gallery problem"
 
 
 def names() -> list[str]:
-    """Return the names of all registered problems; the first one is the easiest start."""
+    """Return the names of all registered problems, in the order of the gallery."""
     return list(registry.components(_KIND))
 
 
@@ -34,7 +34,7 @@ def options(name: str) -> list[Option]:
 
 @exclusive("gallery.problem")
 def problem(name: str, **options: Any) -> Problem:
-    """Return a problem made by code, with known true values if there are any: scene, references (rendered now) and initial values.
+    """Return a problem made by code: scene, references, initial values and, if they exist, true values.
 
         problem("indirect-room", resolution=64, texture_resolution=64)
 
@@ -43,7 +43,7 @@ def problem(name: str, **options: Any) -> Problem:
         options: see `options(name)`. All problems have loss, rendered ones resolution (pixels along a side), reference_spp and max_depth,
             and those with unknown textures texture_resolution. Defaults take seconds on two CPU cores; a GPU can use larger ones.
 
-    References take up to a minute to render, and are stored in the cache folder (`backend.cache`).
+    References take up to a minute to render. They are stored in the cache folder (`backend.cache`) for the next call.
 
     Returns:
         The problem. Its references have noise, which a larger `reference_spp` reduces.

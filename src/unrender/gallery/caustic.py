@@ -31,8 +31,8 @@ class Caustic:
     """The texture of a floor that two lamps light through glass balls, in caustics.
 
     One view. One unknown reflectance (texture_resolution², 3), initially grey, with LargeSteps. Only paths of at least 4 segments reach
-    the lamps, and few of them do; a panel that can be sampled lights the floor a little. The gradient depends on rare samples. Fewer
-    samples of each pixel in a step lead to smaller steps.
+    the lamps, and few of them do; a panel that can be sampled lights the floor a little. So the gradient depends on rare samples, and
+    fewer samples per pixel and step require smaller steps.
     """
 
     resolution: int = fields.resolution(64)

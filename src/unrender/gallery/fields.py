@@ -22,7 +22,7 @@ class Option:
 
     Attributes:
         name: keyword.
-        kind: `int`, or `Loss`, which can be passed by name.
+        kind: `int`, `str`, or `Loss`, which can be passed by name.
         default: default value.
         about: description in one line.
     """
@@ -34,7 +34,7 @@ class Option:
 
 
 def integer(default: int, about: str, at_least: int = 1, at_most: int = 2**31 - 1) -> Any:
-    """Return a dataclass field: an integer in [at_least, at_most]."""
+    """Return a dataclass field of an `Option`: an integer in [at_least, at_most], described by `about`."""
 
     def check(owner: str, name: str, value: Any) -> int:
         number = checks.integer(owner, name, value, at_least)
@@ -46,27 +46,27 @@ def integer(default: int, about: str, at_least: int = 1, at_most: int = 2**31 - 
 
 
 def resolution(default: int) -> Any:
-    """Return the field `resolution`."""
+    """Return the field `resolution`: pixels along a side of each view, in [4, 8192]."""
     return integer(default, "pixels along a side of each view", at_least=4, at_most=_LONGEST_SIDE)
 
 
 def texture_resolution(default: int) -> Any:
-    """Return the field `texture_resolution`."""
+    """Return the field `texture_resolution`: texels along a side of each unknown map, in [2, 8192]."""
     return integer(default, "texels along a side of each unknown map", at_least=2, at_most=_LONGEST_SIDE)
 
 
 def reference_spp(default: int) -> Any:
-    """Return the field `reference_spp`."""
+    """Return the field `reference_spp`: samples per pixel of the references, in [1, 2²⁴]."""
     return integer(default, "samples per pixel of the reference images", at_most=1 << 24)
 
 
 def max_depth(default: int, at_least: int) -> Any:
-    """Return the field `max_depth`."""
-    return integer(default, "longest light path in segments", at_least=at_least, at_most=1 << 20)
+    """Return the field `max_depth`: maximum path length in segments, in [at_least, 2²⁰]."""
+    return integer(default, "maximum path length in segments", at_least=at_least, at_most=1 << 20)
 
 
 def choice(default: str, about: str, among: tuple[str, ...]) -> Any:
-    """Return a dataclass field: one of these words."""
+    """Return a dataclass field of an `Option`: one of the words `among`."""
 
     def check(owner: str, name: str, value: Any) -> str:
         if value not in among:

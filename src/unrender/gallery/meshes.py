@@ -112,7 +112,7 @@ def triangles(
 
 
 def surface(mesh: Any) -> Surface:
-    """Return the surface of a loaded mesh."""
+    """Return the vertices and faces of a loaded `mitsuba.Mesh`."""
     points, faces = np.array(mesh_layout.positions(mesh)), np.array(mesh_layout.faces(mesh))
     return Surface(points.reshape(-1, 3), faces.reshape(-1, 3))
 
@@ -232,7 +232,7 @@ _KINDS = (".ply", ".obj")
 
 
 def option(about: str) -> Any:
-    """Return a dataclass field: the path of a PLY or OBJ file, or "" for none."""
+    """Return a dataclass field of an `Option`: the path of a PLY or OBJ file, or "" for none."""
     return field(default="", metadata={"kind": str, "about": about, "check": _check})
 
 
@@ -318,7 +318,7 @@ class Ellipsoid:
 
 
 def united(parts: Sequence[Ellipsoid], blend: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the depth function of the union of parts, rounded over `blend` where they meet."""
+    """Return the depth function of the union of parts, a log-sum-exp that rounds their joints over the length `blend`."""
 
     def depth(points: np.ndarray) -> np.ndarray:
         return blend * np.logaddexp.reduce([part.depth(points) / blend for part in parts])

@@ -31,12 +31,12 @@ class NerfVolume:
 
     resolution: int = fields.resolution(32)
     grid_resolution: int = fields.integer(16, "voxels along a side of each unknown grid", at_least=2)
-    views: int = fields.integer(16, "cameras, evenly around the toy", at_least=1, at_most=64)
+    views: int = fields.integer(16, "cameras, at equal angles around the toy", at_least=1, at_most=64)
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(4, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
     balls: int = fields.integer(
-        0, "small coloured balls all over the cube in place of the toy, whose volume is sparse; 0: the toy", 0, 512
+        0, "number of small coloured balls in place of the toy, a sparse volume; 0 for the toy", 0, 512
     )
 
     def scene(self) -> dict[str, Any]:

@@ -58,7 +58,7 @@ def colour(*rgb: float) -> dict[str, Any]:
 
 
 def diffuse(*rgb: float) -> dict[str, Any]:
-    """Return a one-sided diffuse material."""
+    """Return a one-sided diffuse material with this RGB reflectance; one number is grey."""
     return {"type": "diffuse", "reflectance": colour(*rgb)}
 
 
@@ -68,7 +68,7 @@ def twosided(bsdf: dict[str, Any]) -> dict[str, Any]:
 
 
 def light(*rgb: float) -> dict[str, Any]:
-    """Return an area light of this radiance."""
+    """Return an area light with this RGB radiance; one number is grey."""
     return {"type": "area", "radiance": colour(*rgb)}
 
 

@@ -23,8 +23,8 @@ class Poster:
     """The grey texture of a poster in direct light.
 
     One view. One unknown, the reflectance (texture_resolution², 1), initially constant: 1024 numbers by default. The loss is a convex
-    quadratic, smooth and without a plateau. Their number is the difficulty for derivatives from perturbations. Texels are not
-    interpolated: with as many pixels, each texel has its own, and the Hessian is diagonal.
+    quadratic, smooth and without a plateau. The number of unknowns is the difficulty for derivatives from perturbations. Texels are not
+    interpolated. If each pixel shows one texel, the Hessian is diagonal.
     """
 
     resolution: int = fields.resolution(64)

@@ -33,8 +33,8 @@ class Relief:
     """The height map of a plaque, from three images under one lamp each, starting with a flat plaque.
 
     Three views by one camera, each of a world in which one lamp is on. The unknown is the height of each vertex above the plane, (n, n, 1),
-    with LargeSteps. An expression makes the mesh's vertex positions a function of it. Heights decide slopes, thereby shading and shadows;
-    the camera looks straight at the plaque and does not see them by itself.
+    with LargeSteps. An expression makes the mesh's vertex positions a function of it. The camera looks straight at the plaque, so heights
+    change the image only by shading and shadows.
     """
 
     resolution: int = fields.resolution(48)

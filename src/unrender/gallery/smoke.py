@@ -28,7 +28,7 @@ class Smoke:
 
     resolution: int = fields.resolution(32)
     grid_resolution: int = fields.integer(16, "voxels along a side of each unknown grid", at_least=2)
-    views: int = fields.integer(8, "cameras, evenly around the smoke", at_least=1, at_most=64)
+    views: int = fields.integer(8, "cameras, at equal angles around the smoke", at_least=1, at_most=64)
     reference_spp: int = fields.reference_spp(512)
     max_depth: int = fields.max_depth(6, at_least=2)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)

@@ -42,13 +42,13 @@ _NAME = "reference"
 _ADDRESS = re.compile(r"\bobject_\d+|0x[0-9a-f]+|\[\d{9,}\]")
 """Parts of a scene's description that differ between loads."""
 _SAMPLER = re.compile(r"^\s*(sample_count|samples_per_wavefront|wavefront_size) = .*\n", re.MULTILINE)
-"""State that a rendering leaves in a sampler, and that the next one sets."""
+"""State of a sampler that every rendering overwrites."""
 
 
 def recall(
     scene: Any, sensor: int, spp: int, max_depth: int, render: Callable[[], np.ndarray], aov: str = ""
 ) -> np.ndarray:
-    """Return the cached image, or the result of `render`, which is then cached.
+    """Return the cached image, or the result of `render`, which is then cached if a cache folder exists.
 
     Args:
         scene: loaded Mitsuba scene.
@@ -71,7 +71,7 @@ def recall(
 
 
 def digest(scene: Any, sensor: int, spp: int, max_depth: int, aov: str = "") -> str:
-    """Return a name for the image: the SHA-256 of everything that determines it."""
+    """Return a name for the image: 40 hexadecimal digits of the SHA-256 of everything that determines it."""
     state = hashlib.sha256()
     versions = [f"{name} {metadata.version(name)}" for name in ("mitsuba", "drjit")]
     facts = [
@@ -185,9 +185,9 @@ def build_problem(name: str, specification: Specification) -> Problem:
 
 
 def reference(scene: Any, sensor: int, spp: int, max_depth: int, aov: str = "") -> np.ndarray:
-    """Return a reference image by Mitsuba's `path` integrator, or `volpath` with media: (H, W, 3) float32. Unbiased.
+    """Return a reference image by Mitsuba's `path` integrator, or `volpath` with media: (H, W, 3) float32. Unbiased up to `max_depth`.
 
-    With an AOV (`picture_format.AOVS`), it has that property of the first surface in place of radiance.
+    With an AOV (`picture_format.AOVS`), the image has that property of the first surface in place of radiance.
 
     It uses the film's reconstruction filter, and `spp` samples or slightly more, in as many equal passes as memory requires. Equal
     arguments give equal images, which are stored in the cache folder (`backend.cache`).

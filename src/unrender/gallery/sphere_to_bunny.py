@@ -44,7 +44,7 @@ class SphereToBunny:
     """
 
     resolution: int = fields.resolution(64)
-    views: int = fields.integer(6, "cameras, around the animal, by turns lower and higher", at_least=1, at_most=64)
+    views: int = fields.integer(6, "cameras around the animal, alternately lower and higher", at_least=1, at_most=64)
     subdivisions: int = fields.integer(4, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=7)
     mesh: str = meshes.option("PLY or OBJ file of a body, in place of the one made by code")
     remesh_at: int = fields.integer(

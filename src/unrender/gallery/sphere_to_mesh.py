@@ -37,7 +37,7 @@ class SphereToMesh:
     """
 
     resolution: int = fields.resolution(48)
-    views: int = fields.integer(6, "cameras, around the body, by turns lower and higher", at_least=1, at_most=32)
+    views: int = fields.integer(6, "cameras around the body, alternately lower and higher", at_least=1, at_most=32)
     subdivisions: int = fields.integer(3, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=6)
     mesh: str = meshes.option("PLY or OBJ file of the body, in place of the one made by code")
     reference_spp: int = fields.reference_spp(512)

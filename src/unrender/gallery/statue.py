@@ -38,7 +38,7 @@ class Statue:
 
     resolution: int = fields.resolution(64)
     texture_resolution: int = fields.texture_resolution(32)
-    views: int = fields.integer(6, "cameras, around the bust, by turns lower and higher", at_least=1, at_most=64)
+    views: int = fields.integer(6, "cameras around the bust, alternately lower and higher", at_least=1, at_most=64)
     subdivisions: int = fields.integer(
         4, "s: the sphere has 10 · 4^s + 2 vertices, without those doubled at its seam", at_least=1, at_most=7
     )

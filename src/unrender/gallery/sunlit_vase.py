@@ -39,7 +39,7 @@ class SunlitVase:
 
     resolution: int = fields.resolution(128)
     texture_resolution: int = fields.texture_resolution(64)
-    views: int = fields.integer(3, "cameras, evenly around the vase", at_least=1, at_most=16)
+    views: int = fields.integer(3, "cameras, at equal angles around the vase", at_least=1, at_most=16)
     reference_spp: int = fields.reference_spp(384)
     max_depth: int = fields.max_depth(5, at_least=2)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
@@ -139,23 +139,24 @@ _FIELD_OF_VIEW = 30.0
 _DISTANCE, _MIDDLE = 4.4, 0.85
 _TEXELS, _MAX_DEPTH = 64, 5
 _WHITE = 0.98
-"""Quantile of the pixels' brightness that is mapped to white: all but one in a thousand."""
+"""Linear value to which the exposure maps the 99.9th percentile of all values."""
 
 
 def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int = 256, seed: int = 0) -> Path:
-    """Render photographs of a glazed vase under the sky, as from a camera that moves around it.
+    """Render photographs of a glazed vase under the sky from a camera that moves around it.
 
     The folder contains `images/00.png`, ... (8-bit sRGB; the alpha channel is 1 on the vase) and `transforms.json` with poses and field
-    of view in NeRF's format. All have one exposure, at which one pixel in a thousand is white.
+    of view in NeRF's format. All have one exposure, at which one value in a thousand is white.
 
     Args:
         folder: output folder; it must be missing or empty.
         views: number of photographs, >= 3, once around, from heights between the foot of the vase and above its lip.
         size: size of a photograph, (size, size) pixels, >= 8.
-        spp: samples per pixel.
-        seed: seed of the renders.
+        spp: samples per pixel, >= 1.
+        seed: seed of the first render, >= 0; each further one adds 1.
 
-    Returns: the folder.
+    Returns:
+        The folder.
 
     Raises:
         InputError: an argument is out of range, or the folder is not empty or not writable.

@@ -20,7 +20,7 @@ from unrender.scene.parameter import Parameter
 class Tea:
     """Extinction and albedo of the tea in a glass ball, in a room lit only by light bounced off its ceiling.
 
-    One view. Two unknowns (3,); the extinction is a tenth of that in inverse units of length.
+    One view. Two unknowns (3,). The scene multiplies the extinction by 10, to inverse units of length.
     """
 
     resolution: int = fields.resolution(32)

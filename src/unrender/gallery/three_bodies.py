@@ -16,7 +16,8 @@ from unrender.scene.parameter import Parameter
 class ThreeBodies:
     """Albedo, roughness and extinction of three balls: of paint, of metal and of fog.
 
-    One view. The unknowns are a reflectance (3,), a roughness () and an extinction (3,), a quarter of that in inverse units of length.
+    One view. The unknowns are a reflectance (3,), a roughness α () and an extinction (3,). The scene multiplies the extinction by 4, to
+    inverse units of length.
     """
 
     resolution: int = fields.resolution(48)
@@ -25,7 +26,7 @@ class ThreeBodies:
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """Return three balls of radius 0.6 on the floor y = -0.6, between two lamps."""
+        """Return three balls of radius 0.6 on the floor y = -0.6, under a lamp and a sky."""
         tiles = {"type": "checkerboard", "color0": parts.colour(0.15), "color1": parts.colour(0.6)}
         tiles["to_uv"] = _scaled(24)
         fog = {

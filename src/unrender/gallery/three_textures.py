@@ -35,7 +35,7 @@ class ThreeTextures:
 
     resolution: int = fields.resolution(64)
     texture_resolution: int = fields.texture_resolution(32)
-    views: int = fields.integer(4, "cameras, evenly around the things", at_least=1, at_most=32)
+    views: int = fields.integer(4, "cameras, at equal angles around the objects", at_least=1, at_most=32)
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(4, at_least=2)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)

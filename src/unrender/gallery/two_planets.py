@@ -40,7 +40,7 @@ class TwoPlanets:
 
     resolution: int = fields.resolution(48)
     texture_resolution: int = fields.texture_resolution(32)
-    views: int = fields.integer(16, "cameras, around the planets, by turns lower and higher", at_least=1, at_most=32)
+    views: int = fields.integer(16, "cameras around the planets, alternately lower and higher", at_least=1, at_most=32)
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(8, at_least=6)
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
