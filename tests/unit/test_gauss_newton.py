@@ -151,6 +151,10 @@ def test_what_it_refuses() -> None:
     with pytest.raises(ur.InputError, match="damping must be"):
         AveragedNewton(damping=0)
     made = problem()
+    with pytest.raises(ur.InputError, match="largest names c, which is not a parameter"):
+        ur.GaussNewton(largest={"c": 1.0}).init(made, START)
+    with pytest.raises(ur.InputError, match='linear: unknown parameter "c"'):
+        AveragedNewton(linear=("c",)).init(START)
     smooth = replace(made.unknowns["a"], preconditioner=ur.preconditioners.LargeSteps(1.0))
     made = made.with_parts(unknowns={**made.unknowns, "a": smooth})
     with pytest.raises(ur.InputError, match="parameter a has a preconditioner"):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.core import periodic
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
@@ -39,7 +40,7 @@ TERMS: dict[str, dict[str, Any]] = {
     "palette": {"palette": [[0.0, 0.1, 0.2], [0.9, 0.8, 1.0]], "std": 0.2},
     "smoothness": {"smoothness": 0.2},
     "total variation": {"total_variation": 0.3},
-    "all": {"near": 0.4, "std": 0.3, "smoothness": 0.2, "total_variation": 0.3, "weight": 2.0},
+    "all": {"near": 0.4, "palette": [[0.5] * 3], "std": 0.3, "smoothness": 0.2, "total_variation": 0.3, "weight": 2.0},
 }
 SHAPES = {"texture": (4, 5, 3), "volume": (3, 2, 4, 3), "colour": (3,), "vertices": (12,)}
 OF_NEIGHBOURS = ("smoothness", "total variation", "all")
@@ -89,6 +90,27 @@ def test_pairs_of_neighbours_are_counted_once() -> None:
     assert value == pytest.approx(8 * 0.5**2 / (2 * 0.1**2))
     assert (gradient[:, 0] == gradient[:, -2]).all()
     assert (gradient[:, -1] == gradient[:, 1]).all()
+
+
+def test_a_value_and_a_palette_are_two_terms() -> None:
+    x, options = np.full(3, 0.5), {"std": 0.2}
+    parts = [Prior(**options, **own).on(x) for own in ({"near": 0.1}, {"palette": [[0.9, 0.5, 0.5]]})]
+    both = Prior(**options, near=0.1, palette=[[0.9, 0.5, 0.5]]).on(x)
+    assert both.evaluate(x)[0] == pytest.approx(sum(part.evaluate(x)[0] for part in parts))
+    assert both.product(x, x) == pytest.approx(sum(part.product(x, x) for part in parts))
+
+
+@pytest.mark.parametrize(("width", "repeated"), [(5, 1), (4, 1), (5, 0)])
+def test_the_diagonal_is_that_of_the_products(width: int, repeated: int) -> None:
+    """A map of an odd number of periodic columns has neighbours of equal parity."""
+    x = periodic.pad(np.random.default_rng(2).random((3, width, 3)), repeated)
+    prior = Prior(smoothness=0.2, total_variation=0.3).on(x, repeated)
+    for row in range(3):
+        for column in range(width):
+            unit = np.zeros((3, width, 3))
+            unit[row, column] = 1.0
+            product = prior.product(x, periodic.pad(unit, repeated))[row, repeated + column]
+            assert prior.diagonal(x)[row, repeated + column] == pytest.approx(product)
 
 
 def test_expected_values_are_averaged_over_a_coarser_grid() -> None:
@@ -151,6 +173,15 @@ def test_the_scale_turns_a_loss_into_a_log_likelihood() -> None:
 def descended(problem: ur.Problem) -> ur.Result:
     adam = ur.optimizers.Adam(0.03, schedule=ur.schedules.Cosine(400))
     return ur.optimize(problem, ur.PathGradient(spp=4), adam, steps=400)
+
+
+def test_a_loss_without_a_value_near_the_references_has_no_scale() -> None:
+    class Logarithmic(ur.losses.L1):
+        def value(self, image: Any, reference: Any) -> Any:
+            return np.where(image > 0, np.abs(np.log(np.maximum(image, 1e-9))), np.nan)
+
+    with pytest.raises(InputError, match="prior: its scale is the loss at the references plus noise"):
+        likelihood_scale(linear({"near": 0.5, "std": 0.1}, loss=Logarithmic())[0])
 
 
 def test_a_descent_ends_at_the_posterior_mean() -> None:

@@ -239,6 +239,11 @@ def test_a_clipped_mean_is_clipped_after_debiasing() -> None:
         (lambda: Chain((FittedSobolev(Sobolev(), ("number",)),)), "needs a texture"),
         (lambda: Chain((Adam(),)), r"Chain: transforms: expected transforms such as ScaleByRms\(\), got Adam"),  # type: ignore
         (lambda: Chain(GradientMean()), "Chain: transforms: expected a list of transforms"),  # type: ignore
+        (lambda: Chain((ScheduleFreeAverage(), ClipDirection())), "ScheduleFreeAverage sets the steps"),
+        (
+            lambda: Chain((PerParameter(("map",), (ScheduleFreeAverage(),)), ClipDirection())),
+            "PerParameter sets the steps",
+        ),
         (lambda: PerParameter(("a",), others=(Adam(),)), "PerParameter: others: expected transforms"),  # type: ignore
         (lambda: tables.component({"type": "Chain", "transforms": [{"type": "Adam"}]}), r"transforms\[0\]: .*Adam"),
     ],

@@ -42,8 +42,8 @@ class Estimate:
         capabilities: additional quantities, at most one of each type; library code reads them by `get` and `require`, which return
             typed values.
         info: information for people: samples traced, control weights, images. Library code never reads it.
-        preconditioned: whether `gradient` and its variance are already by v, where a parameter is x = φ(S v) with its parameterisation φ
-            and its preconditioner S. Estimators with a per-element state store it in the coordinates of the descent.
+        preconditioned: whether `gradient` and its variance are with respect to v, where a parameter is x = φ(S v) with its
+            parameterisation φ and its preconditioner S. Estimators with a per-element state store it in these coordinates.
     """
 
     loss: float

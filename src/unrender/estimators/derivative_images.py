@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 REMEMBERED = 1 << 19
-"""Largest number of pixels, times elements for derivative images, of images whose mean over steps is kept. Both halves take 12 MiB."""
+"""Largest number of pixels, times elements for derivative images, of images that are averaged over steps. Both halves take 12 MiB."""
 _RESIDUAL_ERRORS = 2.0
 """Standard errors of the sum of squared residuals from which on references have noise."""
 _VALUES = 1 << 22
@@ -160,7 +160,7 @@ def mean_residuals(
 ) -> HalvesMean:
     """Return the mean of ℓ' over steps, (H, W, 3), at the present parameters.
 
-    Earlier residuals are moved along by ℓ'' J s for the step s. Otherwise the way to the solution would count as noise of references.
+    ℓ'' J s of the step s is added to earlier residuals. Otherwise the descent's own change would count as noise of the references.
 
     Args:
         before: mean of earlier steps.

@@ -61,7 +61,7 @@ class EmitterState:
         moments: M / u, running mean up to a factor, (E,); zeros before the first update.
         uniform: λ.
         evidence: statistics for λ, see `uniform_share`.
-        second_moment: running mean square of each element of the gradient, in the coordinates of the descent.
+        second_moment: running mean square of each element of the gradient with respect to v (`scene.coordinates`).
     """
 
     start: np.ndarray
@@ -96,7 +96,7 @@ class EmitterState:
         return mixture / mixture.sum()
 
 
-def init(owner: str, problem: Problem, session: RenderSession) -> EmitterState | None:
+def init(owner: str, session: RenderSession) -> EmitterState | None:
     """Return the state before the first step; None if the scene has at most one emitter.
 
     Raises `InputError` if the renderer does not support custom emitter sampling.
@@ -123,7 +123,7 @@ def connections(
     """Return the connection statistics of a frame: Σ y by emitter, with Σ_e M_e / p_e = E[Σ y] for the sampling probabilities p.
 
     A connection that adds f to its pixel j changes the gradient by ∂L/∂I_j · ∂f/∂θ, and by its noise in ∂L/∂I_j times the derivative of
-    the pixel's other samples. With B_j = Σ_k E[(∂I_j/∂θ_k)²] and h_j, the derivative of ∂L/∂I_j by I_j,
+    the pixel's other samples. With B_j = Σ_k E[(∂I_j/∂θ_k)²] and h_j = ∂²L/∂I_j²,
 
         y = (∂L/∂I_j Σ_k v_k ∂f/∂θ_k)² / S² + h_j² B_j f² / (S² n),
 
@@ -182,8 +182,10 @@ def _observed(evidence: ShareEvidence, y: np.ndarray, squares: np.ndarray, densi
 
 
 def observed(problem: Problem, state: EmitterState, gradient: Tree) -> EmitterState:
-    """Return the state after a step with this gradient by u (`Problem.coordinates`), before preconditioning. Variances are relative to
-    the mean squares, as in Adam's steps."""
+    """Return the state after a step with this gradient with respect to u (`Problem.coordinates`), before preconditioning.
+
+    Variances are relative to the gradient's mean squares, as in Adam's steps.
+    """
     return replace(state, second_moment=pixel_statistics.observed(problem, state.second_moment, gradient))
 
 

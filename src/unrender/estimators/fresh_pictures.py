@@ -42,8 +42,8 @@ class Picture:
 
     Attributes:
         images: images of each frame, (K, N, 3), independent over K.
-        losses: pseudo-values (K, N) of the parts of the loss; see `paired_losses.pseudo_values`. Parts are pixels, or the sampling units:
-            pairs of pixels, or views.
+        losses: pseudo-values (K, N) of the parts of the loss with priors and regularizers; see `paired_losses.pseudo_values`. Parts are
+            pixels, or the sampling units: pairs of pixels, or views.
     """
 
     images: tuple[np.ndarray, ...]

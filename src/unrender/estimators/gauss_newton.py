@@ -13,6 +13,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
@@ -155,6 +156,10 @@ class GaussNewton:
         and for a loss that is not per pixel."""
         if not (problem.loss.linear or problem.loss.pixelwise):
             raise InputError(f"GaussNewton requires a per-pixel loss, such as L2, got {type(problem.loss).__name__}")
+        if unknown := next((key for key in self.largest if key not in parameters), None):
+            raise InputError(
+                f"GaussNewton: largest names {unknown}, which is not a parameter{did_you_mean(unknown, parameters)}"
+            )
         for key in (key for key in problem.coordinates.preconditioners if key in parameters):
             raise InputError(f"GaussNewton: parameter {key} has a preconditioner, which H replaces; leave it out")
         problem.renderer.prepare(list(parameters), None, derivatives=False)

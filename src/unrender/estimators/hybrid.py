@@ -84,9 +84,9 @@ class HybridGradient:
     mini-batches. It also renders the scene at perturbed values of the perturbed parameters for `perturbed`, with the others fixed.
     Perturbations of a few numbers take a few renders, independent of the number of texels.
 
-    The gradient by the path parameters is exactly that of `path` at the current perturbed parameters, from the same random numbers. If
+    The gradient of the path parameters is exactly that of `path` at the current perturbed parameters, from the same random numbers. If
     two states share samples, the previous state is rendered with its own perturbed parameters. Paths of one pose are not valid in
-    another, so poses require space="primary". The gradient by the perturbed parameters is that of `perturbed`: of the loss smoothed
+    another, so poses require space="primary". The gradient of the perturbed parameters is that of `perturbed`: of the loss smoothed
     over these alone. Each gradient has the bias that its estimator states. Both belong to one loss, smoothed for the perturbed
     parameters, whose minimum tends to that of the loss itself as σ decreases.
 
@@ -94,7 +94,7 @@ class HybridGradient:
     images. The bias would drive the perturbed parameters towards dark images, and the path parameters would compensate.
 
     With `GaussNewton` for `perturbed`, the perturbed parameters form a block (`BlockEstimate`). An optimizer such as `Partitioned(keys,
-    AveragedNewton(), others)` solves it, and the gradient by them is 0 in steps in which they are fixed. `wait` and `every` select the
+    AveragedNewton(), others)` solves it, and their gradient is 0 in steps in which they are fixed. `wait` and `every` select the
     steps in which they move. While textures are far from the solution, images contain little information on poses.
 
     The steps of both groups have no common scale: give the perturbed parameters their own learning rates.
@@ -107,7 +107,7 @@ class HybridGradient:
         path: an estimator of path gradients: `PathGradient` or `MetaEstimator`.
         perturbed: of order "gradient", with `sigma` for the perturbed parameters; or `GaussNewton`.
         keys: the perturbed parameters; None for all poses and all parameters without a path gradient.
-        averaged: for `MetaAdam`, which has no momentum: the gradient by the perturbed parameters is the running mean of about ten steps,
+        averaged: for `MetaAdam`, which has no momentum: the gradient of the perturbed parameters is the running mean of about ten steps,
             and its variance that of the squares, both debiased, which gives Adam's steps. Differences of the smoothed loss between two
             steps are not rendered, so the mean lags behind. Set it to False for optimizers that average themselves, or that increase
             their rates while gradients agree. Requires a variance of `path`.

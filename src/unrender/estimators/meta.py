@@ -107,8 +107,8 @@ class MetaEstimator:
     moves geometry, a path of one state is not valid in the other. The difference is then computed in primary sample space, from the
     same random numbers. `info["space"]` states the space of each parameter.
 
-    Gradient and variance are by v if a parameter is x = φ(S v) with its parameterisation and preconditioner
-    (`Estimate.preconditioned`), since a variance per element cannot be mapped by S.
+    Gradient and variance are with respect to v, where a parameter is x = φ(S v) with its parameterisation φ and preconditioner S
+    (`Estimate.preconditioned`), because a variance per element cannot be mapped by S.
 
     Bias: none with `statistics="independent"`, a loss whose derivative is linear and plain images, along a path of parameters that does
     not depend on the samples; the path of an optimisation depends on them slightly. With "shared" statistics, the paper's choice, α

@@ -162,7 +162,7 @@ class PathGradient:
         problem = self._rendered(problem)
         session = problem.renderer.prepare(list(parameters), self.image.space)
         adaptive = self.emitters == "adaptive"
-        emitters = emitter_selection.init("PathGradient", problem, session) if adaptive else None
+        emitters = emitter_selection.init("PathGradient", session) if adaptive else None
         image, pixels = self.image.init(problem, parameters), self.pixels.init(problem, parameters)
         return PathGradientState(image, pixels, emitters=emitters)
 

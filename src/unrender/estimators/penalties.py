@@ -31,7 +31,7 @@ def penalty(problem: Problem, parameters: Mapping[str, Array | np.ndarray]) -> f
 def penalized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
     """Return the estimate with priors and regularizers added to the loss and its derivatives; the estimate itself if there are none.
 
-    Second derivatives and products of `estimate` must be by the parameters. They do not include the regularizers of meshes.
+    Second derivatives of `estimate` must be with respect to the parameters. They do not include the regularizers of meshes.
     """
     if not (keys := _keys(problem)):
         return estimate
@@ -99,7 +99,7 @@ def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tr
 
 
 def _product(problem: Problem, parameters: Tree) -> Callable[[Mapping[str, Array | np.ndarray]], dict[str, np.ndarray]]:
-    """Return a function from v to the product of the priors' Hessian with v, by the parameters."""
+    """Return a function from v to the product of the priors' Hessian with v."""
     unknowns, scale = problem.unknowns, problem.prior_scale
     points = {key: arrays.numpy(x) for key, x in parameters.items()}
 

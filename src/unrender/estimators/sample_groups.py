@@ -46,9 +46,9 @@ class GradientSample:
     """The gradient estimate of one step's paths, over all frames.
 
     Attributes:
-        gradient: gradient of the loss by the current parameters.
+        gradient: gradient of the loss with respect to the current parameters.
         paired: the same on the paths of `previous`, if `PairRequest.difference_spp` requests separate paths; else {}.
-        previous: gradient of the loss at the previous parameters by them, from the same paths; {} if it was not requested.
+        previous: gradient of the loss at the previous parameters, from the same paths; {} if it was not requested.
         fresh: gradient from the samples of this step alone; {} if it was not requested.
         losses: losses of the current state, one per frame, lazy.
         images: images of the current state that the loss sees, per full view.

@@ -41,15 +41,15 @@ class ImageEstimate:
     counts: SampleCounts | None = None
 
     def mean(self) -> Array:
-        """Return the image from all samples, (H, W, 3) or (N, 3)."""
+        """Return the image from all samples, filtered, (H, W, 3) or (N, 3)."""
         return self._mean(self.images)
 
     def previous_mean(self) -> Array:
-        """Return `mean()` at the previous step's parameters."""
+        """Return `mean()` at the previous step's parameters. Requires `previous`."""
         return self._mean(self.previous)
 
     def others(self) -> Array:
-        """Return the leave-one-out images: for each group the image from all other groups, or its own if there is one group.
+        """Return the leave-one-out images, filtered: for each group the image from all other groups, or its own if there is only one.
 
         With `counts`, return for each sample the image from the other samples of its pixel.
         """
@@ -60,7 +60,7 @@ class ImageEstimate:
         return self._left_out(self.images if self.fresh is None else self.fresh)
 
     def previous_others(self) -> Array:
-        """Return `others()` at the previous step's parameters."""
+        """Return `others()` at the previous step's parameters. Requires `previous`."""
         return self._left_out(self.previous)
 
     def _mean(self, images: Any) -> Array:

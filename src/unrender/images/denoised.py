@@ -38,8 +38,8 @@ class Denoised:
     Args:
         inner: image estimator, `images.Plain()` or `images.RecursiveControlVariate()`.
         by: the denoiser: "auto" (OptiX on a GPU, else OIDN: `pip install 'unrender[denoise]'`), "oidn", "optix" or "variation".
-        groups: maximum number of sample groups, >= 2. Fewer are used if the number of samples has no such divisor. Two groups need two
-            calls of the denoiser in addition to the full image; more groups make each image less noisy.
+        groups: number of sample groups, >= 2: the largest divisor of the estimator's own number that is at most this, else its smallest
+            divisor above 1. Each group needs a call of the denoiser in addition to the full image; more groups have less noisy images.
 
     Raises:
         InputError: at construction, a value out of range; from `init`, a denoiser that is not available.

@@ -174,7 +174,7 @@ class RecursiveControlVariate:
         """Average the snapshot with the mini-batch's renderings of the snapshot's state.
 
         Consider a pixel with relative variance r that was sampled k times, with mean H. Its image becomes the mean of least variance,
-        image + r k / (1 + r k) (H - image), and r becomes r / (1 + r k). Its weight is updated accordingly.
+        image + r k / (1 + r k) (H - image), and r becomes r' = r / (1 + r k). Its weight is multiplied by (1 + r) / (1 + r').
         """
         snapshot = state.snapshot
         if not self.learn_from_draws or contribution is None or snapshot is None:

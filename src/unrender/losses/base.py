@@ -8,7 +8,7 @@ from unrender.core.arrays import Array
 
 
 class Loss(Protocol):
-    """Distance of an image to its reference per element. Arrays have any equal shape; values are linear radiance."""
+    """Distance of an image to its reference per element. Both arrays have the same shape and contain linear radiance."""
 
     @property
     def linear(self) -> bool:
@@ -25,9 +25,9 @@ class Loss(Protocol):
         ...
 
     def value(self, image: Array, reference: Array) -> Array:
-        """Return ℓ(I, R) >= 0 per element."""
+        """Return ℓ(I, R) per element, with the shape of the image; >= 0 for all losses but a user's function."""
         ...
 
     def derivative(self, image: Array, reference: Array) -> Array:
-        """Return ∂ℓ/∂I per element."""
+        """Return ∂ℓ/∂I per element, with the shape of the image."""
         ...

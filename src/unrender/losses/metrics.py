@@ -1,8 +1,8 @@
 """Image metrics: differences between an image and its reference, by standard measures.
 
-All take linear RGB (H, W, 3). PSNR, SSIM and FLIP are computed on display images: both images are multiplied by the exposure that maps
-the reference's 95th percentile of luminance to 0.7, clipped to [0, 1], and converted by the sRGB curve. Radiance has no peak value for a
-peak signal-to-noise ratio, and a visible emitter would otherwise dominate.
+All but `distance` take linear RGB (H, W, 3). PSNR, SSIM and FLIP are computed on display images: both images are multiplied by
+`exposure(reference)`, clipped to [0, 1], and converted by the sRGB curve. NaN is black in display images. Radiance has no peak value for
+a peak signal-to-noise ratio, and a visible emitter would otherwise dominate.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ _SSIM_WINDOW = 7
 def exposure(reference: np.ndarray) -> float:
     """Return the factor that maps the reference's 95th percentile of luminance to 0.7; 1 for a black reference.
 
-    A percentile, unlike the maximum, is not affected by a small visible emitter.
+    A percentile, unlike the maximum, is not affected by a small visible emitter. If it is 0, the maximum replaces it. Pixels that are not
+    finite are ignored.
     """
     luminance = reference @ np.array([0.2126, 0.7152, 0.0722])
     finite = luminance[np.isfinite(luminance)]
@@ -142,8 +143,6 @@ def _pair(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def has_flip() -> bool:
     """Return whether the package that computes FLIP is installed."""
-    from importlib.util import find_spec
-
     return find_spec("flip_evaluator") is not None
 
 
@@ -162,7 +161,10 @@ def available() -> bool:
 
 
 def distance(image: np.ndarray, reference: np.ndarray) -> float | None:
-    """Return LPIPS by AlexNet of two display images (H, W, 3), values in [0, 1]. Smaller is better. None if it cannot be computed."""
+    """Return LPIPS by AlexNet of two display images of equal shape (H, W, 3), see `displayed`. Smaller is better.
+
+    None if a side is below 32 pixels, or unless `available`.
+    """
     if min(image.shape[:2]) < _LEAST or not available():
         return None
     import torch  # pyright: ignore[reportMissingImports]

@@ -48,7 +48,7 @@ class Perceptual:
 
     Args:
         weights: file of the network's weights: a .safetensors file, or a .pth file with tensors only, with torchvision's names
-            (features.0.weight, ...; others are ignored). None takes torchvision's weights if it is installed.
+            (features.0.weight, ...; others are ignored). None takes torchvision's, which it downloads at first use.
         layers: features to compare, from `perceptual.LAYERS`. relu3_3 needs images of at least 4 x 4, relu5_3 of 16 x 16.
         strength: factor of the loss, > 0.
 

@@ -62,14 +62,14 @@ class L2(_WithLinearDerivative):
 @register(position=3)
 @dataclass(frozen=True)
 class RelativeL2(_WithLinearDerivative):
-    """(I − R)² / (R² + ε): squared relative error, independent of a pixel's brightness.
+    """(I − R)² / (R² + ε): squared relative error.
 
     The denominator contains the reference only, not the noisy image, so the derivative is linear. The estimators sample the image and the
     adjoint independently. The gradient is then that of the unbiased mean relative squared error (Deng et al. 2022; Pidhorskyi et al.
     2022).
 
     Args:
-        epsilon: ε in squared radiance, > 0. For R below √ε the loss is nearly absolute.
+        epsilon: ε in squared radiance, > 0. For R well below √ε the loss is the squared error over ε.
     """
 
     epsilon: float = 1e-2

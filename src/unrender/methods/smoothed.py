@@ -88,8 +88,8 @@ def parse_widths(
 ) -> float | dict[str, float]:
     """Return a width for all parameters, or {key: width, "*": width of the others} from "0.2, mug.rotation.y=0.6".
 
-    Without `sigma`, it is 0.2 times the order of magnitude of the size of each of the problem's parameters `keys`: the length at a moved
-    object, the range, or the largest initial value.
+    Without `sigma`, it is {key: width} for the problem's parameters `keys` (None: all), or 0.2 if all have this width. The width is 0.2
+    times a size: `ParameterInfo.length` of a pose, else the order of magnitude of the range or of the largest initial value.
 
     Raises:
         InputError: the width of the others is missing, or a width is not a positive number.

@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core import arrays, checks, trees
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
@@ -140,7 +141,12 @@ class AveragedNewton:
         return Capabilities(Gradient, Hessian)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> AveragedNewtonState:
+        """Return the state before the first step. Raises `InputError` for an unknown parameter."""
         own = rates.per_parameter("AveragedNewton", parameters, self.learning_rate, learning_rates)
+        if unknown := next((key for key in self.linear if key not in parameters), None):
+            raise InputError(
+                f'AveragedNewton: linear: unknown parameter "{unknown}"{did_you_mean(unknown, parameters)}'
+            )
         n = trees.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
         radii = np.full(n, self.trust_radius or 0.0)
@@ -201,10 +207,9 @@ class AveragedNewton:
     def standard_errors(self, state: AveragedNewtonState, parameters: Tree) -> Tree:
         """Return the standard errors of A⁻¹ b, from the scatter of the models' gradients about those of the mean.
 
-        They cover the run's own noise and that of the references, not the bias of finite differences. There are none if the last estimate
-        does not tell the references' noise (`ScoreCovariance`). They need about ten models. They
-        are infinite for elements that change no image, or that have a share in a damped direction, which the images hardly determine.
-        Parameters whose models have no noise at all have none.
+        They cover the noise of the run and of the references, not the bias of finite differences. They are infinite for elements that
+        change no image, and for those with a share in a damped direction, which the images hardly determine. {} if the last estimate has
+        no `ScoreCovariance`. Parameters with fewer than 8 effective models, or with models without noise, are omitted.
         """
         if state.scores is None:
             return {}

@@ -32,7 +32,7 @@ def trust_region_step(curvatures: np.ndarray, gradient: np.ndarray, radius: floa
     """Return the s with ‖s‖ <= radius that minimises Σ gradient s + curvatures s² / 2, in the eigenbasis, (n,).
 
     Args:
-        curvatures: (n,), >= 0.
+        curvatures: (n,), >= 0; > 0 without a radius.
         gradient: (n,), not all zero.
         radius: > 0; None for no limit.
 

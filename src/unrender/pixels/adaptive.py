@@ -49,8 +49,8 @@ class Adaptive:
     the parameters, per cost c_j of a path. Both factors are estimated from a few paths per tile of pixels and denoised. The second factor
     uses one forward-mode pass with random ±1 tangents (`RenderSession.tangent_moment`); for moving shapes it includes the derivative of
     visibility discontinuities. Samples of the first steps, and of one step between two updates, contribute to both factors
-    (`LearningSampler`) if the estimator reports them. Parameters with a preconditioner S count as u, where x = S u. The gradient is
-    unbiased for any positive probabilities, so errors of these estimates affect only its variance.
+    (`LearningSampler`) if the estimator reports them. θ is the optimizer's variable v (`scene.coordinates`). The gradient is unbiased for
+    any positive probabilities, so errors of these estimates affect only its variance.
 
     A few paths may miss rare bright ones, and such a map can make the variance many times that of uniform sampling. Because p_j >= λ u_j,
     the second moment of the gradient is at most 1 / λ times that of uniform sampling. λ starts at 0.8, a factor of at most 1.25, and
@@ -68,9 +68,9 @@ class Adaptive:
             least 4096 or all: on a processor, fewer pixels are hardly faster because of a step's fixed cost.
         levels: D, >= 0.
         refresh: steps between importance-map updates, >= 1.
-        samples: paths per update, >= 1, which also determines the size of the tiles: one path in each, or several if tiles are single
-            pixels. None takes a third of `count`, but at least 4096 (or twice `count`; eight times for the tiles), for each 20 steps
-            between updates: a few percent of the cost of the steps.
+        samples: paths per update, >= 1; None for min(max(`count` / 3, 4096), 2 `count`) · `refresh` / 20, a few percent of the cost of
+            the steps. There are as many tiles as paths, but at most one per pixel. With None there are at least min(8 `count`, 4096)
+            tiles; if these are more than the paths, only some updates trace one path per tile.
         uniform: λ, fraction of uniform samples, in (0, 1]. None starts at 0.8 and then chooses between 0.1 and 0.8 from the samples.
         stratified: whether samples are stratified over the distribution (`tiles.InverseCdfTable.draw`); independent otherwise, as in the
             paper.

@@ -53,7 +53,7 @@ class AdaptiveCountsState:
         since: number of steps since the last map update.
         costs: cost of a path through each tile, relative to one without an intersection, (tiles,).
         learnt: number of map updates from steps.
-        second_moment: running mean square of each element of the gradient, in the coordinates of the optimisation; {} if not observed.
+        second_moment: running mean square of each element of the gradient with respect to v (`scene.coordinates`); {} if not observed.
     """
 
     step: int
@@ -94,7 +94,7 @@ class AdaptiveCounts:
 
     Args:
         least: m, samples in each pixel, >= 2; `spp` must be larger.
-        refresh: steps between two map updates, >= 1.
+        refresh: interval of map updates in steps, >= 1.
         uniform: λ, in (0, 1]; None starts at 0.8 and then chooses from the samples.
         relative: whether each parameter element's variance is divided by its mean squared gradient; see `Adaptive`.
         by_cost: whether c_j = 1 + v / 2 for v vertices of a path, see `Adaptive`; otherwise c_j = 1.

@@ -26,8 +26,8 @@ class MiniBatch:
     Attributes:
         sample: the pixels; None for all pixels of all views.
         samples: number of paths traced to estimate their probabilities.
-        probability: per view, the pixels' probability relative to uniform sampling, as a map (rows, columns) coarser than the film; empty
-            if uniform.
+        probability: {view: pixels' probability or sample count relative to uniform sampling}, a map of the tiles (rows, columns); {} if
+            uniform.
         tangents: parameter tangents along which the squared derivatives of the pixels are requested (`DrawStatistics`); {} for no
             request.
         shares: distribution of the samples over full views; None for equal numbers.
@@ -110,7 +110,7 @@ def learned(
 
 
 def check_batch(owner: str, problem: Problem, count: int) -> None:
-    """Raise `InputError` if the loss is not pixelwise, or the mini-batch is far larger than all views together.
+    """Raise `InputError` if the loss is not pixelwise, or if `count` is above 65536 and above four times the pixels of all views.
 
     Args:
         owner: name of the sampler, for the message.

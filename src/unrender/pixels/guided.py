@@ -58,7 +58,7 @@ class GuidedSamplerState:
         shares: probability of a pixel of each tile relative to uniform sampling, (tiles,).
         references: mean references of the tiles, (tiles, 3).
         refreshes: number of importance-map updates.
-        second_moment: running mean square of each element of the gradient, in the coordinates of the optimisation; empty if not observed.
+        second_moment: running mean square of each element of the gradient with respect to v (`scene.coordinates`); {} if not observed.
         counts: weighted number of paths of each tile and map, (tiles,) each; earlier ones count less.
         denoised: the denoised first maps, against which samples are compared.
         density: importance map relative to uniform sampling, (tiles,).

@@ -20,7 +20,9 @@ from unrender.scene.problem import Problem
 @register
 @dataclass(frozen=True)
 class LossProportional:
-    """Importance sampling of pixels with p_j ∝ |∂L/∂I_j| (Eq. 5 of the paper of `Adaptive`), without noise and parameter derivatives.
+    """Importance sampling of pixels, p_j = λ u_j + (1 - λ) q_j with uniform u_j and q_j ∝ E|∂L/∂I_j|, summed over the channels. Unbiased.
+
+    This is Eq. 5 of the paper of `Adaptive`. Unlike `Adaptive` it ignores noise and parameter derivatives.
 
     Args:
         count, refresh, samples, uniform, stratified, denoiser: see `Adaptive`.

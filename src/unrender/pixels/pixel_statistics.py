@@ -125,8 +125,8 @@ def estimate_statistics(
         spp: paths per tile, >= 1.
         key: key of the random numbers.
         references: per level from 1 on, the reference of each tile, (tiles, 3); level 0 uses the pixels' own.
-        scales: scales of the tangents, in the coordinates of the optimisation; empty for no tangents. Tangents are propagated in up to
-            `ROUNDS` rounds with separate signs, because all paths of a launch share them.
+        scales: scales of the tangents of v (`scene.coordinates`); {} for no tangents. Tangents are propagated in up to `ROUNDS` rounds
+            with separate signs, because all paths of a launch share them.
     """
     rounds = max(n for n in range(1, min(spp, ROUNDS) + 1) if spp % n == 0) if scales else 1
     parts = [
@@ -197,7 +197,7 @@ def _round(
 
 
 def random_tangents(problem: Problem, parameters: Tree, scales: Tree, key: Key) -> Tree:
-    """Return tangents of the parameters: scales times random signs, in the coordinates of the optimisation."""
+    """Return the tangents of the parameters for tangents of v (`scene.coordinates`), which are `scales` times random signs."""
     signs = random_signs(parameters, key)
     scaled = {name: scales[name] * problem.renderer.array(sign) for name, sign in signs.items()}
     return problem.coordinates.push_forward(scaled, problem.coordinates.slopes(parameters))
@@ -210,9 +210,9 @@ def random_signs(like: Tree, key: Key) -> dict[str, np.ndarray]:
 
 
 def observed(problem: Problem, second_moment: Tree, gradient: Tree) -> Tree:
-    """Return the running mean square of the gradient, in the coordinates of the optimisation, after a further gradient with respect to u.
+    """Return the running mean square of the gradient with respect to v, after a further `gradient` with respect to u.
 
-    Elements that are not finite count as zeros.
+    See `scene.coordinates`. Elements that are not finite count as zeros.
     """
     pulled = problem.coordinates.pull_back(gradient, {})
     squares = trees.map(lambda g: arrays.where(arrays.is_finite(g), g * g, 0.0), pulled)

@@ -20,6 +20,7 @@ from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
 
 MOST_TILES = 1 << 24
+"""Maximum number of tiles of all views."""
 _RANGE = 1 << 32
 
 
@@ -107,7 +108,7 @@ class Tiles:
 
 
 def cut(problem: Problem, most: int) -> Tiles:
-    """Return the finest tiles with at most `most` in total, but at least one per view; the side is the same in all views."""
+    """Return the finest tiles with at most min(`most`, `MOST_TILES`) in total, but at least one per view. All have the same side."""
     return _cut(tuple(problem.renderer.resolutions()[view.sensor] for view in problem.views), min(most, MOST_TILES))
 
 
@@ -252,8 +253,7 @@ class TileSamples:
         return np.stack(sums, axis=1), np.bincount(self.tile, paths, tiles)
 
     def judged(self, values: Maps, denoised: Maps) -> np.ndarray:
-        """Return the `samples` of `uniform_share.observed`: each factor of Eq. 12 from the samples times the other from the map, (2,
-        N)."""
+        """Return y of `uniform_share.observed`, (2, N): each factor of Eq. 12 from the samples, times the other one from the map."""
         factors = [
             (values[index] * denoised[1 - index][self.tile]).sum(axis=1) * self.weights for index in range(FACTORS)
         ]

@@ -29,7 +29,7 @@ class UniformState:
 @register
 @dataclass(frozen=True)
 class Uniform:
-    """Uniform sampling of the pixels of all views.
+    """Uniform sampling of the pixels of all views. Unbiased.
 
     Args:
         count: pixels per step, >= 1, sampled with replacement.

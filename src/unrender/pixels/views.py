@@ -21,11 +21,11 @@ from unrender.scene.problem import Problem
 class Views:
     """Mini-batch of full views: each set of `count` views is equally likely, and all its pixels are rendered. Unbiased.
 
-    The cost per step that grows with the number of views decreases: silhouettes of moving shapes, small images. Sampling pixels of all
-    views (`Uniform`) does not reduce it. The differences between views add to the variance of the gradient.
+    It reduces costs that grow with the number of views, which mini-batches of pixels (`Uniform`) do not: boundary gradients of moving
+    shapes, and launches of small images. The differences between views add to the variance of the gradient.
 
     Args:
-        count: Views per step, >= 1; all views if the problem has no more.
+        count: views per step, >= 1; all views if the problem has no more.
     """
 
     count: int

@@ -13,7 +13,7 @@ from unrender.preconditioners.mesh import MeshTopology
 class Preconditioner(Protocol):
     """A symmetric positive definite linear map S of one parameter's gradients and steps.
 
-    The loop passes S g to the optimizer and adds S (step) to the parameter. This is an optimisation in coordinates u with x = S u.
+    The loop passes S g to the optimizer and adds S (step) to the parameter. This is an optimisation in coordinates v with x = S v.
     """
 
     def check(self, key: str, shape: tuple[int, ...]) -> None:
@@ -44,7 +44,13 @@ class PeriodicPreconditioner(Protocol):
 
 
 def bound_to(preconditioner: Any, topology: MeshTopology | None, columns: int) -> Any:
-    """Return a preconditioner for values at the vertices of a mesh, or with repeated border columns; itself for other parameters."""
+    """Return a preconditioner for values at the vertices of a mesh, or with repeated border columns; itself for other parameters.
+
+    Args:
+        preconditioner: the preconditioner.
+        topology: mesh that carries the values; None for none.
+        columns: number of repeated columns at each end; 0 for none.
+    """
     if isinstance(preconditioner, MeshPreconditioner) and topology is not None:
         return preconditioner.on_mesh(topology)
     if isinstance(preconditioner, PeriodicPreconditioner) and columns:

@@ -117,9 +117,9 @@ class MeshSolver:
         return CholeskySolverF(matrix.shape[0], rows, columns, matrix.data.astype(np.float64), MatrixType.COO)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
-        """Return y of the shape of x, (n V,) float32, for each of the n channels separately.
+        """Return B (C + λ L)^-1 Bᵀ x, (n V,) float32, for each of the n channels separately.
 
-        Raises `InputError` for another vertex number.
+        Raises `InputError` for another number of vertices.
         """
         values = self._topology.split("LargeSteps", np.asarray(x, np.float32))
         return self.solve_places(self._topology.gathered(values))[self._topology.places].reshape(-1)

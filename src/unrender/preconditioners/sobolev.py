@@ -144,7 +144,7 @@ class Sobolev:
     def descents_of_summaries(
         self, shape: tuple[int, ...], first: np.ndarray, second: np.ndarray, shares: np.ndarray
     ) -> np.ndarray:
-        """Estimate the result of `descents` from the summaries of g and g', gradients of this shape."""
+        """Estimate the result of `descents` from the summaries of g and g', gradients of this shape. Requires `is_on_device(shape)`."""
         pyramid = self._pyramid(shape)
         assert pyramid is not None
         strengths = self.strength_of(shape) * np.asarray(shares)

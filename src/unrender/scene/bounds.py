@@ -33,6 +33,7 @@ def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[B
         bounds: (low, high), where either may be None or infinite; None for the physical range.
         info: the renderer's description of the parameter.
         start: initial values, which determine the side of a singular value.
+
     Raises:
         InputError: the bounds are malformed, or the initial values are at a singular value or on both sides of it.
     """
@@ -112,7 +113,7 @@ def _sampled_lobe(start: np.ndarray, info: ParameterInfo) -> tuple[np.ndarray, s
 
 
 def off_ends(values: Tree, known: Mapping[str, ParameterInfo]) -> Tree:
-    """Return the values, those at an end of a closed range moved inside by the margin. All others are left alone.
+    """Return the values, where those within `MARGIN` of an end of a closed physical range are moved inside by it.
 
     Gradients are wrong at an end: no light comes back from a black surface, and no path takes a lobe of probability 0.
     """

@@ -51,7 +51,7 @@ def differences(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def digest(*parts: bytes) -> str:
-    """Return the SHA-256 of bytes, in the format that `differences` recognises."""
+    """Return the first 32 hexadecimal digits of the SHA-256 of bytes, in the format that `differences` recognises."""
     state = hashlib.sha256()
     for part in parts:
         state.update(part)

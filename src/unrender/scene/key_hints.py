@@ -81,7 +81,8 @@ def _same_quantity(key: str, names: list[str]) -> list[str]:
 def instead_of(key: str, known: Mapping[str, ParameterInfo]) -> str:
     """Return a hint at a recoverable key in place of one that is not, or at what to do; "" if there is none.
 
-    A pose replaces a transformation, and the texture of a bump map its scale. Other numbers that are compiled take one run per value.
+    The hint for a transformation is its pose, and for the scale of a bump map its texture. For other compiled numbers it is a run per
+    value.
     """
     owner, _, rest = key.rpartition(".")
     if (info := known.get(key)) is not None and info.compiled:

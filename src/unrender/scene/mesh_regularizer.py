@@ -42,7 +42,7 @@ class MeshRegularizer:
         return bound
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of both terms, and its gradient with respect to x, (3 V,)."""
+        """Return the sum of both terms, and its gradient with respect to x, (3 V,). Raises `InputError` before `on_mesh`."""
         mesh = self._mesh
         if mesh is None:
             raise InputError("regularizer: no mesh is attached; call on_mesh first")

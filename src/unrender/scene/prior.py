@@ -1,4 +1,4 @@
-"""Priors of unknowns: what is known of their values before any picture."""
+"""Priors of unknowns: knowledge of their values that does not come from the references."""
 
 from __future__ import annotations
 
@@ -96,14 +96,13 @@ class Prior:
         return bound
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return −log p(x) up to a constant, and its gradient, of the shape of `x`, in double precision."""
+        """Return −log p(x) up to a constant, `weight` included, and its gradient, of the shape of `x`, in double precision."""
         unknown = self._of()
         cells = unknown.cells(x)
         value, gradient = 0.0, np.zeros_like(cells)
-        if self.std is not None:
-            away = unknown.away(cells)
-            value += float(np.sum(away * away)) / (2 * self.std**2)
-            gradient += away / self.std**2
+        for away in unknown.distances(cells):
+            value += float(np.sum(away * away)) / (2 * self._variance)
+            gradient += away / self._variance
         sizes, pull = self._pairs(cells, cells)
         return self.weight * (value + sizes), self.weight * unknown.spread(gradient + pull, x)
 
@@ -115,23 +114,29 @@ class Prior:
         unknown = self._of()
         cells, along = unknown.cells(x), unknown.cells(v)
         product = np.zeros_like(cells)
-        if self.std is not None:
-            product += along / self.std**2
+        for _ in unknown.distances(cells):
+            product += along / self._variance
         _, pull = self._pairs(cells, along)
         return self.weight * unknown.spread(product + pull, x)
 
     def diagonal(self, x: np.ndarray) -> np.ndarray:
         """Return the diagonal elements of M of a texture or grid, of the shape of `x`. M of `product` couples neighbouring cells only."""
-        odd = np.indices(x.shape[:-1]).sum(axis=0)[..., None] % 2 == 1
-        return np.where(
-            odd, *(self.product(x, np.where(odd == of, 1.0, 0.0) * np.ones(x.shape)) for of in (True, False))
-        )
+        repeated = self._of().repeated
+        colour = np.indices(periodic.interior_shape(x.shape, repeated)[:-1]).sum(axis=0)[..., None] % 2
+        if repeated:  # the last column is a neighbour of the first, which may have the same parity
+            colour[:, -1] += 2
+        masks = [np.broadcast_to(periodic.pad(colour, repeated) == of, x.shape) for of in np.unique(colour)]
+        return sum((mask * self.product(x, mask.astype(np.float64)) for mask in masks), np.zeros(x.shape))
 
     def describe(self) -> str:
         """Return the terms in one line."""
         return ", ".join(
             f"{name} {value}" for name, value in tables.fields(self).items() if name != "weight" or value != 1.0
         )
+
+    @property
+    def _variance(self) -> float:
+        return (self.std or 1.0) ** 2
 
     def _of(self) -> _Unknown:
         if self._unknown is None:
@@ -188,16 +193,16 @@ class _Unknown:
             return values.reshape(x.shape)
         return periodic.pad(values.reshape(periodic.interior_shape(x.shape, self.repeated)), self.repeated)
 
-    def away(self, cells: np.ndarray) -> np.ndarray:
-        """Return the difference of the cells from the expected value or the nearest colour."""
-        if self.near is not None:
-            return cells - self._expected(cells.shape)
-        palette = np.asarray(self.palette)
-        nearest, least = np.broadcast_to(palette[0], cells.shape), np.full((*cells.shape[:-1], 1), np.inf)
-        for colour in palette:
+    def distances(self, cells: np.ndarray) -> list[np.ndarray]:
+        """Return the differences of the cells from the expected values and from the nearest colours, if there are these terms."""
+        terms = [] if self.near is None else [cells - self._expected(cells.shape)]
+        if self.palette is None:
+            return terms
+        nearest, least = np.broadcast_to(self.palette[0], cells.shape), np.full((*cells.shape[:-1], 1), np.inf)
+        for colour in self.palette:
             distance = np.sum((cells - colour) ** 2, axis=-1, keepdims=True)
             nearest, least = np.where(distance < least, colour, nearest), np.minimum(least, distance)
-        return cells - nearest
+        return [*terms, cells - nearest]
 
     def _expected(self, shape: tuple[int, ...]) -> np.ndarray:
         """Return the expected values, averaged over the cells of a coarser grid."""

@@ -233,7 +233,7 @@ class Problem(ViewLosses):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The parameters as passed to the constructor."""
+        """The parameters as passed to the constructor, with the settings of `configured`."""
         return tuple(unknown.parameter for unknown in self.unknowns.values())
 
     @cached_property
@@ -296,7 +296,7 @@ class Problem(ViewLosses):
         return {key: self.renderer.array(unknown.initial) for key, unknown in self.unknowns.items()}
 
     def start(self, step: int = 0) -> Tree:
-        """Return `initial()` at the resolutions of a step."""
+        """Return the values before the first step (`Unknown.first`, else `initial()`) at the resolutions of a step."""
         return {key: self.renderer.array(unknown.start(step)) for key, unknown in self.unknowns.items()}
 
     def shapes(self, step: int | None = None) -> dict[str, tuple[int, ...]]:
@@ -371,9 +371,9 @@ def open_scene(
     """Return the renderer of a scene in which the ties of these parameters are unknowns. Raises `FieldError`.
 
     Args:
-        scene, max_depth, parameters: As for `Problem`.
-        others: Further parameters that will be asked for.
-        expressions: Parameters of the scene that are functions of unknowns.
+        scene, max_depth, parameters: as for `Problem`.
+        others: keys of further parameters that will be used.
+        expressions: parameters of the scene that are functions of unknowns, as for `Problem`.
     """
     functions = expressions or {}
     renderer = open_renderer(scene, max_depth, [*scene_keys(parameters), *others, *functions])

@@ -11,6 +11,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.io.stored_pictures import StoredPicture
 from unrender.scene.view import View
 
@@ -117,9 +118,10 @@ _LEAST = 1e-4
 def standard_deviation(reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the standard deviation of the noise of a picture (H, W, 3), in its units.
 
-    It is the scaled median of (x_ij − x_i+1,j − x_i,j+1 + x_i+1,j+1) / 2, which is 0 for pictures that are linear along either axis, and
-    has the noise's standard deviation where noise is independent between pixels. Edges change few of these values. Fine texture counts
-    as noise, and noise that neighbouring pixels share, as that of wide film filters, is underestimated.
+    It is the scaled median of |x_ij − x_i+1,j − x_i,j+1 + x_i+1,j+1| / 2, and at least 1e-4 times the root mean square of the picture.
+    These differences are 0 for a sum of a function of the row and one of the column. They have the noise's standard deviation if noise is
+    independent between pixels. Edges change few of them. Fine texture counts as noise. Noise that is correlated between neighbours, as by
+    wide film filters, is underestimated.
 
     Args:
         reference: (H, W, 3). Values that are not finite are ignored.
@@ -139,7 +141,7 @@ def likelihood_scale(problem: Problem) -> float:
 
     A loss of |image − reference|^p per pixel is s times a negative log likelihood with s = p L(noise) / N. L(noise) is the loss of
     pictures that differ from the N values of the references by their noise alone. p is measured: L grows by 2^p when that noise is
-    doubled.
+    doubled; 2 if it does not grow. Raises `InputError` if the loss is not finite there.
     """
     once, twice, count = 0.0, 0.0, 0.0
     for index, view in enumerate(problem.views):
@@ -151,7 +153,12 @@ def likelihood_scale(problem: Problem) -> float:
         twice += _loss(problem, index, reference + 2 * noise)
         count += reference.size if mask is None else float(mask.sum()) * reference.shape[-1]
     power = math.log2(twice / once) if 0 < once < twice < math.inf else 2.0
-    return power * once / max(count, 1.0) if math.isfinite(once) else 0.0
+    if not math.isfinite(once):
+        raise InputError(
+            f"prior: its scale is the loss at the references plus noise, where {type(problem.loss).__name__} is {once}; use a loss that is "
+            "finite there, or leave out the priors"
+        )
+    return power * once / max(count, 1.0)
 
 
 def _loss(problem: Problem, view: int, image: np.ndarray) -> float:

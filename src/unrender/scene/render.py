@@ -41,6 +41,9 @@ def render(
 
     Returns:
         float32 (H, W, 3), linear RGB.
+
+    Raises:
+        InputError: `spp` or `view` is out of range, or `parameters` have other keys or shapes.
     """
     if not isinstance(spp, int) or spp < 1:
         raise InputError(f"render: spp must be a whole number of at least 1, got {spp!r}")

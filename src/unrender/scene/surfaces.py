@@ -75,7 +75,7 @@ class Surface:
         return KDTree(np.concatenate([points, middles])), np.concatenate([face, np.arange(len(self.faces))])
 
     def distances_from(self, other: Surface) -> np.ndarray:
-        """Return distances (N,) from points uniform by area on another surface to this one.
+        """Return the distances (2000,) from points uniform by area on another surface to this one. Deterministic.
 
         Distances are exact for the triangles of the nearest sample points and centroids, hence never too small.
         """

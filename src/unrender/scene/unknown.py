@@ -77,9 +77,9 @@ class Unknown:
         return project(values, *self.bounds, self._scale)
 
     def reached(self, values: Array) -> Array:
-        """Return the values after a step that leads to `values`: inside the bounds. A direction that has become very long or short gets
-        length 1; at each step, optimizers would take the change of its elements for bounds."""
+        """Return `values` projected onto the bounds. A direction (3,) whose length is outside [1e-3, 1e3] is normalised."""
         inside = self.project(values)
+        # Normalisation at every step would look like a projection onto bounds to the optimizer.
         if self.measure.role != "direction" or self.initial.shape != _VECTOR:
             return inside
         length = float(np.linalg.norm(arrays.numpy(inside)))
@@ -113,7 +113,7 @@ class Unknown:
         return self.initial.shape if levels is None or step is None else levels.shape(self.initial.shape, step)
 
     def start(self, step: int) -> np.ndarray:
-        """Return the initial value at the resolution of a step."""
+        """Return `first`, or `initial` if it is None, at the resolution of a step."""
         first = self.initial if self.first is None else self.first
         return first if self.coarse_to_fine is None else self.coarse_to_fine.coarsened(first, step)
 

@@ -46,12 +46,15 @@ class Upsampler:
         problem: problem whose `coarse_to_fine` gives the shapes.
         step: the next step.
         parameters: the current parameters at the coarse resolution.
+
+    Attributes:
+        shares: {key: 1/n} of the parameters whose shape changes.
     """
 
     problem: Problem
     step: int
     parameters: Tree
-    shares: dict[str, float] = field(default_factory=dict)
+    shares: dict[str, float] = field(default_factory=dict, init=False)
 
     def __post_init__(self):
         self._shapes = self.problem.shapes(self.step)

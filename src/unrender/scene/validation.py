@@ -387,4 +387,5 @@ def check_sequence(values: Any, kind: type, name: str) -> tuple[Any, ...]:
 
 
 def is_number(x: Any) -> bool:
+    """Return whether x is a finite real number of Python or NumPy, and no boolean."""
     return isinstance(x, (int, float, np.integer, np.floating)) and not isinstance(x, bool) and math.isfinite(x)

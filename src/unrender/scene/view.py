@@ -17,7 +17,7 @@ class View:
     """A reference image and its sensor.
 
     Args:
-        reference: file, or array (H, W, 3), in linear RGB. 8-bit files are converted from sRGB. An array contains the film's format:
+        reference: file, or array (H, W, 3), in linear RGB. 8- and 16-bit files are converted from sRGB. An array has the film's format:
             luminance (H, W) or XYZ (H, W, 3) according to the film's `pixel_format`. Alpha of 8- and 16-bit images multiplies the mask.
             Alpha of floating-point images is ignored, because films store premultiplied colours.
         sensor: index of the scene's sensor.

@@ -33,13 +33,13 @@ def of_views(
     """Return a renderer in which each view's world is a sensor, and the views with these sensors.
 
     Args:
-        renderer: Renders the problem's scene.
-        views: As given.
-        keys: Parameters of the scenes that are unknown.
-        opened: Returns the renderer of a scene. Called once for equal scenes.
+        renderer: renderer of the problem's scene.
+        views: views as passed to the problem.
+        keys: keys of the unknowns.
+        opened: function from a scene to its renderer; called once for equal scenes.
 
     Raises:
-        FieldError: A sensor, key or value that does not suit, or a scene that has none of the unknowns.
+        FieldError: a sensor, key or value is invalid, or a scene has none of the unknowns.
     """
     scenes: list[tuple[Any, Renderer]] = []
     worlds: dict[int, World] = {}

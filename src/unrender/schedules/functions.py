@@ -123,7 +123,7 @@ class Cosine:
 @register(position=5)
 @dataclass(frozen=True)
 class Steps:
-    """Multiplication by `factor` after every `every` steps.
+    """`factor` to the power ⌊step / `every`⌋.
 
     Args:
         every: number of steps, >= 1.
@@ -161,5 +161,5 @@ class Warmup:
 
     def __call__(self, step: float) -> float:
         if step < self.steps:
-            return (step + 1) / self.steps
+            return min((step + 1) / self.steps, 1.0)
         return 1.0 if self.then is None else self.then(step - self.steps)

@@ -1,4 +1,4 @@
-"""Statistical formulas made of operators: the same code runs on NumPy and on Dr.Jit arrays."""
+"""Statistical formulas. `meta`, `recursion`, `roughness` and `welford` run on NumPy and Dr.Jit arrays, the other modules on NumPy's."""
 
 from unrender.statistics import gaussian, meta, recursion, welford
 from unrender.statistics.recursion import control_variate_variance, control_weight

@@ -21,7 +21,7 @@ def rmse(
     Args:
         first, second: (H, W, C), independent renderings of equal noise; noise is independent between pixels.
         reference: (H, W, C).
-        mask: weight of each pixel, (H, W), in [0, 1]; None for equal weights.
+        mask: weight of each pixel, (H, W), in [0, 1]; None for equal weights. Values of pixels with weight 0 are ignored.
 
     Returns:
         The root of that mean and its standard error. The root is 0 where the mean is negative or no pixel counts. Both are infinite if a

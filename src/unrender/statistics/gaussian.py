@@ -115,8 +115,8 @@ def gradient_mixture(chosen: np.ndarray, u: np.ndarray, normal: np.ndarray) -> n
     """Sample the mixture over the gradient's elements; returns z (B, n).
 
     Args:
-        chosen: (B,), uniform numbers that select the element.
-        u: (B, n), uniform numbers, of which those of the selected dimension are used.
+        chosen: (B,), uniform numbers in [0, 1) that select the element.
+        u: (B, n), uniform numbers in (0, 1), of which those of the selected dimensions are used.
         normal: (B, n), standard normals for the other dimensions.
     """
     n = normal.shape[1]

@@ -1,4 +1,4 @@
-"""Covariance of a sum of pixel scores whose noise channels and neighbouring pixels share."""
+"""Covariance of a sum of pixel scores with noise that is correlated between channels and between neighbouring pixels."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _FEWEST_PIXELS = 256
 
 
 def covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return an estimate of the covariance of Σ_p s_p over the pixels p of a picture, (n, n).
+    """Return an estimate of the covariance (n, n) of Σ_p s_p over the pixels p of a picture, for n parameters.
 
-    The scores s_p are derivative times residual, summed over the channels, so channels may share their noise. Wide film filters make the
-    noise of neighbours correlated. Where the scores show that, products with the eight neighbours are included. They are left out
-    elsewhere, since they have much noise, and in pictures of fewer than 256 pixels.
+    The scores s_p (n,) are derivative times residual, summed over the channels, so noise may be correlated between channels. Wide film
+    filters correlate the noise of neighbours. If the scores show that, products with the eight neighbours are included. They are left out
+    otherwise, because they are noisy, and in pictures of fewer than 256 pixels.
 
     Args:
         one, other: (n, H, W), two estimates of the scores with independent rendering noise, which then adds no bias. Equal arrays
@@ -50,10 +50,10 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
 
 
 def without_own_pixel(residuals: np.ndarray, slopes: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return the residuals that each pixel would have if the fit had left it out, (..., P, C).
+    """Return the residuals that each pixel would have if the fit had left it out, (1 − h)⁻¹ r, (..., P, C).
 
-    A fit follows the noise of its pixels, so that what remains is less than the noise, by (1 − h)² for a pixel of leverage h = J_p (JᵀJ)⁻¹
-    J_pᵀ (Efron's jackknife; HC3 of MacKinnon and White 1985).
+    A fit follows the noise of its pixels, so its residuals r are smaller than the noise. h = J_p (JᵀJ)⁻¹ J_pᵀ (C, C) is the leverage of a
+    pixel, with eigenvalues clamped to [0, 0.9] (Efron's jackknife; HC3 of MacKinnon and White 1985).
 
     Args:
         residuals: residuals of the fit, (..., P, C).
@@ -68,7 +68,7 @@ def without_own_pixel(residuals: np.ndarray, slopes: np.ndarray, inverse: np.nda
 
 
 def positive_part(matrix: np.ndarray) -> np.ndarray:
-    """Return the symmetric matrix with its negative eigenvalues set to 0, after scaling to unit diagonal."""
+    """Return D P D for the symmetric matrix D M D, where D is diagonal, M has a unit diagonal, and P is M without negative eigenvalues."""
     units = np.sqrt(np.abs(np.diag(matrix)))
     units = np.where(units > 0.0, units, 1.0)
     eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))

@@ -37,10 +37,11 @@ class StationaryMean:
 
 
 def stationary_mean(sequence: np.ndarray) -> StationaryMean | None:
-    """Return the mean over the longest window at the end of a sequence (T,) in which it is stationary; None if no half of it is.
+    """Return the mean over the longest window at the end of a sequence (T,) in which it is stationary.
 
-    In such a window the values cross their mean repeatedly, the first quarter has the mean of the rest, and so has the first half, within
-    two standard errors. So a sequence that converges smoothly, or wanders slowly, has no mean here.
+    In such a window the values cross their mean repeatedly. The means of the first quarter and of the first half differ from those of the
+    rest by less than two standard errors. None if no window of at least half the sequence and 16 values is stationary, as for a sequence
+    that converges smoothly or drifts slowly.
     """
     count = len(sequence)
     for start in sorted({int(count * share) for share in _STARTS}):

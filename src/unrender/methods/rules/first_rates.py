@@ -41,8 +41,9 @@ def first_rates(problem: Problem, share: float, constants: Constants = CONSTANTS
     """Return {key: first learning rate} of each parameter, `share` times its size.
 
     The size is the range between two bounds, else the root mean square of the initial values, or 1 if they are 0. It is divided by the
-    root of the number of unknown textures of the same material, which share residuals and would together overshoot. It is smaller for
-    bounded numbers. With a parameterisation, it is the size in u.
+    root of the number of unknown textures of the same material, which share residuals and would together overshoot. For vertices it is
+    `mesh_share` times the mesh's radius. Numbers with two bounds, normal maps, and albedos of media with an unknown extinction have a
+    share of it (`Constants`). With a parameterisation, it is the size in u.
     """
     rates: dict[str, float] = {}
     initial = {key: unknown.initial for key, unknown in problem.unknowns.items()}

@@ -30,7 +30,7 @@ def sampler(traits: Traits) -> tuple[PixelSampler, str]:
 
 
 def samples_per_pixel(traits: Traits, sampler: PixelSampler) -> int:
-    """Return the largest power of two within the path budget, clamped to the limits, unless it is set."""
+    """Return the option `spp`, or else the largest power of two within the path budget, clamped to the limits."""
     constants = traits.constants
     draws = isinstance(sampler, pixels.Uniform)
     count, paths = (sampler.count, constants.batch_paths) if draws else (traits.problem.pixels, constants.paths)

@@ -96,6 +96,11 @@ class StepTransform(ABC):
         """Capabilities that the estimate must have in addition to the gradient."""
         return ()
 
+    @property
+    def sets_steps(self) -> bool:
+        """Return whether `update` sets `StepUpdate.steps`, which later transforms cannot change."""
+        return False
+
     @abstractmethod
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Any:
         """Return the state before the first step: a frozen dataclass of arrays, or None.
@@ -143,9 +148,11 @@ def checked_keys(owner: str, keys: Any) -> tuple[str, ...]:
 
 
 def checked_transforms(owner: str, parts: Any) -> tuple[StepTransform, ...]:
-    """Return transforms as a tuple. Raise `InputError` for anything else."""
+    """Return transforms as a tuple. Raise `InputError` for anything else, or if one before the last sets the steps."""
     if not isinstance(parts, (list, tuple)):
         raise InputError(f"{owner}: expected a list of transforms such as ScaleByRms(), got {parts!r:.80}")
     if wrong := [part for part in parts if not isinstance(part, StepTransform)]:
         raise InputError(f"{owner}: expected transforms such as ScaleByRms(), got {wrong[0]!r:.80}")
+    if early := [type(part).__name__ for part in parts[:-1] if part.sets_steps]:
+        raise InputError(f"{owner}: {early[0]} sets the steps, so later transforms have no effect; put it last")
     return tuple(parts)

@@ -64,6 +64,10 @@ class PerParameter(StepTransform):
         """Capabilities that the transforms require."""
         return tuple(kind for part in (*self.transforms, *self.others) for kind in part.requires)
 
+    @property
+    def sets_steps(self) -> bool:
+        return any(part.sets_steps for part in (*self.transforms, *self.others))
+
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> PerParameterState:
         """Return the states before the first step. Raises `InputError` for an unknown key."""
         if unknown := next((key for key in self.keys if key not in parameters), None):

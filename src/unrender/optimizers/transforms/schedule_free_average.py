@@ -52,6 +52,10 @@ class ScheduleFreeAverage(StepTransform):
         checks.number("ScheduleFreeAverage", "beta", self.beta, above=0.0, below=1.0, inclusive=True)
         checks.number("ScheduleFreeAverage", "averaging", self.averaging, above=0.0, inclusive=True)
 
+    @property
+    def sets_steps(self) -> bool:
+        return True
+
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> Iterates:
         del learning_rates
         return Iterates(dict(parameters), dict(parameters))
