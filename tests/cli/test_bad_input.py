@@ -86,7 +86,25 @@ MISTAKES = [
     (["compare", "problem.toml", "--set", "auto.spp=0"], "method auto: option spp: expected a whole number above 0"),
     (["compare", ".", "nowhere"], "nowhere: no such run folder"),
     (["compare", "."], "run.json"),
-    (["compare", ".", "--seconds", "3"], "do not apply to run folders"),
+]
+MISTAKES += [  # options that would be ignored
+    *(
+        (["compare", ".", name, *value], f"compare: {name} does not apply to run folders; leave it out")
+        for name, *value in (
+            ("--seconds", "3"),
+            ("--seeds", "2"),
+            ("--set", "spp=2"),
+            ("--final-spp", "4"),
+            ("--no-cache",),
+        )
+    ),
+    (["compare", ".", "-p", "resolution=8"], "compare: --problem-set does not apply to run folders"),
+    (["gallery", "--out", "drawn"], "gallery: --out needs the NAME of a problem"),
+    (["gallery", "exponential", "--spp", "4"], "gallery: --spp needs --out"),
+    (["gallery", "exponential", "--no-cache"], "gallery: --no-cache needs --out or --problem-set"),
+    (["gallery", "exponential", "-p", "loss=L1", "--overwrite"], "gallery: --overwrite needs --out"),
+    (["methods", "rcv", "--variant", "auto"], "methods: --variant needs --plan PROBLEM"),
+    (["methods", "-s", "spp=2"], "methods: --set needs --plan PROBLEM"),
 ]
 
 

@@ -84,6 +84,9 @@ def test_an_interrupted_sweep_goes_on_where_it_was(
     assert (more.status, len(trials("s"))) == (0, 5)
     refused = unrender("sweep", "s", "--steps", 3)
     assert (refused.status, "continues with its original options; leave out --steps" in refused.error) == (2, True)
+    for short, full in (("-p", "--problem-set"), ("-s", "--set"), ("-m", "--method")):
+        refused = unrender("sweep", "s", short, "a=1")
+        assert (refused.status, f"leave out {full}\n" in refused.error) == (2, True)
 
 
 def test_a_trial_that_cannot_be_carried_out_is_one_line_and_the_others_go_on(

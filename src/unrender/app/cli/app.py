@@ -51,7 +51,7 @@ def _doctor() -> None:
 @app.callback(invoke_without_command=True)
 def _unrender(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
 ) -> None:
     if version:
         typer.echo(metadata.version("unrender"))

@@ -7,7 +7,7 @@ import math
 import os
 import re
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 DEFAULT_STEPS = 300
 MOST_SAMPLES, MOST_SEEDS, MOST_TRIALS = 1 << 24, 10_000, 100_000
-"""Largest samples per pixel of a picture, runs of one method or trial, and trials of a sweep. More would take years."""
+"""Limits of samples per pixel of a picture, of runs of one method or trial, and of trials of a sweep. More would take years."""
 
 ProblemName = Annotated[
     str, typer.Argument(metavar="PROBLEM", help="A problem file (TOML), or a name from the gallery.")
@@ -41,21 +41,28 @@ ProblemSettings = Annotated[
     ),
 ]
 Variant = Annotated[str, typer.Option(help=f"Mitsuba's variant: auto, {', '.join(variant.VARIANTS)}.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the results of an earlier run in the folder.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace earlier results in the folder.")]
 Threads = Annotated[
     int | None,
-    typer.Option(min=1, help="Threads of the processor. With 1, runs repeat bit for bit.", show_default=False),
+    typer.Option(
+        min=1, help="Number of processor threads. With 1, runs on LLVM repeat bit for bit.", show_default=False
+    ),
 ]
 CheckpointEvery = Annotated[
     int | None,
-    typer.Option(min=1, max=2**31 - 1, help="Steps between checkpoints. Default: 50 or so.", show_default=False),
+    typer.Option(
+        min=1,
+        max=2**31 - 1,
+        help="Steps between checkpoints. Default: about 50, in 1 % of the time.",
+        show_default=False,
+    ),
 ]
 FinalSpp = Annotated[
     int | None,
     typer.Option(
         min=1,
         max=MOST_SAMPLES,
-        help="Samples per pixel of the final pictures. Default: as many as a twentieth of the time allows.",
+        help="Samples per pixel of the final pictures. Default: as many as 5 % of the time allow.",
     ),
 ]
 
@@ -85,7 +92,7 @@ WorkersOption = Annotated[
     str | None,
     typer.Option(
         metavar="auto | N | HOST:PORT",
-        help="Several processes by Ray: one a GPU or core, so many, or those of a cluster. Default: this process alone.",
+        help="Run in Ray processes: one per GPU or core, N of them, or those of a cluster. Default: in this process.",
         show_default=False,
     ),
 ]
@@ -102,7 +109,7 @@ Insecure = Annotated[
 
 
 def workers(text: str | None, insecure: bool = False) -> Workers | None:
-    """Return the value of --workers and --insecure; None for this process alone, which includes one worker without an address.
+    """Return the value of --workers and --insecure; None for this process, which also runs a single worker without an address.
 
     Raises:
         InputError: --workers is invalid, or --insecure is given without it.
@@ -136,13 +143,20 @@ def settings(pairs: Iterable[str] | None, option: str) -> dict[str, str]:
 
 
 def literal(text: str) -> Any:
-    """Return an integer, a number, or a boolean if `text` is one, else the text."""
+    """Return the integer, the number or the boolean that `text` represents; the text itself if it represents none."""
     for kind in (int, float):
         try:
             return kind(text)
         except ValueError:
             pass
     return {"true": True, "false": False}.get(text.lower(), text)
+
+
+def typed_options(context: typer.Context, accepted: Collection[str] = ()) -> list[str]:
+    """Return the typed options of a command, such as "--seed", without those whose parameters are `accepted`."""
+    options = [one for one in context.command.params if one.param_type_name == "option" and one.name not in accepted]
+    sources = {one.opts[0]: context.get_parameter_source(one.name or "") for one in options}
+    return [name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"]
 
 
 def check_variant(name: str) -> None:
@@ -166,12 +180,15 @@ def use_variant(name: str, threads: int | None = None) -> str:
 
 
 def check_file(name: str) -> None:
-    """Raise `InputError` for a problem file that is not there, or whose fields are invalid, before the slow imports."""
+    """Raise `InputError` for a problem file that is missing or has invalid fields, before the slow imports.
+
+    Stages and names of the gallery are not checked.
+    """
     file = Path(name)
     if file.suffix.lower() != ".toml":
         return
     if not file.exists():
-        from unrender.io import bounded_files  # NumPy with it
+        from unrender.io import bounded_files  # imports NumPy
 
         raise InputError(f"{name}: {bounded_files.no_file(file)}")
     from unrender.app.stages import stages_file
@@ -195,7 +212,7 @@ def check_problem(name: str, options: Mapping[str, str]) -> None:
         if options:
             raise InputError(f"--problem-set {next(iter(options))}: only gallery problems have options; edit {name}")
         if not Path(name).exists():
-            from unrender.io import bounded_files  # NumPy with it
+            from unrender.io import bounded_files  # imports NumPy
 
             raise InputError(f"{name}: {bounded_files.no_file(Path(name))}")
         refuse_stages(name)
@@ -237,7 +254,7 @@ def short_name(problem: str) -> str:
 
 
 def absolute(problem: str) -> str:
-    """Return the problem as typed, with the absolute path of a file."""
+    """Return the typed problem: the absolute path of a file, or the name of a gallery problem."""
     return str(Path(problem).absolute()) if _is_file(problem) else problem
 
 
@@ -246,7 +263,7 @@ def _is_file(name: str) -> bool:
 
 
 def budget(steps: int | None, seconds: float | None) -> tuple[int | None, float | None]:
-    """Return steps and seconds; `DEFAULT_STEPS` if neither is given. Raise `InputError` for an invalid value."""
+    """Return steps and seconds; `DEFAULT_STEPS` steps if both are None. Raise `InputError` for an invalid value."""
     if steps is not None and not 1 <= steps < 1 << 63:
         raise InputError(f"--steps {steps!s:.60}: expected at least 1 and less than 2**63")
     if seconds is not None and not 0 < seconds < math.inf:
@@ -264,7 +281,7 @@ def folder(out: Path | None, default: str, overwrite: bool, *marks: str) -> Path
         marks: patterns of files that identify earlier results.
 
     Raises:
-        InputError: a file, a folder with other contents, earlier results without `overwrite`, or not writable.
+        InputError: `out` is a file, has other contents, has earlier results without `overwrite`, or cannot be written to.
     """
     if out is None:
         name = re.sub(r"[^\w.-]+", "-", default).strip(".-") or "run"
@@ -281,7 +298,7 @@ def folder(out: Path | None, default: str, overwrite: bool, *marks: str) -> Path
                 raise InputError(f"--out {out}: the folder is not empty and holds no earlier results ({marks[0]})")
             if not overwrite:
                 raise InputError(f"--out {out}: contains earlier results; give --overwrite to replace them")
-        from unrender.io import files  # NumPy with it
+        from unrender.io import files  # imports NumPy
 
         files.make_folder(out)
     except OSError as error:
@@ -297,14 +314,14 @@ def command_line(context: typer.Context) -> str:
 
 
 def finished_run(directory: Path) -> Path:
-    """Return the run folder of the result in DIR: for a run in stages, the last that has started. Raise `InputError`."""
+    """Return the folder itself or, for a run in stages, the run folder of the last stage that has started. Raise `InputError`."""
     from unrender.app.stages import run_folders
 
     return run_folders.last_result(directory)
 
 
 def remove_if_empty(directory: Path) -> None:
-    """Remove a folder that `folder` created if nothing was written to it."""
+    """Remove an empty folder that `folder` created, and an empty out/ above it."""
     with contextlib.suppress(OSError):
         directory.rmdir()
         if directory.parent == Path("out"):

@@ -51,7 +51,8 @@ _Seconds = Annotated[
     float | None, typer.Option(help="Time for each run, with compilation and final pictures. [default: 20]")
 ]
 _Methods = Annotated[
-    str | None, typer.Option(metavar="NAME,NAME", help="The first measures the others. [default: stock,auto]")
+    str | None,
+    typer.Option(metavar="NAME,NAME", help="The first is the reference of the others. [default: stock,auto]"),
 ]
 
 
@@ -93,8 +94,9 @@ def compare(
     check_seed("--seed", seed, seeds)
     where = arguments.workers(workers, insecure)
     if all(Path(name).is_dir() for name in what):
-        run_options = methods or settings or problem_settings or workers or seconds is not None
-        return _compare_folders(console, [Path(name) for name in what], out, overwrite, bool(run_options))
+        if refused := arguments.typed_options(context, ("out", "overwrite", "allow_outside")):
+            raise InputError(f"compare: {refused[0]} does not apply to run folders; leave it out")
+        return _compare_folders(console, [Path(name) for name in what], out, overwrite)
     _check_single(what)
     typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
@@ -171,14 +173,8 @@ def _check_single(what: Sequence[str]) -> None:
         raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
 
 
-def _compare_folders(
-    console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool, run_options: bool
-) -> None:
-    """Compare earlier runs. `run_options` is whether options were given that only apply to new runs."""
-    if run_options:
-        raise InputError(
-            "compare: --methods, --set, --seconds and --workers do not apply to run folders; leave them out"
-        )
+def _compare_folders(console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool) -> None:
+    """Compare earlier runs."""
     from unrender.app import report
     from unrender.app.cli.comparison_table import plain, show
 

@@ -22,6 +22,11 @@ TOLERANCE = 1e-3
 """Maximum relative error of the test gradient. Both sides use the same paths, so only rounding errors remain."""
 
 _FEATURES = {
+    "capture": "photographs, glTF, .mp4",
+    "usd": "USD",
+    "remesh": "remeshing",
+    "ray": "workers",
+    "sweep": "sweeps by tpe",
     "denoise": "denoised images on the CPU",
     "flip": "the measure FLIP",
     "tensorboard": "TensorBoard",
@@ -74,11 +79,10 @@ def doctor(console: Console | None = None) -> int:
 
 
 def gradient_error() -> float:
-    """Return the relative error of path replay against central differences on the same paths. The derivative is that of a Cornell box's
-    mean brightness by the red wall's albedo, summed over channels.
+    """Return the relative error of path replay against central differences on the same paths. A variant must be active.
 
-    A variant must be active. The brightness is a cubic polynomial of the albedo at this depth, so the error of the differences is about
-    1e-4.
+    The derivative is that of the mean of a Cornell box's image by the red wall's albedo, summed over the albedo's channels. The mean is
+    a cubic polynomial of the albedo at this depth, so the error of the differences is about 1e-4.
     """
     import drjit as dr
     import mitsuba as mi

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def judge(
     directory: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A run folder, or that of a run in stages, for its last one.")
+        Path, typer.Argument(metavar="DIR", help="A run folder, or that of a run in stages for its last stage.")
     ],
     held_out: Annotated[
         Path | None,
@@ -35,7 +35,7 @@ def judge(
     variant: Variant = "auto",
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Measure a run's result on photographs that it was not made from: PSNR, SSIM, LPIPS, a sheet, the light as a picture."""
+    """Measure a run's result on held-out photographs: PSNR, SSIM and LPIPS, with pictures of the views and of the light."""
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
@@ -84,18 +84,21 @@ def _number(value: float | None, name: str) -> str:
 
 def turntable(
     directory: Annotated[
-        Path, typer.Argument(metavar="DIR", help="A run folder, or that of a run in stages, for its last one.")
+        Path, typer.Argument(metavar="DIR", help="A run folder, or that of a run in stages for its last stage.")
     ],
     environment: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The light: a picture of all directions (.exr, .hdr).")
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, max=100_000, help="Frames of one turn.")] = 48,
-    rate: Annotated[float, typer.Option(help="Frames a second.")] = 24.0,
-    size: Annotated[int, typer.Option(help="Pixels a side.")] = 320,
+    frames: Annotated[int, typer.Option(min=1, max=10_000, help="Number of frames.")] = 48,
+    rate: Annotated[float, typer.Option(help="Frames per second, at most 240.")] = 24.0,
+    size: Annotated[int, typer.Option(help="Width and height in pixels, an even number.")] = 320,
     spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel.")] = 64,
-    elevation: Annotated[float, typer.Option(help="Elevation of the camera in degrees.")] = 15.0,
-    up: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="The axis. Default: the cameras' mean.")] = None,
-    background: Annotated[str, typer.Option(help="light, black, grey or white.")] = "light",
+    elevation: Annotated[float, typer.Option(help="Elevation of the camera above the horizon in degrees.")] = 15.0,
+    up: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Axis of the rotation. Default: the mean up axis of the cameras."),
+    ] = None,
+    background: Annotated[str, typer.Option(help="Background: light, black, grey or white.")] = "light",
     out: Annotated[
         Path | None, typer.Option(help=".mp4, .gif, or a folder for PNG files. Default: turntable.mp4 in DIR.")
     ] = None,
@@ -103,7 +106,7 @@ def turntable(
     variant: Variant = "auto",
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Write a video of a run's result that turns once before a camera and a light."""
+    """Write a video of one rotation of a run's result before a camera and a light."""
     from unrender.app.evaluation import turntable
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress

@@ -33,7 +33,7 @@ def export(
         ),
     ] = "mitsuba",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier export.")] = False,
-    spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel that the scene asks for.")] = 256,
+    spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel in scene.xml.")] = 256,
     variant: Variant = "auto",
     allow_outside: AllowOutside = False,
 ) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.cli.arguments import FinalSpp, NoCache, Overwrite, ProblemSettings, Variant
+from unrender.app.cli.arguments import MOST_SAMPLES, NoCache, Overwrite, ProblemSettings, Variant
+from unrender.core.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,10 +19,9 @@ if TYPE_CHECKING:
 
     from unrender.scene.problem import Problem
 
-_SPP = 64
-
 
 def gallery(
+    context: typer.Context,
     name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Describe this problem.")] = None,
     out: Annotated[
         Path | None,
@@ -28,7 +29,9 @@ def gallery(
     ] = None,
     problem_settings: ProblemSettings = None,
     variant: Variant = "auto",
-    spp: FinalSpp = None,
+    spp: Annotated[
+        int, typer.Option(min=1, max=MOST_SAMPLES, help="With --out: samples per pixel of start and ground truth.")
+    ] = 64,
     overwrite: Overwrite = False,
     no_cache: NoCache = False,
 ) -> None:
@@ -38,6 +41,7 @@ def gallery(
     from unrender import gallery as problems
     from unrender.display.terminal import Console
 
+    _refuse_unused(arguments.typed_options(context), name)
     console = Console(highlight=False)
     if name is None:
         table = _table()
@@ -72,6 +76,17 @@ def gallery(
             arguments.remove_if_empty(folder)
 
 
+def _refuse_unused(typed: Sequence[str], name: str | None) -> None:
+    """Raise `InputError` for options that would be ignored."""
+    opens = ("--out", "--problem-set")
+    needs = {"--spp": ("--out",), "--overwrite": ("--out",), "--variant": opens, "--no-cache": opens}
+    for option in typed:
+        if name is None:
+            raise InputError(f"gallery: {option} needs the NAME of a problem")
+        if not set(needs.get(option, typed)) & set(typed):
+            raise InputError(f"gallery: {option} needs {' or '.join(needs[option])}")
+
+
 def _table() -> Table:
     from rich.table import Table
 
@@ -92,7 +107,7 @@ def _parameters(problem: Problem) -> Table:
     return table
 
 
-def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
+def _draw(problem: Problem, folder: Path, spp: int) -> list[Path]:
     """Write PNG files of each view's reference, start and ground truth, with the exposure of the reference."""
     import numpy as np
 
@@ -103,9 +118,9 @@ def _draw(problem: Problem, folder: Path, spp: int | None) -> list[Path]:
     written: list[Path] = []
     for index, view in enumerate(problem.views):
         reference = np.asarray(view.reference, np.float32)
-        requests = {"reference": reference, "start": render(problem, None, index, spp or _SPP)}
+        requests = {"reference": reference, "start": render(problem, None, index, spp)}
         if set(problem.truth) == {parameter.key for parameter in problem.parameters}:
-            requests["truth"] = render(problem, problem.truth, index, spp or _SPP)
+            requests["truth"] = render(problem, problem.truth, index, spp)
         for what, picture in requests.items():
             path = folder / f"view{index}-{what}.png"
             written.append(write(path, _png(picture * exposure(reference))))

@@ -24,7 +24,7 @@ _Folder = Annotated[
     ),
 ]
 _Mesh = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="PLY or OBJ in the cameras' world. Default: carved from masks.")
+    Path | None, typer.Option(metavar="FILE", help="PLY or OBJ file in the cameras' world. Default: carved from masks.")
 ]
 _Masks = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Masks named like the photographs, white on the object.")
@@ -32,11 +32,13 @@ _Masks = Annotated[
 _Check = Annotated[
     bool, typer.Option("--check", help="Only draw mesh, edges and masks over the photographs, and check their overlap.")
 ]
-_Resolution = Annotated[int, typer.Option(min=8, help="Pixels along the longer side, at most.")]
+_Resolution = Annotated[int, typer.Option(min=8, help="Maximum number of pixels along the longer side.")]
 _Scale = Annotated[float | None, typer.Option(help="Alternative to --resolution: 0.5 halves the width and the height.")]
 _HoldOut = Annotated[
     int | None,
-    typer.Option(metavar="N", min=0, help="Hold out one photograph of N, 0 for none. Default: the own split, or 8."),
+    typer.Option(
+        metavar="N", min=0, help="Hold out every Nth photograph, 0 for none. Default: the capture's split, or 8."
+    ),
 ]
 _Kind = Annotated[
     str | None, typer.Option("--format", help="transforms, colmap, llff or lights, if the folder has several.")
@@ -53,12 +55,15 @@ _Unknowns = Annotated[
     str | None,
     typer.Option(
         metavar="NAMES",
-        help="Some of colour,roughness,metallic,normal,shape,light,exposure,vignetting,response,poses. "
+        help="Some of colour, roughness, metallic, normal, shape, light, exposure, vignetting, response, poses, with commas. "
         "Default: colour,roughness,metallic,light, and normal of a carved shape.",
     ),
 ]
 _Band = Annotated[
-    int, typer.Option(metavar="N", min=0, max=64, help="Pixels inside the border of masks that count a tenth.")
+    int,
+    typer.Option(
+        metavar="N", min=0, max=64, help="Width in pixels of the border inside masks that has a tenth of the weight."
+    ),
 ]
 
 _Response = Annotated[
@@ -72,12 +77,12 @@ _Turntable = Annotated[
     bool | None,
     typer.Option(
         "--turntable/--no-turntable",
-        help="Whether the object turned before a camera and a light that stood still. Default: as the background shows.",
+        help="Whether the object rotated before a static camera and light. Default: detected from the background.",
     ),
 ]
 _Field = Annotated[
     int | None,
-    typer.Option(metavar="N", min=2, max=256, help="A radiance field of N voxels a side, without masks or mesh."),
+    typer.Option(metavar="N", min=2, max=256, help="A radiance field of N voxels per side, without masks or mesh."),
 ]
 
 

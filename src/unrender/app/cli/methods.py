@@ -17,10 +17,11 @@ if TYPE_CHECKING:
 
 
 def methods(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Only this one.")] = None,
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show this method only.")] = None,
     plan: Annotated[
         str | None,
-        typer.Option(metavar="PROBLEM", help="Print the plan of the method (auto) for this problem, as a plan file."),
+        typer.Option(metavar="PROBLEM", help="Print the plan of NAME, or of auto, for this problem, as a plan file."),
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -38,8 +39,8 @@ def methods(
     if plan is not None:
         _print_plan(plan, name or "auto", arguments.settings(settings, "--set"), problem_settings, variant)
         return
-    if settings or problem_settings:
-        raise InputError("--set and --problem-set need --plan PROBLEM")
+    if unused := arguments.typed_options(context):
+        raise InputError(f"methods: {unused[0]} needs --plan PROBLEM")
 
     from unrender.display.terminal import Console
     from unrender.methods import method

@@ -34,8 +34,8 @@ def resume(
 ) -> None:
     """Continue an interrupted or killed run, or extend a finished one.
 
-    It continues from its last checkpoint and gives the result of an uninterrupted run: to the bit with the same number of workers,
-    otherwise up to rounding. For a run in stages, steps or seconds are those of all stages, for the remaining ones.
+    It continues from its last checkpoint and gives the result of an uninterrupted run up to rounding; with --threads 1 and the same
+    number of workers, bit for bit. For a run in stages, --steps and --seconds are a new budget of all stages.
     """
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
@@ -47,6 +47,7 @@ def resume(
         if force:
             raise InputError(f"{directory}: --force applies to the run folder of a stage; give that instead")
         stages.refuse_workers(workers)
+        distribution.check(None, compress, insecure)  # options of workers
         command = arguments.command_line(context)
         with Progress(console) as progress:
             return stages.run_remaining(

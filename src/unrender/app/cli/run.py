@@ -38,15 +38,15 @@ if TYPE_CHECKING:
 
 
 _MethodName = Annotated[
-    str, typer.Option("--method", "-m", metavar="NAME", help="See `unrender methods`; or a plan file (TOML).")
+    str, typer.Option("--method", "-m", metavar="NAME", help="A method (`unrender methods`) or a plan file (TOML).")
 ]
 _Settings = Annotated[
     list[str] | None,
     typer.Option("--set", "-s", metavar="NAME=VALUE", help="An option of the method, such as spp=4. Repeatable."),
 ]
-_Steps = Annotated[int | None, typer.Option(help="Stop after that many steps. [default: 300, or --seconds]")]
+_Steps = Annotated[int | None, typer.Option(help="Number of steps. [default: 300 without --seconds]")]
 _Seconds = Annotated[
-    float | None, typer.Option(help="Time for compilation, steps and final pictures; steps have half of it at least.")
+    float | None, typer.Option(help="Time with compilation and final pictures. Steps get at least half of it.")
 ]
 _Out = Annotated[Path | None, typer.Option(help="The run folder. Default: a new one in out/.")]
 
@@ -129,12 +129,15 @@ def conclude(
     again: Path | None = None,
     page: bool = True,
 ) -> None:
-    """Write the page, print a summary, and exit with the status of an interrupted, failed or doubtful run.
+    """Write the page and print a summary.
 
     Args:
-        console, problem, result, folder, progress: of the run.
+        console, problem, result, folder, progress: output, problem, result, folder and phases of the run.
         again: argument of `unrender resume` for the run; None for the run folder.
         page: whether to write the page.
+
+    Raises:
+        typer.Exit: the run was interrupted, failed, or is doubtful.
     """
     from rich.markup import escape
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _TRIALS = 16
 _SEARCHES = ("grid", "random", "tpe")
 MARK = "sweep.json"
-_FREE = ("allow_outside", "what", "workers", "insecure", "trials", "threads")
+_FREE = ("allow_outside", "workers", "insecure", "trials", "threads")
 """Options that may change when a sweep continues."""
 
 _What = Annotated[str, typer.Argument(metavar="PROBLEM | DIR", help="A problem; or the folder of a sweep to continue.")]
@@ -54,7 +54,7 @@ _Settings = Annotated[
 ]
 _SearchName = Annotated[
     str | None,
-    typer.Option(metavar="grid|random|tpe", help="Search strategy. [default: grid; random with open ranges]"),
+    typer.Option(metavar="grid|random|tpe", help="Search strategy. [default: grid; random if a range has no POINTS]"),
 ]
 _Trials = Annotated[
     int | None, typer.Option(min=1, max=MOST_TRIALS, help="Number of trials of random and tpe. [default: 16]")
@@ -65,9 +65,11 @@ _Prune = Annotated[
 ]
 _Window = Annotated[
     int | None,
-    typer.Option(min=1, max=MOST_TRIALS, help="Maximum number of concurrent trials. [default: 4, or two per worker]"),
+    typer.Option(
+        min=1, max=MOST_TRIALS, help="With --prune or tpe: limit of concurrent trials. [default: 4, or two per worker]"
+    ),
 ]
-_Steps = Annotated[int | None, typer.Option(help="Steps of each run. [default: 300, or --seconds]")]
+_Steps = Annotated[int | None, typer.Option(help="Steps of each run. [default: 300 without --seconds]")]
 _Seconds = Annotated[float | None, typer.Option(help="Time for each run, with compilation and final pictures.")]
 _Seeds = Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each trial.")]
 _Seed = Annotated[int, typer.Option(min=0, help="Seed of the search, and of the first run of each trial.")]
@@ -161,9 +163,11 @@ def sweep(
         method: name of the method.
         over: options to vary: a list of values, or a range as text, LOW:HIGH[:log][:POINTS].
         settings, problem_settings: fixed options of the method and of a gallery problem.
-        search, trials, prune, window: search (None for a grid, or random if a range has no points), and number of trials.
+        search, trials: strategy, None for a grid, or random if a range has no points; number of trials, None for 16.
+        prune, window: whether runs are stopped early; limit of concurrent trials if they depend on earlier ones, None for 4 or more.
         steps, seconds, seeds, seed, final_spp, variant: options of each run, as in `unrender sweep`.
-        workers, threads, insecure: number of processes, "auto", or an address; threads of each; whether others may enter the cluster.
+        workers, threads: number of processes, "auto", or an address, None for this process; threads of each.
+        insecure: whether to join a cluster that other users can enter.
         out, overwrite: output folder, None for a new one in out/; whether to replace an earlier sweep there.
 
     Returns:
@@ -283,12 +287,9 @@ def _search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
 
 
 def _check_alone(context: typer.Context, folder: str) -> None:
-    """Raise `InputError` for options that a continued sweep takes from its start."""
-    for name in context.params:
-        source = context.get_parameter_source(name)
-        if name not in _FREE and source is not None and source.name == "COMMANDLINE":
-            option = name.replace("_name", "").replace("_", "-")
-            raise InputError(f"sweep {folder}: continues with its original options; leave out --{option}")
+    """Raise `InputError` for options that a continued sweep takes from sweep.json."""
+    if refused := arguments.typed_options(context, _FREE):
+        raise InputError(f"sweep {folder}: continues with its original options; leave out {refused[0]}")
 
 
 def _extended(record: SweepRecord, trials: int | None) -> SweepRecord:

@@ -35,7 +35,7 @@ def watch(
 ) -> None:
     """Serve a page that shows runs as they go, with buttons to pause, resume and stop them.
 
-    It is served to this machine alone, under an address that holds a secret. Ctrl-C ends the page, not the runs.
+    It is served to this machine only, under an address that contains a secret. Ctrl-C ends the page, not the runs.
     """
     from unrender.app.watch import server
 
