@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.app.capture import field_folder
+from unrender.app.capture import field_folder, importing
 
 
 def around(middle: np.ndarray, distance: float, count: int = 6) -> np.ndarray:
@@ -53,3 +53,7 @@ def test_a_field_has_no_mesh_and_unknowns_of_its_own(tmp_path) -> None:
         ur.app.ImportOptions(field=16, mesh=tmp_path / "a.ply")
     with pytest.raises(ur.InputError, match="expected light, exposure or both for a radiance field"):
         ur.app.import_capture(tmp_path, tmp_path / "out", ur.app.ImportOptions(field=16, unknowns=("colour",)))
+    with pytest.raises(ur.InputError, match="--band: does not apply to a radiance field; leave it out"):
+        ur.app.import_capture(tmp_path, tmp_path / "out", ur.app.ImportOptions(field=16, band=2))
+    with pytest.raises(ur.InputError, match="--field: does not apply to a check of the mesh"):
+        importing.check(tmp_path, tmp_path / "out", ur.app.ImportOptions(field=16))

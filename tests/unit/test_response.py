@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -207,4 +208,11 @@ def test_photographs_under_known_lights_choose_by_themselves(tmp_path: Path) -> 
     (tmp_path / "lit" / "lights.txt").write_text("1\n0 0 1\n")
     with pytest.raises(InputError, match="--response: with one camera under known lights"):
         ur.app.import_capture(tmp_path / "lit", tmp_path / "out", ur.app.ImportOptions(response="linear"))
+    ignored: dict[str, Any] = {"field": 16, "mesh": tmp_path / "a.ply", "world_to_camera": True, "turntable": False}
+    for name, value in ignored.items():
+        option = name.replace("_", "-")
+        with pytest.raises(
+            InputError, match=f"--{option}: does not apply to one camera under known lights; leave it out"
+        ):
+            ur.app.import_capture(tmp_path / "lit", tmp_path / "out", ur.app.ImportOptions(**{name: value}))
     assert not (tmp_path / "out").exists()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +51,8 @@ STILL_LIGHT = (
     "curve; only highlights and vignetting determine the response"
 )
 LIT_DEFAULT = ("colour", "normal")
+_OF_ASSET = ("masks", "voxels", "faces", "texture", "band", "turntable")
+_OF_POSES = ("mesh", "axes", "world_to_camera", "voxels", "faces", "texture", "band", "turntable", "field")
 _OF_CHECK = {CHECK, SHEET}
 _OF_IMPORT = {*problem_folder.OWN, *field_folder.OWN, SHEET}
 
@@ -62,22 +64,24 @@ class ImportOptions:
     Attributes:
         mesh: a PLY or OBJ file in the world space of the cameras; None for a hull of the masks.
         masks: a folder of masks with the names of the photographs; None for the masks of the capture.
-        kind: a key of `formats.FORMATS`; None to detect it.
+        kind: a key of `formats.FORMATS`, or "lights"; None to detect it.
         axes: a key of `conventions.AXES`, if the files differ from their format; None for the convention of the format.
         world_to_camera: whether matrices are inverse poses; None for the convention of the format.
-        resolution: maximum pixels along the longer side of a view.
-        scale: a scale factor of the photographs, instead of `resolution`; None for `resolution`.
-        hold_out: interval of the held-out photographs; 0 for none; None for the split of the capture, or 8.
+        resolution: maximum pixels along the longer side of a view, >= 8.
+        scale: a scale factor of the photographs in (0, 1], instead of `resolution`; None for `resolution`.
+        hold_out: interval of the held-out photographs, >= 2; 0 for none; None for the split of the capture, or 8; 6 for lights.
         voxels: voxels along the longest side of the hull, at most `MOST_VOXELS`.
         faces: approximate number of faces of the hull.
         texture: width and height of the textures in texels.
         unknowns: unknowns of the asset, of `unknowns.NAMES`; None for `unknowns.DEFAULT` with a mesh, `unknowns.OF_HULL` with a hull,
             colour and normals under known lights, radiance and light of a field.
-        band: width in pixels of the border of masks that has a small weight.
+        band: width in pixels of the border of training masks that has a tenth of the weight.
         turntable: whether the object rotated in front of a static camera and light; None to detect it from the background.
         response: response of 8- and 16-bit files: "srgb", "linear", an exponent such as "2.2", or "fit", which is sRGB with `response`
             among the unknowns.
-        field: voxels along each side of a radiance field, which needs neither masks nor a mesh; None for an asset.
+        field: voxels along each side of a radiance field, from 2 to `MOST_VOXELS`, without masks or mesh; None for an asset.
+
+    Raises `InputError` for a value out of range.
     """
 
     mesh: Path | None = None
@@ -112,6 +116,12 @@ class ImportOptions:
                 raise InputError(f"--field: expected 2 to {MOST_VOXELS} voxels a side, and no --mesh")
         if self.voxels > MOST_VOXELS:
             raise InputError(f"--voxels {self.voxels}: expected 1 to {MOST_VOXELS}")
+
+    def refuse(self, names: Sequence[str], what: str) -> None:
+        """Raise `InputError` if one of these options is not its default; `what` has no use for them."""
+        for each in fields(self):
+            if each.name in names and getattr(self, each.name) != each.default:
+                raise InputError(f"--{each.name.replace('_', '-')}: does not apply to {what}; leave it out")
 
     def chosen(self, default: tuple[str, ...]) -> tuple[str, ...]:
         """Return the selected unknowns, or `default` without a selection, and `response` if it is fitted."""
@@ -170,11 +180,8 @@ def import_capture(
         options: None for the defaults.
         overwrite: whether an earlier import or check may be replaced. The replacement is atomic, after all files are written.
 
-    Returns:
-        The result.
-
     Raises:
-        InputError: a malformed file, with the expected content; nothing is written then.
+        InputError: a malformed file, with the expected content, or an option that would be ignored; nothing is written then.
     """
     folder, out = Path(folder), Path(out)
     options = options or ImportOptions()
@@ -195,18 +202,9 @@ def import_capture(
 
     def fill(place: Path) -> None:
         with phases.phase("problem"):
-            name = folder.resolve().name
-            problem_folder.write(
-                place,
-                name,
-                data.views,
-                mesh,
-                data.silhouettes,
-                options.texture,
-                options.chosen(OF_HULL if options.mesh is None else DEFAULT),
-                options.band,
-                data.turntable,
-            )
+            name, chosen = folder.resolve().name, options.chosen(OF_HULL if options.mesh is None else DEFAULT)
+            views = data.views, mesh, data.silhouettes
+            problem_folder.write(place, name, *views, options.texture, chosen, options.band, data.turntable)
             (place / SHEET).write_bytes(
                 _sheet(data, [overlays.thumbnail(_overlay(data, index)) for index in overlays.chosen(len(data.views))])
             )
@@ -217,6 +215,7 @@ def import_capture(
 
 def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """Import a capture of one camera under known lights."""
+    options.refuse(_OF_POSES, "one camera under known lights")
     if options.response != pictures.SRGB:
         raise InputError(
             "--response: with one camera under known lights, the better fit of sRGB and linear is selected automatically"
@@ -238,6 +237,7 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
 
 def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
     """Import a capture as a radiance field."""
+    options.refuse(_OF_ASSET, "a radiance field")
     assert options.field is not None
     if options.response == pictures.FIT:
         raise InputError(
@@ -280,11 +280,12 @@ def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, st
         The result, and one line about the convention that seems wrong; "" if none does.
 
     Raises:
-        InputError: a malformed file, with the expected content; nothing is written then.
+        InputError: as in `import_capture`.
     """
     _check_place(out, folder, options, _OF_CHECK)
     if formats.is_lit(folder, options.kind):
         raise InputError(f"{folder}: one camera under known lights has no poses to check")
+    options.refuse(("field",), "a check of the mesh")
     data = _read(folder, options, unwrapped=False)
 
     def fill(place: Path) -> None:
@@ -321,6 +322,8 @@ def _check_place(out: Path, folder: Path, options: ImportOptions, own: set[str])
 def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     """Read the capture, its shape and their overlap; `unwrapped`: whether texture coordinates will be needed."""
     variant.ensure()
+    if options.mesh is not None:
+        options.refuse(("voxels", "faces"), "a mesh from a file")
     capture = _capture(folder, options)
     own_mesh = None if options.mesh is None else meshes.read(options.mesh)
     if own_mesh is None:

@@ -94,9 +94,7 @@ def compare(
     check_seed("--seed", seed, seeds)
     where = arguments.workers(workers, insecure)
     if all(Path(name).is_dir() for name in what):
-        if refused := arguments.typed_options(context, ("out", "overwrite", "allow_outside")):
-            raise InputError(f"compare: {refused[0]} does not apply to run folders; leave it out")
-        return _compare_folders(console, [Path(name) for name in what], out, overwrite)
+        return _compare_folders(console, context, [Path(name) for name in what], out, overwrite)
     _check_single(what)
     typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
@@ -173,8 +171,12 @@ def _check_single(what: Sequence[str]) -> None:
         raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
 
 
-def _compare_folders(console: Console, directories: Sequence[Path], out: Path | None, overwrite: bool) -> None:
-    """Compare earlier runs."""
+def _compare_folders(
+    console: Console, context: typer.Context, directories: Sequence[Path], out: Path | None, overwrite: bool
+) -> None:
+    """Compare earlier runs. Raise `InputError` for options that only apply to new runs."""
+    if refused := arguments.typed_options(context, ("out", "overwrite", "allow_outside")):
+        raise InputError(f"compare: {refused[0]} does not apply to run folders; leave it out")
     from unrender.app import report
     from unrender.app.cli.comparison_table import plain, show
 

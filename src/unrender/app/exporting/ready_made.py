@@ -79,7 +79,7 @@ class FilesOnly:
         if description is None:
             raise InputError(
                 f"{'.'.join(place)}: a ready-made {value.class_name()}, which has no description; give its dictionary, or "
-                "make it by unrender.rendering.mitsuba.description.load_described inside the function that returns the scene"
+                "make it by unrender.rendering.mitsuba.described.load_described inside the function that returns the scene"
             )
         return self.dictionary(description, place)
 
