@@ -97,5 +97,5 @@ def test_images_of_a_pair_of_meshes_trace_one_scene_each(on_gpu: None, monkeypat
 
 def test_lookups_outside_of_virtual_calls_have_no_mask(on_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
     assert gpu.lookup_mask(mi.Bool(False)) is True
-    monkeypatch.undo()
+    monkeypatch.setattr(gpu, "is_gpu", lambda: False)
     assert not gpu.lookup_mask(mi.Bool(False))

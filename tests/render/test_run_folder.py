@@ -278,7 +278,7 @@ def test_two_runs_in_one_folder(tmp_path: Path) -> None:
 def test_the_lock_of_a_process_that_died_is_no_lock(tmp_path: Path) -> None:
     code = "import sys, time; from pathlib import Path; from unrender.runs.folder.lock import Lock\n"
     code += "Lock(Path(sys.argv[1])).acquire(); print('held', flush=True); time.sleep(60)"
-    environment = {**os.environ, "PYTHONPATH": str(Path(ur.__file__).parents[1])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     words = [sys.executable, "-c", code, str(tmp_path)]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment)
     try:
