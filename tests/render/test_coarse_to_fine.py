@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -765,3 +766,15 @@ def test_a_parameterised_run_comes_to_its_resolution_and_repeats_when_resumed(
     assert np.abs(whole.parameters[KEY] - TRUTH).mean() < np.abs(0.5 - TRUTH).mean() * 1.1
     ur.optimize(fresh(), estimator, optimizer, steps=5, run_directory=tmp_path)
     np.testing.assert_array_equal(ur.resume(tmp_path, fresh(), steps=12).parameters[KEY], whole.parameters[KEY])
+
+
+def test_compiling_at_a_new_resolution_counts_as_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(run: Any) -> Any:
+        time.sleep(0.3)
+        seconds, state = loop.warm_up(run)
+        return seconds + 0.3, state
+
+    monkeypatch.setattr(refinement, "warm_up", slow)
+    result = ur.optimize(problem(), *PAIRS["plain"], steps=8)
+    assert result.phases["compiling"] >= 0.6
+    assert sum(result.phases.values()) >= 0.6 + result.seconds

@@ -23,6 +23,8 @@ RUN_PHASES = (COMPILING, STEPS, ASIDE, VERIFYING, PICTURES)
 class PhaseTimes(Callback):
     """Callback that records the seconds of each phase in `Result.phases`. It is the first callback, so that saved results contain them.
 
+    Compiling between steps, after a change of resolution or of a mesh, counts as compiling.
+
     Args:
         earlier: {phase: seconds} before the run, such as loading.
     """
@@ -30,15 +32,16 @@ class PhaseTimes(Callback):
     def __init__(self, earlier: Mapping[str, float] | None = None):
         self._earlier = dict(earlier or {})
         self._made = self._started = time.perf_counter()
-        self._clock = 0.0
+        self._clock = self._warm = 0.0
 
     def on_start(self, run: Run) -> None:
-        self._started, self._clock = time.perf_counter(), run.clock
+        self._started, self._clock, self._warm = time.perf_counter(), run.clock, run.warmup_seconds
 
     def on_result(self, run: Run, result: Result) -> Result:
         steps = run.clock - self._clock
-        aside = time.perf_counter() - self._started - steps
-        run_phases = {COMPILING: self._started - self._made, STEPS: steps, ASIDE: max(aside, 0.0)}
+        between = run.warmup_seconds - self._warm
+        aside = time.perf_counter() - self._started - steps - between
+        run_phases = {COMPILING: self._started - self._made + between, STEPS: steps, ASIDE: max(aside, 0.0)}
         return replace(result, phases={**self._earlier, **run_phases})
 
 
