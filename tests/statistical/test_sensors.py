@@ -9,6 +9,7 @@ finite differences of Mitsuba's own renders, with other samples.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import mitsuba as mi
@@ -17,6 +18,7 @@ import pytest
 from fog import grid
 from scipy import stats
 
+from kernels import count_recordings
 from tiers import quick
 from unrender.rendering.mitsuba import frozen
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -145,6 +147,38 @@ def test_gradients_of_all_sensors_in_one_launch() -> None:
 def test_gradients_of_each_sensor_alone(name: str) -> None:
     renderer = MitsubaRenderer(room(name), DEPTH)
     check_replay(renderer, SampleRequest(0, 256, 7), KEY)
+
+
+@pytest.mark.parametrize("filter_name", ["box", "gaussian"])
+def test_one_recording_serves_all_cameras(filter_name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images and gradients are those of a scene that has this camera only."""
+
+    def camera(number: int) -> dict[str, Any]:
+        origin = [2.0 * number - 3.0, -4 + 0.3 * number, 2.2]
+        of_film = {**film(), "rfilter": {"type": filter_name}}
+        at = mi.ScalarTransform4f().look_at(origin, [0, 0, 0.55], [0, 0, 1])
+        return {"type": "perspective", "fov": 30 + 5 * number, "to_world": at, "film": of_film}
+
+    def session_of(*which: int) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
+        renderer = MitsubaRenderer(room() | {f"camera_{n}": camera(n) for n in which}, DEPTH)
+        session, current = renderer.prepare([KEY], "path"), renderer.values([KEY])
+        weights = renderer.array(np.linspace(0.5, 1.5, SIZE * SIZE * 3).reshape(1, SIZE, SIZE, 3))
+
+        def of_sensor(sensor: int) -> tuple[np.ndarray, np.ndarray]:
+            rendering = session.image(current, SampleRequest(sensor, 64, 3))
+            return numbers(rendering.images), numbers(session.adjoint(current, rendering.paths, weights)[KEY])
+
+        return of_sensor
+
+    alone = [session_of(n)(0) for n in range(4)]
+    recordings, of_sensor, counts = count_recordings(monkeypatch), session_of(0, 1, 2, 3), []
+    for sensor, (image, gradient) in enumerate(alone):
+        own_image, own_gradient = of_sensor(sensor)
+        counts.append(len(recordings))
+        np.testing.assert_allclose(own_image, image, rtol=1e-4)
+        np.testing.assert_allclose(own_gradient, gradient, rtol=1e-3)
+        assert np.abs(own_image - alone[sensor - 1][0]).max() > 0.01
+    assert counts[3] == counts[1]
 
 
 @pytest.mark.slow

@@ -6,14 +6,19 @@ batch sensors do not declare all of theirs, so Dr.Jit refuses to record a kernel
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.renderer import SampleRequest
+
 _COMPLETE = frozenset({"PerspectiveCamera", "DistantSensor", "DistantSensorImpl", "RadianceMeter", "IrradianceMeter"})
 """Sensor classes that declare all members in Mitsuba 3.9."""
+_MANY = 3
+"""Number of sensors from which on a scene's sensors share recordings."""
 _LONGEST_GAP = 32
 """Number of consecutive unused registry ids that ends a search. Ids of dead objects are reused."""
 
@@ -26,6 +31,22 @@ def are_recordable(sensor: Any, several: bool) -> bool:
     """
     sensors = _registered(mi.SensorPtr) if several else [sensor]  # pyright: ignore[reportAttributeAccessIssue]
     return all(each.class_name() in _COMPLETE for each in sensors)
+
+
+def for_every_sensor(request: SampleRequest, sensors: Sequence[mi.Sensor], count: int) -> SampleRequest:
+    """Return a request in which each pixel has its own sensor, so that one recording serves all sensors of a scene.
+
+    A scene of one or two sensors, and sensors that a recording does not support, keep the request.
+
+    Args:
+        request: request of one sensor.
+        sensors: all sensors of the scene.
+        count: number of pixels.
+    """
+    if request.sensors is not None or len(sensors) < _MANY or not are_recordable(sensors[0], several=True):
+        return request
+    pixels = dr.arange(mi.UInt32, count) if request.pixels is None else request.pixels
+    return replace(request, pixels=pixels, sensors=dr.full(mi.UInt32, request.sensor, count))
 
 
 def build_emitter_tables() -> None:

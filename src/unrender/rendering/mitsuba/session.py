@@ -41,7 +41,7 @@ from unrender.rendering.mitsuba.passes import (
     VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
-from unrender.rendering.mitsuba.recordable import are_recordable
+from unrender.rendering.mitsuba.recordable import are_recordable, for_every_sensor
 from unrender.rendering.mitsuba.rendered_paths import DroppedSamples, Paths
 from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_graph import has_instances
@@ -371,26 +371,26 @@ class MitsubaSession:
 
     def kernel(self, task: Pass, request: SampleRequest) -> Callable[..., Any]:
         """Return the kernel of a pass for a request, a function of the pass's own arrays. It is traced once and replayed later."""
-        pair = self._pair
-        size = LaunchSize(request.sensor, request.spp, self.count(request), self._light.hide_emitters)
+        pair, count = self._pair, self.count(request)
+        if not (self._geometric or self._poses):
+            request = for_every_sensor(request, pair.current.sensors(), count)
         several = request.sensors is not None
+        size = LaunchSize(0 if several else request.sensor, request.spp, count, self._light.hide_emitters)
         outside = not are_recordable(pair.current.sensors()[request.sensor], several)
         # Each resolution of a texture or grid needs its own recording, since a replay with another one would fail.
         shapes = pair.loaded().shapes()
-        pixels = request.pixels is None, several, request.positions is None
-        key = (task, size, request.groups, pixels, outside, shapes, request.emitters is None)
+        absent = tuple(part is None for part in (request.pixels, request.positions, request.emitters))
+        key = (task, size, request.groups, several, outside, shapes, *absent)
         posed = None if isinstance(task, PosesPass) else self._posed_scene(task.previous)
         if key not in self._functions:
             traced = task.function(self._kernel_of(task), self._sampler, size, posed)
             self._functions[key] = FrozenFunction(traced, self._recordable, self._attached)
         share_addresses()
-        scenes = [loaded.scene for loaded in loaded_scenes()]
-        films = pair.films(request)
+        scenes, films = [loaded.scene for loaded in loaded_scenes()], pair.films(request)
         tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         if request.emitters is not None and len(self.emitters()) > 1:
             tables |= pair.emitter_tables(task.previous, request.emitters)
-        seed = dr.opaque(mi.UInt32, request.seed)  # a constant would record each kernel again
-        seeds = seed, request.positions
+        seeds = dr.opaque(mi.UInt32, request.seed), request.positions  # a constant would record each kernel again
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
         prepare: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
