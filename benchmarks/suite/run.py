@@ -83,9 +83,8 @@ def ours(
     """Run `auto`, with an option or without a part (`ablation.plan`); return its curve, its steps and its seconds of compilation."""
     curve = Recorder(lambda values: {"": error(values)}, {"": 1.0}, 1 / 100)
     plan = ablation.plan(problem, option)
-    ur.optimize(
-        plan.problem, plan, steps=2, seed=seed
-    )  # kernels are recorded anew after the loop's scene has come or gone
+    # Kernels are recorded anew after the loop's scene has come or gone.
+    ur.optimize(plan.problem, plan, steps=2, seed=seed)
     result = ur.optimize(plan.problem, plan, seconds=seconds, seed=seed, callbacks=[curve])
     points = [(at, found) for at, _, found in curve.points[""][1:]]
     return points, {"steps": result.steps, "compile_seconds": result.warmup_seconds}
