@@ -278,7 +278,10 @@ def gather(x: Array, index: Array) -> Array:
 
 
 def searchsorted(ascending: Array, values: Array) -> Array:
-    """Return the index of the last element of `ascending` that is <= each value. The first element must be <= every value."""
+    """Return the index of the last element of `ascending` that is <= each value. All are unsigned integers.
+
+    The first element of `ascending` must be <= every value.
+    """
     if not is_drjit(ascending):
         return (np.searchsorted(ascending, values, side="right") - 1).astype(np.uint32)
     kind = type(values)
@@ -299,14 +302,17 @@ def integer(value: int, like: Array) -> Array:
 
 
 def random_integers(like: Array, seed: int, count: int, below: int) -> Array:
-    """Return `count` integers, uniform in [0, below)."""
+    """Return `count` integers, uniform in [0, below), of the index type of arrays such as `like`."""
     if not is_drjit(like):
         return np.random.default_rng(seed).integers(below, size=count, dtype=np.uint32)
     return dr.rng(seed).integers(dr.uint32_array_t(dr.array_t(like)), count, 0, below)
 
 
 def random_below(bounds: Array, like: Array, seed: int) -> Array:
-    """Return an integer uniform in [0, bound) for each bound."""
+    """Return an integer uniform in [0, bound) for each of `bounds` (N,), unsigned integers >= 1.
+
+    On Dr.Jit the number comes from a float32 in [0, 1), so its distribution is uniform to about bound / 2**24.
+    """
     if not is_drjit(like):
         return np.random.default_rng(seed).integers(bounds, dtype=np.uint32)
     kind = type(bounds)

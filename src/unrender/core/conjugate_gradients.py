@@ -30,7 +30,7 @@ def solve(
         damping: smallest allowed ratio of a direction's curvature to the largest curvature so far, in [0, 1).
 
     Returns:
-        The step, (n,); zero where the gradient is zero or not finite.
+        The step, (n,); the zero vector if the gradient is zero or any of its elements is not finite.
     """
     step, residual = np.zeros_like(gradient), -gradient
     v, greatest_curvature = residual, 0.0

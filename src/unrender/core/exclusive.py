@@ -42,7 +42,7 @@ if hasattr(os, "register_at_fork"):
 def exclusive(what: str, long: bool = False) -> Iterator[None]:
     """Serialise calls from different threads, as a decorator or in a `with` statement. Calls within one thread may nest.
 
-    A call waits for another thread's call to end. If that call is marked `long`, it raises `InputError` instead.
+    A call waits for the other thread's call to end. It raises `InputError` instead if the other call is marked `long`.
 
     Args:
         what: name of the function in the message.

@@ -25,7 +25,9 @@ def is_torch(x: Any) -> bool:
 
 
 def framework(values: Iterable[Any], owner: str) -> Framework:
-    """Return the framework of some arrays. Numbers, lists and NumPy arrays combine with either other framework.
+    """Return the framework of some arrays: "numpy" if none is of Dr.Jit or PyTorch.
+
+    Numbers, lists and NumPy arrays may be mixed with arrays of one other framework.
 
     Raises `InputError` that names `owner` if arrays of Dr.Jit and PyTorch are mixed.
     """
@@ -41,9 +43,10 @@ def framework(values: Iterable[Any], owner: str) -> Framework:
 
 
 def host(x: Any, owner: str) -> np.ndarray:
-    """Convert an array of any framework, or nested lists, to NumPy: float64 stays, any other type becomes float32. Waits for the device.
+    """Convert an array of any framework, or nested lists, to NumPy. Waits for the device.
 
-    Raises `InputError` that names `owner` if the values are not real numbers.
+    A NumPy array of float64 is returned itself. Other types than float64 become float32.
+    Raises `InputError` that names `owner` if the values are not integers or real numbers.
     """
     if is_torch(x):
         x = x.detach().cpu().numpy()

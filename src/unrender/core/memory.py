@@ -53,7 +53,7 @@ def evaluate_in_turn(*parts: Any) -> None:
 
 
 def small_parts(*parts: Any) -> list[Array]:
-    """Return the arrays of a nested structure that are not large, which one launch should compute."""
+    """Return the Dr.Jit arrays of a nested structure that are not large, which one launch should compute."""
     return [array for array in _flatten(parts) if not is_large(array)]
 
 
@@ -65,10 +65,11 @@ def every(x: Array, step: int) -> Array:
 
 
 def inner_products(pairs: Sequence[tuple[Array, Array]]) -> list[Array]:
-    """Return Σ x y over all elements of each pair (x, y) of equal shapes and types; lazy for Dr.Jit.
+    """Return Σ x y over all elements of each pair (x, y). All arrays have the same shape and type.
 
-    Large arrays are divided into 16 parts that one kernel multiplies and adds element by element, so that no product is stored. (Dr.Jit's
-    `dot` stores no product either, but one thread adds a long sum in single precision and loses all but a few digits.)
+    Lazy for Dr.Jit, except that large arrays are evaluated. One kernel multiplies and adds their 16 parts element by element, so that no
+    product is stored. (Dr.Jit's `dot` stores no product either. But one thread adds a long sum in single precision, and loses all but a
+    few digits.)
     """
     if not pairs or not arrays.is_drjit(pairs[0][0]) or math.prod(pairs[0][0].shape) < LARGE:
         return [arrays.total(x * y) for x, y in pairs]

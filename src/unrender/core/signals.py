@@ -7,14 +7,14 @@ import signal
 import sys
 
 GRACEFUL = "unrender_graceful"
-"""Attribute of a SIGTERM handler that a run may replace by its own, which ends the run after the current step."""
+"""Name of an attribute that marks a SIGTERM handler as replaceable: a run may install its own, which ends it after the current step."""
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 
 
 def end_at_once() -> None:
     """Make Ctrl-C and SIGTERM end the command with one line while it imports, if this process is the command.
 
-    Nothing is written before that point. Without these handlers Python would print the traceback of an import.
+    The command writes no file while it imports. Without these handlers Python would print the traceback of an import.
     """
     if not _is_command():
         return

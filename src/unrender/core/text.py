@@ -53,7 +53,10 @@ def one_line(text: str) -> str:
 
 
 def reason_of(error: BaseException, longest: int | None = None) -> str:
-    """Return an error's message on one line of at most `longest` characters, or the name of its type if it is empty."""
+    """Return an error's message on one line, or the name of its type if it is empty.
+
+    A message of more than `longest` characters is cut; None means no limit.
+    """
     return " ".join(str(error).split())[:longest] or type(error).__name__
 
 
@@ -63,7 +66,7 @@ def plain(text: str) -> str:
 
 
 def printable(value: Any) -> str:
-    """Format an untrusted value on one line of at most 60 characters, with unprintable characters escaped."""
+    """Format an untrusted value on one line of at most 60 characters, with unprintable characters escaped; None as "nothing"."""
     text = value if isinstance(value, str) and value.isprintable() else "nothing" if value is None else repr(value)
     text = visible(text[:200])  # repr of an arbitrary type may be long or unprintable
     return text if len(text) <= 60 else text[:57] + "..."

@@ -71,18 +71,11 @@ def parts(vectors: np.ndarray, like: Tree) -> dict[str, np.ndarray]:
 
 def unravel(vector: np.ndarray, like: Tree) -> Tree:
     """Return a tree with the shapes and types of `like` from a vector (n,); the inverse of `ravel`. The arrays own their memory."""
-    result = {}
-    for key, part in parts(vector, like).items():
-        x = like[key]
-        if arrays.is_drjit(x):  # adding zero copies out of NumPy's memory, see `MitsubaRenderer.array`
-            result[key] = type(x)(part.astype(np.float32)) + arrays.scalar(0.0, x)
-        else:
-            result[key] = part.astype(x.dtype)
-    return result
+    return {key: arrays.like(part, like[key]) for key, part in parts(vector, like).items()}
 
 
 def repeat_per_element(numbers: Mapping[str, float | np.ndarray], like: Tree) -> np.ndarray:
-    """Return a vector (n,) from one number per parameter, or one per element."""
+    """Return a vector (n,) in the order of `ravel` from {key: number or array}; a number is repeated for each element."""
     return np.concatenate(
         [np.broadcast_to(np.asarray(numbers[key], float), arrays.shape(x)).ravel() for key, x in like.items()]
     )
