@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from unrender.backend import limits, variant
+from unrender.backend import limits, variant, versions
 from unrender.core.errors import InputError
 
 
@@ -75,3 +75,16 @@ def test_more_threads_than_a_few_for_each_core_are_refused(monkeypatch: pytest.M
     variant.check_threads(8)
     with pytest.raises(InputError, match=f"threads {count}: this process may use 2 cores; expected at most 8"):
         variant.check_threads(count)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("llvm_ad_rgb", "19.1.7"), ("llvm_ad_spectral", "19.1.7"), ("cuda_ad_rgb", None)]
+)
+def test_every_variant_of_the_cpu_records_its_llvm(
+    monkeypatch: pytest.MonkeyPatch, name: str, expected: str | None
+) -> None:
+    monkeypatch.setattr(versions, "current", lambda: name)
+    monkeypatch.setattr(versions, "llvm_version", lambda: (19, 1, 7))
+    versions._deciding_versions.cache_clear()
+    assert versions.deciding_versions().get("llvm") == expected
+    versions._deciding_versions.cache_clear()

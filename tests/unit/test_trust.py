@@ -48,7 +48,9 @@ def test_a_cluster_without_a_token_is_refused(home: Path, monkeypatch: pytest.Mo
     check_token("a:1")
 
 
-@pytest.mark.parametrize(("mode", "refused"), [(0o644, True), (0o604, True), (0o640, True), (0o600, False)])
+@pytest.mark.parametrize(
+    ("mode", "refused"), [(0o644, True), (0o604, True), (0o640, True), (0o620, True), (0o600, False)]
+)
 def test_a_token_that_others_can_read_is_refused(
     home: Path, monkeypatch: pytest.MonkeyPatch, mode: int, refused: bool
 ) -> None:
@@ -57,7 +59,8 @@ def test_a_token_that_others_can_read_is_refused(
     if not refused:
         check_token("a:1")
         return
-    with pytest.raises(InputError, match=rf"{path} is readable by others \(mode {mode:04o}\); .*chmod 600") as raised:
+    verb = "readable" if mode & 0o044 else "writable"
+    with pytest.raises(InputError, match=rf"{path} is {verb} by others \(mode {mode:04o}\); .*chmod 600") as raised:
         check_token("a:1")
     assert "\n" not in str(raised.value)
     home.chmod(0o700)  # nobody else gets there

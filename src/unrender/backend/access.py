@@ -32,7 +32,7 @@ def can_change(folder: Path, shared: bool = False) -> str:
 
 
 def can_read(path: Path) -> str:
-    """Return how other users can read a file, as a phrase for a message; "" if they cannot."""
+    """Return how other users can read or write a file, as a phrase for a message; "" if they cannot."""
     path = Path(os.path.realpath(path))
     if _shielded(path.parent):
         return ""
@@ -40,7 +40,7 @@ def can_read(path: Path) -> str:
     mode = stat.S_IMODE(status.st_mode)
     if status.st_uid not in _trusted():
         return f"{path} belongs to user {status.st_uid}"
-    return f"{path} is readable by others (mode {mode:04o})" if mode & 0o066 else ""
+    return f"{path} is {'readable' if mode & 0o044 else 'writable'} by others (mode {mode:04o})" if mode & 0o066 else ""
 
 
 def _shielded(folder: Path) -> bool:

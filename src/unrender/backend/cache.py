@@ -88,7 +88,10 @@ def use_for_kernels() -> None:
 
 
 def kernels_changed() -> int | None:
-    """Return the time at which a kernel was last added to Dr.Jit's cache, in nanoseconds of its file system; None if unknown."""
+    """Return the time of the last change of Dr.Jit's cache folder: a kernel was added or removed.
+
+    The unit is nanoseconds of the file system's clock; None if unknown.
+    """
     place = os.environ.get(_DRJIT_VARIABLE) or os.path.expanduser("~/.drjit")
     try:
         return os.stat(place).st_mtime_ns
@@ -97,7 +100,7 @@ def kernels_changed() -> int | None:
 
 
 def tidy(place: Path, largest: int) -> None:
-    """Call `trim` at most once a day."""
+    """Call `trim` unless it ran for this folder within the last day. A hidden file in the folder records the time."""
     stamp = place / _STAMP
     with contextlib.suppress(OSError):
         if stamp.exists() and 0 <= time.time() - stamp.stat().st_mtime < _DAY:
@@ -126,7 +129,7 @@ def trim(place: Path, largest: int) -> None:
 
 
 def size(part: str) -> int:
-    """Return the number of bytes of the files in a part of the cache."""
+    """Return the number of bytes of the files in a part of the cache; 0 if there is none."""
     top = root()
     if top is None:
         return 0

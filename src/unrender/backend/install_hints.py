@@ -32,7 +32,10 @@ def manager(environment: Mapping[str, str] = os.environ) -> str | None:
 
 
 def command(needs: Sequence[str], by: str | None = None) -> str:
-    """Return one shell command that installs `needs` (from `NEEDS`) with the package manager `by` (default: `manager()`)."""
+    """Return one shell command that installs `needs` (from `NEEDS`) with the package manager `by`.
+
+    The default is `manager()`, and conda if that is unknown. Needs for which a manager has no package are omitted.
+    """
     by = by or manager()
     sudo = "" if is_root() else "sudo "
     if by == "apt-get":

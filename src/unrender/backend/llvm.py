@@ -48,7 +48,7 @@ class Library:
 
 
 def folders(environment: Mapping[str, str] = os.environ, root: Path = Path("/")) -> list[Path]:
-    """Return the folders to search: the active conda environment, then the system's and Homebrew's."""
+    """Return the existing folders to search: those of conda and of this Python, then the system's, Homebrew's and MacPorts'."""
     conda = [Path(prefix) / "lib" for prefix in (environment.get("CONDA_PREFIX"), sys.prefix) if prefix]
     patterns = [
         f"usr/lib/{platform.machine()}-linux-gnu",
@@ -112,8 +112,10 @@ def version_by_asking(path: Path) -> int | None:
 
 
 def identify(path: Path) -> Library:
-    """Return the library at `path` with its version, by its name if possible. A bare file name, which the loader resolves, is not checked
-    for existence."""
+    """Return the library at `path` with its version, by its name if possible; the version is None if there is no file.
+
+    A bare file name, which the loader resolves, is not checked for existence.
+    """
     if path.parent != Path() and not path.is_file():
         return Library(path, None)
     major = version_by_name(path)

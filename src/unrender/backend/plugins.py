@@ -67,7 +67,7 @@ def only(folder: Path) -> Iterator[None]:
 
 
 def check_type(name: str) -> None:
-    """Raise `InputError` for an object type for which Mitsuba would load a library other than its own.
+    """Raise `InputError` for an object type for which Mitsuba would load a library other than its own, or that is no plugin's name.
 
     Types that were registered in Python have no library and pass. Types that do not exist pass too: Mitsuba reports them.
     """

@@ -262,7 +262,8 @@ def has_cuda_driver() -> bool:
 def llvm_version() -> tuple[int, ...] | None:
     """Return the version of the LLVM that Dr.Jit has loaded, such as (19, 1, 7); None if there is none.
 
-    Dr.Jit is not asked if the configured library is unusable or no usable one exists. It would deadlock: it waits for its own
+    If the configured library is unusable, the result is its major version (n,), or None if that is unknown. Dr.Jit is asked neither
+    then nor if no usable library exists. It would deadlock: it waits for its own
     initialisation, whose thread waits for the interpreter lock of this call to report the failure.
     """
     library = os.environ.get(llvm.ENVIRONMENT_VARIABLE)

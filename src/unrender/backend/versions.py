@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from unrender.backend.limits import cores
-from unrender.backend.variant import LLVM, current, llvm_version
+from unrender.backend.variant import current, llvm_version
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages on which the numbers depend."""
+    """Return {name: version} of Python and of the packages on which the numbers depend; "not installed" for a missing one."""
     return dict(_versions())
 
 
@@ -30,7 +30,7 @@ def _versions() -> dict[str, str]:
 
 
 def deciding_versions() -> dict[str, str]:
-    """Return the versions on which the bits of a run's numbers depend: packages, LLVM, the variant."""
+    """Return {name: version} on which the bits of a run's numbers depend: packages, the variant, and LLVM on a CPU."""
     return dict(_deciding_versions(current() or "none"))
 
 
@@ -39,12 +39,12 @@ def _deciding_versions(name: str) -> dict[str, str]:
     versions_by_package = {name: version for name, version in versions().items() if name != "python"}
     for package in ("scipy", "cholespy", "cma"):
         versions_by_package[package] = metadata.version(package)
-    llvm = llvm_version() if name == LLVM else None
+    llvm = llvm_version() if name.startswith("llvm") else None
     return {**versions_by_package, "variant": name, **({"llvm": ".".join(map(str, llvm))} if llvm else {})}
 
 
 def hardware() -> dict[str, Any]:
-    """Return the processor, and the number of cores that this process may use."""
+    """Return the processor, the number of cores that this process may use, and the operating system: keys processor, cores, system."""
     return dict(_hardware())
 
 
