@@ -61,6 +61,7 @@ def test_arrays_without_channels_have_one(tmp_path: Path) -> None:
         ("a.vol", GRID[0, 0], None, r"expected a grid of shape \(Z, Y, X, C\), got \(5, 2\)"),
         ("a.vol", GRID[:0], None, r"expected a grid of shape \(Z, Y, X, C\), got \(0, 3, 5, 2\)"),
         ("a.vol", GRID, (0, 0, 0, 1, 1), "box: expected six finite numbers"),
+        ("a.npy", np.where(GRID > 0.5, np.nan, GRID), None, "values are NaN or infinite"),
     ],
 )
 def test_what_is_no_grid_is_not_written(tmp_path: Path, name: str, values: Any, box: Any, message: str) -> None:

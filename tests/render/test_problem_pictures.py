@@ -144,6 +144,28 @@ def test_npy_fills_any_shape(tmp_path: Path):
         values.fill(tmp_path / "a.npy", (2, 3, 5, 1))
 
 
+def test_arrays_of_vertices_and_grey_arrays_fill_like_their_files(tmp_path: Path):
+    points, grey = np.arange(12.0).reshape(4, 3), np.arange(6.0).reshape(2, 3)
+    for array, shape in ((points, (12,)), (points[:1], (3,)), (grey, (2, 3, 1))):
+        np.save(tmp_path / "a.npy", array)
+        for given in (array, tmp_path / "a.npy"):
+            np.testing.assert_array_equal(values.fill(given, shape)[0], array.reshape(shape))
+
+
+def test_transposed_vertices_are_refused(tmp_path: Path):
+    np.save(tmp_path / "a.npy", np.arange(12.0).reshape(3, 4))
+    for given in (np.arange(12.0).reshape(3, 4), tmp_path / "a.npy"):
+        with pytest.raises(InputError, match=r"got an array of shape \(3, 4\)"):
+            values.fill(given, (12,))
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint32, np.int8])
+def test_integers_of_unknown_encoding_are_no_picture(kind: type):
+    with pytest.raises(InputError, match=r"expected uint8 or uint16 \(sRGB\) or floating-point numbers"):
+        images.read(np.full((2, 2, 3), 100, kind))
+    np.testing.assert_array_equal(images.read(np.eye(3, dtype=kind)).values[..., 0], np.eye(3))
+
+
 def test_a_picture_cannot_fill_a_volume(tmp_path: Path):
     with pytest.raises(InputError, match=r"a picture cannot fill a parameter of shape \(3,\)"):
         values.fill(bitmap(COLOURS, tmp_path / "a.exr"), (3,))

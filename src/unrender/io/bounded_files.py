@@ -229,7 +229,10 @@ def _check_plain(value: Any, where: str, depth: int = 0) -> None:
 
 
 def read_float_arrays(path: Path, folder: Path) -> dict[str, np.ndarray]:
-    """Read the arrays of an .npz file in a run folder: float32 if stored as float32 or narrower, else float64."""
+    """Read the arrays of an .npz file in a run folder.
+
+    Booleans and floating-point numbers of at most 32 bits become float32, all others float64.
+    """
     arrays = read_arrays(path, LARGEST_ARCHIVE, folder=folder, largest=LARGEST_ARRAY)
     with np.errstate(over="ignore"):
         return {name: array.astype(_float_type(array.dtype)) for name, array in arrays.items()}

@@ -32,11 +32,11 @@ class FileConversion:
     vertices: Callable[[Path], np.ndarray] | None = field(default=None, compare=False, repr=False)
 
     def picture_shape(self, shape: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the size of an image that fills a parameter of this shape without scaling."""
+        """Return the shape (H, W, C) of an image that fills a parameter of this shape without scaling."""
         return periodic.interior_shape(shape, self.repeated)
 
     def stored(self, values: np.ndarray) -> np.ndarray:
-        """Return float32 values rounded to the renderer's precision."""
+        """Return float32 values rounded to the renderer's precision. Values beyond the range of half precision are not changed."""
         if not self.half:
             return values
         with np.errstate(over="ignore"):

@@ -111,7 +111,7 @@ def write_arrays(
 
 
 def temporary(path: Path, end: str = PARTIAL) -> Path:
-    """Return the temporary name next to `path` under which this process writes it; see `remove_leftovers`."""
+    """Return the temporary name next to `path` under which this process writes or removes it; `end` is `PARTIAL` or `RETIRED`."""
     return path.with_name(f"{path.name}.{os.getpid()}.{end}")
 
 

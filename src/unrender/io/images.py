@@ -19,10 +19,10 @@ READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".
 
 @dataclass(frozen=True)
 class Picture:
-    """An image in linear values.
+    """An image.
 
     Attributes:
-        values: (H, W, C) float32, C in {1, 3}.
+        values: (H, W, C) float32, C in {1, 3}; linear unless read with `linearise=False`.
         notice: one line about the conversion of the values, "" for none.
         alpha: (H, W) float32 in [0, 1], if it was requested and integer values are not opaque everywhere; else None.
         labelled_xyz: whether the file names its channels X, Y and Z. The values are RGB in any case.
@@ -39,13 +39,14 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
 
     Args:
         source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). The alpha of floating-point values is ignored.
-            Floating-point values are linear. 8- and 16-bit integers are sRGB in [0, 1].
+            Floating-point values are linear. Unsigned integers of 8 and 16 bits are sRGB, and their range is mapped to [0, 1]. Other
+            integers and booleans must be 0 or 1, as in masks.
         linearise: whether to convert 8- and 16-bit values from sRGB; False for masks.
-        alpha: whether to return the alpha of 8- and 16-bit values.
+        alpha: whether to return the alpha of 8- and 16-bit values. Requires `linearise`.
         channels: numbers of channels that arrays may have; the second of 2 channels is alpha.
 
     Raises:
-        InputError: the file is missing or unreadable, or the values have an unsupported shape or are not finite.
+        InputError: the file is missing or unreadable, or the values have an unsupported type or shape, or are not finite.
     """
     if isinstance(source, (str, Path)):
         path = Path(source)
@@ -175,6 +176,10 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
         coverage = _coverage(array[..., -1]) if alpha and transparent else None
         note = ", its alpha taken as mask" if coverage is not None else ""
         return Picture(srgb_to_linear(values).astype(np.float32), f"{bits}-bit sRGB, linearised{note}", coverage)
+    if array.dtype.kind in "iu" and not ((values == 0) | (values == 1)).all():
+        raise InputError(
+            f"expected uint8 or uint16 (sRGB) or floating-point numbers (linear), got {array.dtype} beyond 0 and 1"
+        )
     with np.errstate(over="ignore"):
         return Picture(np.ascontiguousarray(values, dtype=np.float32))
 

@@ -263,7 +263,7 @@ _LONGEST_NAME = 1 << 12
 
 
 def check_serialized(path: Path, index: int = 0) -> None:
-    """Raise `InputError` unless the mesh with this index in a serialized file is complete, finite, and has existing vertices only."""
+    """Raise `InputError` unless a mesh of a serialized file is complete, with finite positions and faces of existing vertices."""
     if index < 0:
         raise InputError(f"{path}: expected a shape_index of at least 0, got {index}")
     try:
@@ -352,7 +352,7 @@ def ply(
         vertices: (V, 3).
         faces: vertex indices, (F, 3).
         normals: unit normals, (V, 3).
-        uv: texture coordinates, (V, 2).
+        uv: Mitsuba's texture coordinates, (V, 2); stored as (u, 1 - v), for `flip_tex_coords`.
     """
     columns = [("xyz", vertices)]
     columns += [] if normals is None else [(("nx", "ny", "nz"), normals)]
@@ -382,10 +382,10 @@ def obj(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None = None) -
 
 
 def rows(kind: str, values: np.ndarray) -> list[str]:
-    """Return the rows of an array as lines of an OBJ file."""
+    """Return the rows of an array as lines of an OBJ file that begin with `kind`, such as "v"."""
     return [f"{kind} " + " ".join(f"{x:.9g}" for x in row) for row in values.tolist()]
 
 
 def upwards(uv: np.ndarray) -> np.ndarray:
-    """Flip the direction of v in texture coordinates (V, 2)."""
+    """Return (u, 1 - v) for texture coordinates (u, v), (V, 2)."""
     return np.stack([uv[:, 0], 1 - uv[:, 1]], 1)

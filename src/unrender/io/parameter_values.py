@@ -33,8 +33,8 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
 
     A number fills any shape, a colour the last axis. An image file fills (H, W, C), and a .vol file (Z, Y, X, C); other resolutions are
     resized. A mesh file fills values at vertices. An array, a .npy file, or an .npz archive of one array must have the shape; a last axis
-    of length 1 may be missing. A shape of one axis, such as that of vertices (n V,), also accepts (V, n). Images and arrays may omit
-    repeated border columns.
+    of length 1 may be missing. A shape of one axis, such as that of vertices (n V,), also accepts (V, n) with V >= n or V = 1. Images and
+    arrays may omit repeated border columns. Values of arrays are not rescaled.
 
     Args:
         initial: the value as passed.
@@ -63,7 +63,7 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         return periodic.repeat(array, conversion.repeated), ""
     if array.shape == conversion.picture_shape(shape):
         return periodic.pad(array, conversion.repeated), ""
-    if len(shape) == 1 and array.size == shape[0] and array.ndim == 2:
+    if _is_unflattened(array.shape, shape):
         return array.reshape(shape), ""
     scalar = array.shape in ((), (1,))
     colour = array.ndim == 1 and len(shape) > 1 and array.shape[0] == shape[-1]
@@ -79,8 +79,7 @@ def _from_file(path: Path, shape: tuple[int, ...], conversion: FileConversion) -
     if ending in MESH_FILES:
         return _from_mesh(path, shape, conversion), ""
     if ending in (".npy", ".npz"):
-        array = volumes.read_numpy(path, lambda array_shape: _check_shape(array_shape, shape, conversion))
-        return fill(array.reshape(shape) if array.shape == shape[:-1] else array, shape, conversion)
+        return fill(volumes.read_numpy(path, lambda size: _check_shape(size, shape, conversion)), shape, conversion)
     picture = images.read(path, not conversion.raw)
     if len(shape) != 3:
         raise InputError(f"{path}: a picture cannot fill a parameter of shape {shape}, expected {_expected(shape)}")
@@ -129,9 +128,20 @@ def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
 def _check_shape(array_shape: tuple[int, ...], shape: tuple[int, ...], conversion: FileConversion) -> None:
     """Raise `InputError` if an array of this shape cannot fill the parameter; called before the array is read."""
     number, colour = array_shape in ((), (1,)), len(array_shape) == 1 and len(shape) > 1 and array_shape[0] == shape[-1]
-    bare = len(shape) > 1 and shape[-1] == 1 and array_shape == shape[:-1]
-    if not (number or colour or bare or array_shape in (shape, conversion.picture_shape(shape))):
+    same = array_shape in (shape, conversion.picture_shape(shape)) or _is_unflattened(array_shape, shape)
+    if not (number or colour or same):
         raise InputError(f"expected {_expected(shape, conversion)}, got an array of shape {array_shape}")
+
+
+def _is_unflattened(array_shape: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Return whether an array lacks a last axis of length 1, or is (V, n) for values (n V,).
+
+    An array with 1 < V < n does not qualify, since it is more likely (n, V).
+    """
+    if len(shape) == 1 and len(array_shape) == 2:
+        rows, columns = array_shape
+        return rows * columns == shape[0] and (rows >= columns or rows == 1)
+    return shape[-1:] == (1,) and array_shape == shape[:-1]
 
 
 def _expected(shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> str:

@@ -49,7 +49,7 @@ def downsample(values: np.ndarray, size: Sequence[int]) -> np.ndarray:
 
 
 def resize(values: np.ndarray, size: Sequence[int]) -> np.ndarray:
-    """Resize (*old, C) to (*size, C): `downsample` along axes that shrink, then `upsample` along axes that grow."""
+    """Resize (*old, C) to (*size, C) float32: `downsample` along axes that shrink, then `upsample` along axes that grow."""
     least = [min(old, new) for old, new in zip(values.shape[:-1], size, strict=True)]
     return np.ascontiguousarray(upsample(downsample(values, least), size), np.float32)
 

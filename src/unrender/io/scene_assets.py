@@ -30,7 +30,7 @@ class AssetChecks:
     values: int = 0
 
     def check(self, plugin: str, path: Path, index: int = 0) -> None:
-        """Check a file that an object refers to.
+        """Check a file that an object refers to, and add its values to `values`.
 
         Args:
             plugin: type of the object.

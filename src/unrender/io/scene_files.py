@@ -1,8 +1,8 @@
 """List of the files of a Mitsuba scene, and confinement of its XML to the scene's folder.
 
 Mitsuba reads whatever an XML file includes. An untrusted scene must not be able to have other files of this machine parsed. So this
-module follows includes first, as Mitsuba will, and requires that they stay in the scene's folder. Textures and meshes may be anywhere,
-because no message shows the contents of an image or a mesh.
+module follows includes first, as Mitsuba will, and requires that they stay in the scene's folder. It does not restrict
+textures and meshes: no message shows their contents, and `confinement` restricts those of untrusted scenes.
 """
 
 from __future__ import annotations

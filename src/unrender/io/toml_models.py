@@ -33,8 +33,7 @@ def read(file: Path, model: type[_M], tables: Mapping[str, type[Table]]) -> tupl
         tables: models of the fields that are a table or a list of tables.
 
     Raises:
-        InputError: "problem.toml:12: parameters[0].bounds: expected ..., got ...".
-        OSError: the file does not exist.
+        InputError: the file is missing, or "problem.toml:12: parameters[0].bounds: expected ..., got ...".
     """
     text = bounded_files.read_text(file, toml_lines.LARGEST).replace("\r\n", "\n")
     try:

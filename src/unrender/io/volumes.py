@@ -95,15 +95,19 @@ def write_grid(path: str | Path, values: Any, box: Sequence[float] = UNIT_BOX) -
     if ending not in READABLE:
         raise InputError(f"{file}: unknown kind of grid, expected one of {', '.join(READABLE)}")
     if ending == ".vol" and type(values).__name__ == "VolumeGrid":
-        file.parent.mkdir(parents=True, exist_ok=True)
-        values.write(str(file))
-        return file
+        import mitsuba as mi
+
+        _check_finite(file, np.array(values))
+        stream = mi.MemoryStream()
+        values.write(stream)
+        return files.write(file, stream.raw_buffer())
     array = np.ascontiguousarray(values, np.float32)
     array = array[..., None] if array.ndim == 3 else array
     if array.ndim != 4 or array.size == 0:
         raise InputError(f"{file}: expected a grid of shape (Z, Y, X, C), got {array.shape}")
     if len(box) != 6 or not all(math.isfinite(side) for side in box):
         raise InputError(f"{file}: box: expected six finite numbers, got {box!r}")
+    _check_finite(file, array)
     buffer = io.BytesIO()
     if ending == ".vol":
         z, y, x, channels = array.shape
