@@ -45,7 +45,7 @@ def init(**options):
     begin(**options)
     same.append(action() == before)
 ray.init = init
-connection._kept_action = lambda number: contextlib.nullcontext()
+connection._restored_action = lambda number: contextlib.nullcontext()
 with connect(Workers(1), "llvm_ad_rgb", store_bytes=80 << 20):
     same.append(action() == before)
 print(*same, action() == before)

@@ -29,11 +29,13 @@ class Lens:
     """A perspective camera with OpenCV's distortion.
 
     Attributes:
-        width, height: of the picture in pixels.
+        width, height: size of the picture in pixels.
         fx, fy: focal lengths in pixels.
         cx, cy: principal point, in pixels from the upper left corner.
         model: "radial-tangential" (k1, k2, p1, p2, k3, k4, k5, k6) or "fisheye" (k1, k2, k3, k4).
-        distortion: the model's coefficients; fewer are followed by zeros.
+        distortion: coefficients of the model; missing ones are 0.
+
+    Raises `InputError` for a value out of range.
     """
 
     width: int

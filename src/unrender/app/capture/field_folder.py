@@ -60,13 +60,15 @@ _WHOLE = 0.999
 
 
 def cube_of(cameras: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the centre (3,) and half the side of the cube that the cameras look at, from their poses (V, 4, 4), axes right, up,
-    backwards.
+    """Return the centre (3,) and half the side of the cube that the cameras look at.
 
-    The middle is nearest to all optical axes, by least squares; the side is twice the median distance from it to the cameras.
+    The centre is nearest to all optical axes, by least squares. Half the side is its median distance from the cameras.
+
+    Args:
+        cameras: poses (V, 4, 4), axes right, up, backwards.
 
     Raises:
-        InputError: the cameras look in parallel, at no point.
+        InputError: the cameras look in parallel, or away from the centre.
     """
     places, views = cameras[:, :3, 3], -cameras[:, :3, 2]
     across = np.eye(3) - views[:, :, None] * views[:, None, :]

@@ -187,7 +187,7 @@ def _refined(
 SUFFICIENT = 0.6
 """Mean intersection over union of silhouettes and masks below which an import is refused."""
 _CLEAR = 0.15
-"""By how much another convention must be better to be named."""
+"""Minimum increase of the overlap by which another convention is named."""
 _VIEWS = 10
 _VOXELS = 40
 _SCALES = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
@@ -209,8 +209,7 @@ class Trial:
 
 
 def explain(capture: Capture, views: CapturedViews, mesh: Mesh | None, mean_overlap: float) -> str:
-    """Explain in one line why masks and mesh, or masks and poses, do not fit; `mean_overlap` is their overlap in the original
-    conventions."""
+    """Return one line on why masks and mesh, or masks and poses, do not fit; `mean_overlap` is their overlap as read."""
     whose = "the mesh covers" if mesh is not None else "a shape carved from all masks covers"
     line = f"{whose} the masks with an overlap (IoU) of {mean_overlap:.2f}, expected at least {SUFFICIENT:g}"
     best = max(trials(capture, views, mesh), key=lambda trial: trial.overlap, default=None)
@@ -220,7 +219,7 @@ def explain(capture: Capture, views: CapturedViews, mesh: Mesh | None, mean_over
 
 
 def trials(capture: Capture, views: CapturedViews, mesh: Mesh | None) -> list[Trial]:
-    """Other conventions of the poses, and of the mesh where there is one, with how well each fits."""
+    """Return other conventions of the poses and, with a mesh, of its axes and scale, each with its overlap on at most ten views."""
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int))
     few = [_reduced(views[index]) for index in chosen]
     names = [views[index].name for index in chosen]
@@ -261,7 +260,7 @@ def _meshes(mesh: Mesh | None) -> Iterator[tuple[str, str, Mesh]]:
 
 
 def _fit(views: CapturedViews, mesh: Mesh | None) -> float:
-    """Mean overlap; 0 where no hull is left, or the mesh is seen by none."""
+    """Return the mean overlap; 0 if the hull is empty."""
     try:
         shape = visual_hull(views, _VOXELS) if mesh is None else mesh
     except InputError:

@@ -56,12 +56,12 @@ class LitViews:
     """Photographs at the chosen resolution.
 
     Attributes:
-        names: of the photographs.
+        names: file names of the photographs.
         values: (N, H, W, 3) float32, linear.
         directions: (N, 3) unit, towards the lights.
-        mask: (H, W) in [0, 1], the part of a pixel that the object covers.
-        held_out: of each, whether it is for judging alone.
-        linear: whether the files' values were taken as linear.
+        mask: (H, W) in [0, 1], the fraction of a pixel that the object covers.
+        held_out: whether each photograph is for evaluation only.
+        linear: whether the values of 8- and 16-bit files are interpreted as linear.
     """
 
     names: tuple[str, ...]
@@ -73,7 +73,7 @@ class LitViews:
 
     @property
     def training(self) -> np.ndarray:
-        """Indices of those that are not held out."""
+        """Indices of the photographs that are not held out."""
         return np.flatnonzero(~np.array(self.held_out))
 
 
@@ -85,7 +85,7 @@ def prepare(capture: LitCapture, resolution: int, scale: float | None, hold_out:
     Args:
         capture: contents of the folder.
         resolution, scale: see `views.prepare`.
-        hold_out: interval of lights that are held out, 0 for none; None for 6.
+        hold_out: interval of lights that are held out, >= 2; 0 for none; None for 6. None are held out if fewer than four would remain.
 
     Raises:
         InputError: a photograph cannot be read, has another size, or the mask is empty.

@@ -140,7 +140,7 @@ def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
     picture has the lens's aspect ratio and the stored one does not.
 
     Raises:
-        InputError: neither has it.
+        InputError: neither the stored nor the rotated picture has it.
     """
     width, height, orientation = _stored_size(path)
     if lens is None or _proportional(width, height, lens):
@@ -256,7 +256,7 @@ _LEAST, _MOST = 1.0, 4.0
 
 
 def check_response(response: str) -> str:
-    """Return the name of a response unchanged. Raise `InputError` if it is invalid."""
+    """Return a response unchanged. Raise `InputError` if it is neither a name nor an exponent from 1 to 4."""
     if response not in (SRGB, LINEAR, FIT):
         _exponent(response)
     return response

@@ -29,7 +29,7 @@ class StoredArrays:
             self.append(array)
 
     def append(self, array: np.ndarray) -> None:
-        """Store one more."""
+        """Store one more array."""
         self._places.append((self._file.seek(0, 2), array.shape))
         self._file.write(np.ascontiguousarray(array, np.float32).data)
 
@@ -62,7 +62,7 @@ class StoredViews:
             self.append(view)
 
     def append(self, view: CapturedView) -> None:
-        """Store one more."""
+        """Store one more view."""
         self._values.append(view.values)
         self._masks.append(_NONE if view.mask is None else view.mask)
         self._shown.append(view.shown)
@@ -77,12 +77,12 @@ class StoredViews:
         return subset
 
     def bare(self) -> list[CapturedView]:
-        """Return all views without their arrays."""
+        """Return all views without masks, and with empty arrays in place of values and coverage."""
         return [self._views[index][0] for index in self._indices]
 
     @property
     def masked(self) -> list[bool]:
-        """Booleans of the views: whether each has a mask."""
+        """Whether each view has a mask."""
         return [self._views[index][1] for index in self._indices]
 
     def __len__(self) -> int:

@@ -23,9 +23,9 @@ _SIDE = 8192
 
 
 def pinhole(lens: Lens, scale: float) -> Lens:
-    """Return the camera of the result: no distortion, square pixels, and `scale` (at most 1) times as many along each side.
+    """Return the camera of the result: no distortion, square pixels, and `scale` times as many along each side, in (0, 1].
 
-    The scale is exactly equal along both sides: a fractional last pixel is cropped. The principal point is scaled accordingly.
+    The scale is exactly equal along both sides: a fractional last pixel is cropped. The focal length is the geometric mean of both.
 
     Raises:
         InputError: no complete pixel remains along a side.
@@ -44,8 +44,8 @@ class Resampling:
     """A resampling of the picture of a lens to that of a pinhole camera.
 
     Attributes:
-        source: of the photograph.
-        target: a pinhole with square pixels.
+        source: lens of the photograph.
+        target: pinhole of the result, with square pixels, as from `pinhole`.
     """
 
     source: Lens

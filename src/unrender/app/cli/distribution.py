@@ -29,7 +29,7 @@ Compress = Annotated[
 
 
 def check(workers: str | None, compress: bool, insecure: bool = False) -> Workers | None:
-    """Return `arguments.workers`; raise `InputError` for --compress without workers as well."""
+    """Return `arguments.workers`. Raise `InputError` also for --compress without other processes."""
     if compress and workers is None:
         raise InputError("--compress: requires --workers")
     parsed = arguments.workers(workers, insecure)

@@ -67,9 +67,9 @@ def execution(
     progress: Progress,
     callbacks: Sequence[Callback] = (),
 ) -> Iterator[dict[str, Any]]:
-    """Print the run that starts, and yield its arguments of `optimize`. Its live page ends with the block.
+    """Print the plan, and yield the arguments of `optimize`. The files of the live page are removed if the block succeeds.
 
-    The run writes a run folder, also if it is interrupted. `callbacks` are called in addition to those of the command.
+    The run writes a run folder, even if it is interrupted. `callbacks` are called in addition to those of the command.
     """
     plan = order.method.plan(problem, order.settings)
     for line in plan.lines:
@@ -144,7 +144,7 @@ def verified(result: Result) -> str:
         formatting.with_error(*verification[name]) if None not in verification[name] else "not finite"
         for name in ("start", "end")
     )
-    selected = "" if verification["best"] == "end" else f"; kept: the parameters of {verification['best']}"
+    selected = "" if verification["best"] == "end" else f"; selected: the parameters of {verification['best']}"
     return f"{verification['status']}: loss {first} before, {last} after (fresh pictures, noise removed){selected}"
 
 

@@ -53,7 +53,7 @@ def is_limited() -> bool:
 
 
 def exhausted(error: BaseException) -> bool:
-    """Return whether an unknown error is due to a lack of memory: it says so, or nearly all of the allowed address space was in use."""
+    """Return whether an error is due to a lack of memory: its text says so, or less than 64 MiB of the address space were unused."""
     limit = limits.address_space()
     return says_so(error) or 0 < limit < limits.most_address_space() + _MARGIN
 
@@ -64,7 +64,7 @@ def says_so(error: BaseException) -> bool:
 
 
 def exhaustion(how: str = "") -> str:
-    """Return the line for a command that ran out of memory."""
+    """Return the line for a command that ran out of memory; `how` is inserted after the limits."""
     try:
         limit = f" ({described})" if (described := _described()) else ""
     except MemoryError:  # not enough memory to read the limits

@@ -43,13 +43,13 @@ _SHOW_CURSOR = b"\x1b[?25h"
 
 
 class Signals:
-    """Handles both signals, as a context manager, in the main thread.
+    """Handles SIGINT and SIGTERM within its context, in the main thread.
 
     Args:
-        process: whether the process ends with the command: then a signal that comes after it is ignored: all is written.
+        process: whether the process ends with the command. Later signals are then ignored, because all files are written.
 
     Attributes:
-        status: the exit status of the signal that came; 0 for none.
+        status: exit status of the first signal, 130 or 143; 0 without a signal.
     """
 
     def __init__(self, process: bool):
@@ -79,9 +79,9 @@ class Signals:
             self._watch.close()
 
     def receive(self, number: int, frame: FrameType | None) -> None:
-        """Interrupt the command; end the process if it is already being interrupted.
+        """Interrupt the command by `KeyboardInterrupt`; end the process at a further signal.
 
-        During an import, the signal is repeated later, since compiled code that imports modules may abort at an exception.
+        During an import, the signal is sent again later, since compiled code that imports modules may abort at an exception.
         """
         waited = time.monotonic() - self._first.setdefault(number, time.monotonic())
         if self.status or number in self._deferred or waited > _LONGEST:

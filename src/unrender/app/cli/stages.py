@@ -140,7 +140,7 @@ def begin(
 def reopen(
     folder: Path, budget: tuple[int | None, float | None], variant: str | None, threads: int | None, command: str
 ) -> StagesRun:
-    """Return an earlier run in stages, with its own budget, variant, threads and checkpoints unless they are given."""
+    """Return an earlier run in stages. None, and a budget of two None, select the run's own values. Raise `InputError`."""
     from unrender.app.stages import stages_file
 
     file = folder / stages_file.FILE
@@ -162,9 +162,12 @@ def reopen(
 
 
 def run_remaining(run: StagesRun, console: Console, progress: Progress) -> None:
-    """Run the stages that are left, each to its end, or until one is interrupted or fails: leave with its status then.
+    """Run the remaining stages, and release the lock.
 
-    A doubtful stage does not end the others: the next one begins with the parameters that it verified.
+    The next stage after a doubtful one starts with the parameters that this verified.
+
+    Raises:
+        typer.Exit: a stage was interrupted or failed, which ends the run; or, at the end, a stage is doubtful.
     """
     try:
         _run_stages(run, console, progress)

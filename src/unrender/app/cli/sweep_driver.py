@@ -42,7 +42,7 @@ _SHOWN, _SHOWN_LIVE = 10, 5
 
 
 def line(trial: TrialRecord) -> str:
-    """Return the summary line of a trial."""
+    """Return the line of a trial: number, settings, error with its standard error, and status."""
     what = f"trial {trial.number}: {_settings(trial)}: "
     if trial.status == "failed":
         return f"{what}failed: {trial.message}"

@@ -34,7 +34,7 @@ from unrender.runs.resume import load_run, resume_run
 from unrender.scene.problem import Problem
 
 _PATIENCE_SECONDS = 30.0
-"""Time to wait for a run folder that a dying process still holds, in seconds."""
+"""Seconds to wait for a run folder that a dying process still locks."""
 _MARK = ".unrender-folder"
 
 
@@ -47,7 +47,7 @@ class Job:
         command: typed command.
         folder: output folder, an absolute path.
         token: contents of the file `.unrender-folder` in it: a worker that reads something else, or nothing, sends its results back.
-        variant, threads: of the workers.
+        variant, threads: Mitsuba variant and processor threads of the workers.
     """
 
     problem: str
@@ -106,7 +106,7 @@ def carry_out(
     progress: Progress,
     callbacks: Sequence[Callback] = (),
 ) -> RunOutcome:
-    """Run a task, from the state of an earlier attempt. Raise `InputError` as `optimize` and `resume_run` do."""
+    """Run a task, or continue its earlier attempt, and return its outcome. Raise `InputError` as `optimize` and `resume_run` do."""
     folder = Path(job.folder, task.name)
     _wait_until_free(folder)
     record = reader.read_run_record(folder) if (folder / RECORD).is_file() else None
@@ -192,7 +192,7 @@ def receive(folder: Path, written: Mapping[str, bytes]) -> None:
 
 
 def in_turn(job: Job, tasks: Sequence[RunTask], problem: Problem) -> list[RunOutcome]:
-    """Carry out runs one after the other, silently, until one does not come to its end."""
+    """Run tasks in turn, without output, until one does not complete."""
     outcomes: list[RunOutcome] = []
     console, progress = quiet()
     with progress:

@@ -37,8 +37,8 @@ class ViewWorker:
     """A Ray actor: shares of a problem's views, one or more.
 
     Args:
-        variant: of Mitsuba.
-        threads: of the processor.
+        variant: Mitsuba variant.
+        threads: number of processor threads.
     """
 
     def __init__(self, variant: str, threads: int):
@@ -52,7 +52,7 @@ class ViewWorker:
         return Place(socket.gethostname(), os.getpid(), free, gpu)
 
     def alive(self) -> bool:
-        """Return True, from a separate thread while others compute."""
+        """Return True. It runs in a thread of its own, so that it answers during a step."""
         return True
 
     def hold(self, share: int, views: tuple[int, ...], blob: bytes) -> None:
@@ -68,7 +68,7 @@ class ViewWorker:
         self._shares[share] = ViewShare(problem, views)
 
     def drop(self, share: int) -> None:
-        """Hold it no more."""
+        """Delete a share. Do nothing if it does not exist."""
         self._shares.pop(share, None)
 
     def run(self, share: int, call: Call, arrays: dict[int, Any]) -> Reply:

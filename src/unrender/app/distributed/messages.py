@@ -34,7 +34,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Pair:
-    """A `PairRequest`."""
+    """A `PairRequest`, with the numbers of its arrays."""
 
     previous: References
     space: Space

@@ -19,7 +19,7 @@ from unrender.scene.view import View
 
 __all__ = ["packed", "unpacked"]
 
-_Given = TypeVar("_Given", View, Parameter)
+_Owner = TypeVar("_Owner", View, Parameter)
 
 
 class _Parts(NamedTuple):
@@ -117,7 +117,7 @@ def _scene(problem: Problem) -> Any:
     return str(Path(description).resolve()) if isinstance(description, (str, Path)) else description
 
 
-def _located(owner: _Given, *names: str) -> _Given:
+def _located(owner: _Owner, *names: str) -> _Owner:
     """Return the object with absolute file names, since workers have other working directories."""
     paths = {name: value for name in names if isinstance(value := getattr(owner, name), (str, Path))}
     located: dict[str, Any] = {name: Path(value).absolute() for name, value in paths.items()}

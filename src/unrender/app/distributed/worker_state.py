@@ -21,8 +21,8 @@ from unrender.runs.folder.state import Packed
 
 _MOST_STEPS = 512
 _MOST_BYTES = 1 << 28
-"""Steps, and bytes of their parameters, that a share that was lost repeats at most; or as many bytes as a collection has, where these are
-more: then collections send no more than steps do."""
+"""Maximum steps, and bytes of their parameters, that a lost share repeats. The bytes of a collection count if they are more, so that
+collections do not send more than steps."""
 
 
 @dataclass(eq=False)

@@ -25,7 +25,7 @@ def find(run: Path, problem: Problem) -> Path:
     """Return held-out.toml in the folder of the problem file of a run, or in that of its stages.
 
     Raises:
-        InputError: no such file exists.
+        InputError: the file does not exist.
     """
     staged = run_folders.stage_of(run)
     origin = problem.origin.get("file", problem.origin.get("scene")) if staged is None else staged[0].problem

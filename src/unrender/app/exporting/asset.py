@@ -50,7 +50,7 @@ class Camera:
     """A perspective camera.
 
     Attributes:
-        name: of the sensor.
+        name: id of the sensor.
         to_world: (4, 4), axes left, up, forwards, which are Mitsuba's.
         x_fov: horizontal angle of view in degrees.
         offset: `principal_point_offset_x` and `_y`: 0.5 - cx / width, 0.5 - cy / height.
@@ -149,7 +149,7 @@ def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np
 
 
 def read_environment(scene: Any, notices: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
-    """Return the environment map of a live scene and its rotation, as in `Asset`; add a notice for each light that is not exported.
+    """Return the environment map of a live scene and its rotation, as in `Asset`. Append a line to `notices` for each other light.
 
     The map of a turntable has its orientation at the first camera.
 

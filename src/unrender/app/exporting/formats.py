@@ -135,7 +135,7 @@ FORMATS = {
     "blender": Format(gltf.write_blender_script, (gltf.BLENDER_SCRIPT,), ("glb", "environment"), gltf.check_installed),
     "usd": Format(usd.write, (usd.FILE,), check_installed=usd.check_installed),
 }
-"""The formats except that of Mitsuba."""
+"""{name: format}, except that of Mitsuba."""
 OWN = frozenset(name for known in FORMATS.values() for name in known.files)
 
 

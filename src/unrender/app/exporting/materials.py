@@ -60,8 +60,10 @@ class Material:
 def read_material(bsdf: Any) -> tuple[Material, list[str]]:
     """Return the material of a live BSDF, and a line for each property that is not exported.
 
+    Materials other than `principled` and `diffuse` become grey.
+
     Raises:
-        InputError: a map is too large.
+        InputError: a map is too large, or maps have different `to_uv`.
     """
     values: Any = mi.traverse(bsdf)
     notes: list[str] = []

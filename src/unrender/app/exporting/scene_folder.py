@@ -108,7 +108,7 @@ def export(
     variant.ensure()
     out, formats_ = Path(out), check_formats(formats)
     files.check_replaceable(out, _OWN, textures.RECORD, overwrite, f"export to {out}", "an earlier export")
-    problem, parameters, beside = _opened(what)
+    problem, parameters, related = _opened(what)
     renderer = scene_renderer(problem.renderer)
     if not isinstance(renderer, MitsubaRenderer):
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
@@ -116,7 +116,7 @@ def export(
     values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
     try:
         notices, renamed = files.write_folder(
-            out, lambda folder: _write(folder, problem, renderer, values, formats_, spp, beside)
+            out, lambda folder: _write(folder, problem, renderer, values, formats_, spp, related)
         )
     except OSError as error:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
@@ -144,14 +144,14 @@ def _write(
     values: dict[str, np.ndarray],
     formats: Sequence[str],
     spp: int,
-    beside: _Maps,
+    related: _Maps,
 ) -> tuple[list[str], dict[str, str]]:
     """Write the recovered values and the requested formats; return the notices and `Exported.renamed`."""
     repeated = problem.coordinates.repeated
     inner, *maps = (
-        {k: periodic.interior(x, repeated.get(k, 0)) for k, x in of.items()} for of in (values, *beside.values())
+        {k: periodic.interior(x, repeated.get(k, 0)) for k, x in of.items()} for of in (values, *related.values())
     )
-    notices = textures.write(inner, folder, dict(zip(beside, maps, strict=True)))
+    notices = textures.write(inner, folder, dict(zip(related, maps, strict=True)))
     others = [name for name in formats if name != MITSUBA]
     if renderer.pair.emissive:
         if others:
@@ -284,16 +284,16 @@ def _gather_files(graph: SceneGraph, folder: Path) -> None:
 
 
 def _verify(graph: SceneGraph, path: Path, recovered: Mapping[str, str], posed: list[int]) -> dict[str, str]:
-    """Load the exported scene and hold it to the values that it should have.
+    """Load the exported scene, and raise `InputError` if its values are not those of the live scene.
 
     Args:
-        graph: with its live scene at these values.
-        path: of the XML file.
-        recovered: {the parameter's key: its key in the live scene}.
-        posed: nodes that were moved, which the live scene's are not.
+        graph: description whose live scene has the recovered values.
+        path: the XML file.
+        recovered: {key of a parameter: its key in the live scene}.
+        posed: nodes that were moved in the exported scene only.
 
     Returns:
-        the name of each parameter of the live scene in the one that was written.
+        {key in the live scene: key in the exported scene}.
     """
     try:
         written = ObjectGraph(load(path)).parameters()

@@ -60,7 +60,7 @@ def _mesh(graph: SceneGraph, place: Place, folder: Path) -> None:
     mesh, old = place.owner, graph.nodes[place.node].props
     path = _path(folder, MESHES, graph.names[place.node] or f"mesh-{place.node}", ".ply")
     mesh.write_ply(str(path))
-    properties = {name: old[name] for name in old.keys() if old.type(name) in _KEPT or name == "flip_normals"}  # noqa: SIM118
+    properties = {name: old[name] for name in old.keys() if old.type(name) in _REFERENCES or name == "flip_normals"}  # noqa: SIM118
     props = graph.replace(place.node, "ply")
     props["filename"] = str(path)
     for name, value in properties.items():
@@ -69,7 +69,7 @@ def _mesh(graph: SceneGraph, place: Place, folder: Path) -> None:
         props["face_normals"] = True
 
 
-_KEPT = (mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
+_REFERENCES = (mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
 
 
 def _map(props: Any, value: np.ndarray, name: str, folder: Path) -> None:

@@ -24,17 +24,18 @@ _LARGEST = 64
 
 
 def write(
-    parameters: Mapping[str, np.ndarray], folder: Path, beside: Mapping[str, Mapping[str, np.ndarray]] | None = None
+    parameters: Mapping[str, np.ndarray], folder: Path, related: Mapping[str, Mapping[str, np.ndarray]] | None = None
 ) -> list[str]:
-    """Write `parameters` to `folder`: parameters.json with all of them, parameters.csv with the small ones, maps/ with the large.
+    """Write parameters.json with all parameters, parameters.csv with those of at most 64 numbers, and maps/ with the others.
 
-    Maps (H, W, C) become an EXR file with the values as they are, and a PNG file for the eye; volumes a .vol file; other large arrays
-    a .npy file. Returns one line for each thing that a file does not show.
+    Maps (H, W, C) become an EXR file with unchanged values, and a PNG file for viewing; volumes a .vol file; other large arrays a .npy
+    file. Return a line for each PNG file with clipped values.
 
     Args:
         parameters: {key: array}.
         folder: folder of the export.
-        beside: {name: {key: array}}, maps that belong to large parameters, such as standard errors: maps/<key>.<name>.exr, .vol or .npy.
+        related: {name: {key: array}}, maps that belong to large parameters, such as standard errors: maps/<key>.<name>.exr, .vol or
+            .npy.
     """
     notices: list[str] = []
     record: dict[str, Any] = {}
@@ -50,7 +51,7 @@ def write(
                 table.writerow([key, " ".join(map(str, index)), float(value[index])])
         else:
             entry |= _large(key, value, folder)
-            for name, of in (beside or {}).items():
+            for name, of in (related or {}).items():
                 if key in of:
                     entry[name] = _values(f"{_base(key)}.{name}", np.asarray(of[key], np.float32), folder)
             if entry.get("clipped"):

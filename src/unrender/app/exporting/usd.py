@@ -29,7 +29,10 @@ def _module(name: str) -> Any:
 
 
 def write(asset: Asset, folder: Path) -> None:
-    """Write asset.usdz without light. As in UsdPreviewSurface, +Y and v point upwards and roughness is perceptual."""
+    """Write asset.usdz without light. As in UsdPreviewSurface, +Y and v point upwards and roughness is perceptual.
+
+    Raises `InputError` if usd-core is missing.
+    """
     check_installed()
     Usd, UsdGeom, UsdUtils = map(_module, ("Usd", "UsdGeom", "UsdUtils"))
 

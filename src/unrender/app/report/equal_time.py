@@ -121,12 +121,12 @@ class Comparison:
 
     Attributes:
         groups: the methods; the first one is the reference for the others.
-        seconds: of the shortest run.
-        samples: of the run that traced the fewest paths.
-        metrics: the first one counts most.
+        seconds: time of the shortest run.
+        samples: paths of the run that traced the fewest.
+        metrics: the compared quantities; pages and tables begin with the first one.
         image_error: {label: root mean square error of the result's pictures}, each run at its own end.
         images: {metric's name: {label: value}} of the same pictures.
-        representatives: {label: the run whose last value of the first metric is the (lower) median}.
+        representatives: {label: the run with the (lower) median of the final parameter error, or of the image error without truth}.
     """
 
     groups: tuple[Group, ...]
@@ -146,7 +146,11 @@ class Comparison:
 
 
 def compare_groups(groups: tuple[Group, ...]) -> Comparison:
-    """Compare methods up to the shortest run's time, and up to the fewest samples."""
+    """Compare methods up to the shortest run's time, and up to the fewest samples.
+
+    Raises:
+        InputError: no truth is known, and no loss is finite.
+    """
     ends = {axis: min(float(getattr(run.history, axis)[-1]) for group in groups for run in group.runs) for axis in AXES}
     end = ends["seconds"]
     first_run = groups[0].runs[0]

@@ -49,7 +49,8 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
     """Raise `InputError` for runs that cannot be compared; return the weaknesses of the comparison, one line each.
 
     Raises:
-        InputError: no runs, the same run twice, a run without steps, different problems or parameters, or pictures of different sizes.
+        InputError: no runs, the same run twice, a run without steps, different parameters or sizes of pictures, or references or true
+            values that differ by more than 1 %.
     """
     if not runs:
         raise InputError("compare: give at least one run folder")

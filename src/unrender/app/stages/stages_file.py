@@ -223,7 +223,10 @@ def write(stages: Stages, folder: Path) -> None:
 
 
 def split(stages: Stages) -> list[tuple[int | None, float | None]]:
-    """Return steps and seconds of each stage, in proportion to the shares; every stage has at least one step."""
+    """Return (steps, seconds) of each stage, in proportion to the shares; None without that budget.
+
+    Every stage has at least one step, so the steps can exceed the total.
+    """
     total = sum(stage.share for stage in stages.stages)
     ends, budgets = 0.0, []
     assigned = 0
@@ -238,5 +241,5 @@ def split(stages: Stages) -> list[tuple[int | None, float | None]]:
 
 
 def folder_of(stages: Stages, index: int, out: Path) -> Path:
-    """Return the run folder of a stage."""
+    """Return the run folder of a stage in the folder `out`: 1-NAME, 2-NAME, ..."""
     return out / f"{index + 1}-{stages.stages[index].name}"

@@ -39,15 +39,17 @@ class Axis:
     integer: bool = False
 
     def at(self, share: float) -> str:
-        """Return the value at a position in [0, 1) along the axis: uniform positions give each choice, or each integer, the same
-        probability."""
+        """Return the value at a position in [0, 1) along the axis.
+
+        Uniform positions give each choice the same probability, and each integer of a linear range.
+        """
         if self.choices:
             return self.choices[min(int(share * len(self.choices)), len(self.choices) - 1)]
         low, high = (self.low - 0.5, self.high + 0.5) if self.integer else (self.low, self.high)
         return self.typed(self._between(max(low, 0.5) if self.integer and self.logarithmic else low, high, share))
 
     def typed(self, number: float) -> str:
-        """Return a number of the range as text: rounded, and clamped to the ends."""
+        """Return a number of the range as text: rounded to an integer or four digits, and clamped to the ends."""
         if self.integer:
             return str(int(min(max(round(number), self.low), self.high)))
         return repr(min(max(float(f"{number:.{_DIGITS}g}"), self.low), self.high))
@@ -87,7 +89,7 @@ def parse_axes(
         fixed: options that are set already.
 
     Raises:
-        InputError: no axis, a malformed or repeated axis, an option that is fixed already, or no option of the method.
+        InputError: no axis, a malformed or repeated axis, an option that is fixed already, or one that the method does not have.
     """
     axes = []
     taken = set(fixed)

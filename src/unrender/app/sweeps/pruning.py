@@ -28,7 +28,7 @@ RUNGS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8)
 """Fractions of the budget at which the error of a run is measured; no run is pruned at the first one."""
 RUNG_FILE = "rungs.json"
 _FEWEST = 4
-"""Least number of finished trials before a run is pruned."""
+"""Minimum number of finished trials with an error at a fraction before a run is pruned there."""
 _PATHS, _MOST_SPP = 1 << 19, 64
 _SEED = 1 << 20
 """Seed of the pictures during a run; it differs from the seeds of the final pictures."""
@@ -73,11 +73,12 @@ def is_hopeless(errors: Mapping[float, float], limits: Mapping[float, float]) ->
 def stated_error(run: RunFolder) -> tuple[float, float | None]:
     """Return the error that a sweep minimises, and its standard error if it has one.
 
-    If the truth is known, the error is the root mean square error of the parameter; with several parameters, the mean of their errors,
-    each relative to its initial error. Otherwise it is the debiased root mean square error of the final pictures, the mean over views.
+    Parameters with a known truth have the error of their measure (`run.measure`), such as root mean square. With several of them, it is
+    the mean of the ratios to the initial errors. Without truth, it is the debiased root mean square error of the final pictures, the
+    mean over views.
 
     Raises:
-        InputError: the run has neither.
+        InputError: neither the truth nor an error of pictures is known.
     """
     if run.error_after:
         return _combined(run.error_after, run.error_before), None

@@ -18,7 +18,7 @@ class Started:
     """A trial to start.
 
     Attributes:
-        number: from 0.
+        number: index of the trial, from 0.
         settings: {option: value as text}.
         limits: limits of the pruning of its first run, see `pruning.is_hopeless`; {} disables pruning.
     """
@@ -60,7 +60,10 @@ class Trials:
         return len(self.ended) >= self.search.trials
 
     def next(self) -> Started | None:
-        """Return a trial to start now; None if none can start yet, or none is left. Trials that have ended already are skipped."""
+        """Return a trial to start now; None if none can start yet, or none is left. Trials that have ended already are skipped.
+
+        Raises `InputError` if a trial that has ended had other settings than the search proposes now.
+        """
         while self._asked < self.search.trials:
             number = self._asked
             while self.dependent and self._reported <= number - self.window:

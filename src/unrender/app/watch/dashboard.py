@@ -36,13 +36,14 @@ _STATES = {
 
 @dataclass(frozen=True)
 class RunRow:
-    """The row of one of the watched runs, all text.
+    """The row of a watched run.
 
     Attributes:
         number: its index, from 0.
         label, state, state_text: its name, its state (see `monitor`), and the description of its state.
         step, seconds, samples, loss, error: its progress.
         accepts_commands, paused: whether its buttons are shown, and whether it is paused.
+        path: its folder.
     """
 
     number: int

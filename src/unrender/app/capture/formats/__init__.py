@@ -6,7 +6,7 @@
 | | or `transforms_train.json` and `transforms_test.json` (held out) | | or `camera_angle_x`; `k1`, `k2`, `p1`, `p2`, `k3` |
 | | | | `k1` to `k4` of `OPENCV_FISHEYE` |
 | `colmap` | `cameras`, `images` (`.bin` or `.txt`) | world to camera, `opencv` | all models but `FOV` and the thin prism |
-| | in the folder, `sparse/0`, `sparse`, `colmap/sparse/0` | | |
+| | in the folder, `sparse/0`, `sparse`, `colmap/sparse/0`, `colmap` | | |
 | `llff` | `poses_bounds.npy`; photographs in `images`, by name | camera to world, `llff` | one focal length, centred |
 | `lights` | `lights.txt`: one camera under known lights | none | orthographic |
 
@@ -60,7 +60,7 @@ LIGHTS = "lights"
 
 
 def is_lit(folder: Path, kind: str | None) -> bool:
-    """Return whether a folder contains photographs of one camera under known lights, to be read as such."""
+    """Return whether a folder is to be read as one camera under known lights: `kind` says so, or no other format fits."""
     if kind is not None:
         return kind == LIGHTS and lights.recognise(folder)
     return lights.recognise(folder) and not any(each.recognise(folder) for each in FORMATS.values())

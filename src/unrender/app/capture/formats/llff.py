@@ -38,8 +38,8 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
     files.check_count(len(rows), path)
     place = next((folder / name for name in _FOLDERS if files.pictures(folder / name)), folder)
     pictures = files.pictures(place)
-    masks_beside = {f"{path.stem.removesuffix('_rgb').removesuffix('_rgba')}_mask" for path in pictures}
-    pictures = [path for path in pictures if path.stem not in masks_beside]
+    mask_names = {f"{path.stem.removesuffix('_rgb').removesuffix('_rgba')}_mask" for path in pictures}
+    pictures = [path for path in pictures if path.stem not in mask_names]
     if len(pictures) != len(rows):
         many = f"{len(rows)} poses, and {place} has {len(pictures)} pictures"
         raise InputError(f"{path}: {many}: they are matched in the order of names, so none may be missing")

@@ -25,12 +25,12 @@ from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line, reason_of
 
 _LOOK, _ANSWER, _PATIENCE = 3.0, 2.0, 15.0
-"""Seconds between looks, that an answer may take, and without one until the head counts as lost. Ray itself would end the process, without
-a word to its program, after 60."""
+"""Seconds between checks, time limit of an answer, and time without an answer after which the head node counts as lost. Ray itself
+ends the process after 60 seconds, without an exception."""
 
 
 def reach(address: str, seconds: float) -> None:
-    """Open a connection to HOST:PORT, and close it. Raises `OSError`."""
+    """Open a connection to HOST:PORT within a time limit in seconds, and close it. Raises `OSError`."""
     host, _, port = address.rpartition(":")
     try:
         socket.create_connection((host.strip("[]"), int(port)), seconds).close()
@@ -250,7 +250,7 @@ def _own_signals() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     received = 0
     try:
-        with _kept_action(signal.SIGTERM):
+        with _restored_action(signal.SIGTERM):
             yield
     except SystemExit as end:  # raised by Ray's handler
         received = end.code if end.code == signal.SIGTERM else 0
@@ -272,7 +272,7 @@ _LARGEST_ACTION = 1024
 
 
 @contextlib.contextmanager
-def _kept_action(number: int) -> Iterator[None]:
+def _restored_action(number: int) -> Iterator[None]:
     """Keep the system's action of a signal. Ray's compiled code sets one that prints a stack trace, and Python does not notice.
 
     It does so if its version does not know `RAY_DISABLE_FAILURE_SIGNAL_HANDLER`, or if a program has imported it without that setting.

@@ -121,10 +121,10 @@ def share(machines: Sequence[tuple[float, float]], count: int | None, gpu: bool,
 
 
 def most_by_memory(most: int | None) -> int | None:
-    """Return how many workers have room in the memory that this machine, or this container, has left.
+    """Return the maximum number of workers for the free memory of this machine or container, 512 MiB each.
 
     Args:
-        most: of how many there is work for; None for any number, which is also returned where the memory is unknown.
+        most: maximum useful number of workers; None for no maximum. It is returned unchanged if the memory is unknown.
     """
     free = limits.free_memory()
     if not free:
