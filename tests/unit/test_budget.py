@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from unrender.methods.plan import Plan
 from unrender.protocols import Callback
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import budget, loop
+from unrender.runs.folder.history import thinned
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.resume import load_run, resume_run
 from unrender.runs.run import Run
@@ -112,6 +114,26 @@ def test_a_resumed_run_has_what_is_left_of_its_budget(tmp_path: Path, monkeypatc
     assert seen[0] <= 0.5
 
 
+@pytest.mark.parametrize(
+    ("steps", "seconds", "message"),
+    [
+        (None, None, "set a budget"),
+        (0, None, "steps must be a whole number of at least 1, got 0"),
+        (2.0, None, "steps must be a whole number of at least 1, got 2.0"),
+        (True, None, "steps must be a whole number of at least 1, got True"),
+        (1 << 63, None, "steps must be below"),
+        (None, 0, "seconds must be positive and finite, got 0"),
+        (None, math.inf, "seconds must be positive and finite, got inf"),
+        (None, math.nan, "seconds must be positive and finite, got nan"),
+        (None, True, "seconds must be positive and finite, got True"),
+        (None, "5", "seconds must be positive and finite, got '5'"),
+    ],
+)
+def test_an_invalid_budget_is_refused(steps: Any, seconds: Any, message: str) -> None:
+    with pytest.raises(ur.InputError, match=f"^optimize: {message}"):
+        budget.check_budget(steps, seconds)
+
+
 def test_slowdown_is_at_least_one() -> None:
     assert 1.0 <= budget.slowdown() < 1e3
 
@@ -120,3 +142,12 @@ def test_a_run_that_its_budget_ends_before_a_third_step_is_told() -> None:
     found = ur.optimize(problem(), slow(0.5), ur.optimizers.Adam(0.01), seconds=0.6)
     assert found.steps < 3
     assert sum("allows about" in line for line in found.warnings) == 1
+
+
+def test_thinning_keeps_the_records_of_refinements() -> None:
+    records: list[dict[str, Any]] = [{"step": step} for step in range(80)]
+    records[5]["resolution"], records[7]["faces"] = {"albedo": [8, 8]}, {"mesh": 320}
+    for length in (80, 60):
+        records = thinned(records[:length])
+    assert [r["step"] for r in records if len(r) > 1] == [5, 7]
+    assert len(records) < 50

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import math
 import time
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 from unrender.backend import cache
@@ -121,12 +122,14 @@ def few_steps(seconds: float, steps: int, most: int | None = None) -> str:
 
 
 def check_budget(steps: int | None, seconds: float | None) -> None:
-    """Raise `InputError` for an invalid budget."""
+    """Raise `InputError` unless a limit is given, `steps` is a whole number in [1, 2⁶³), and `seconds` is positive and finite."""
     if steps is None and seconds is None:
         raise InputError("optimize: set a budget, steps= or seconds=")
     if isinstance(steps, int) and steps >= _MOST_STEPS:
         raise InputError(f"optimize: steps must be below 2**63, got an integer of {steps.bit_length()} bits")
-    if steps is not None and (not isinstance(steps, int) or steps < 1):
+    if steps is not None and (isinstance(steps, bool) or not isinstance(steps, int) or steps < 1):
         raise InputError(f"optimize: steps must be a whole number of at least 1, got {steps!r}")
-    if seconds is not None and not (0 < float(seconds) < float("inf")):
+    if seconds is not None and (
+        isinstance(seconds, bool) or not isinstance(seconds, Real) or not 0 < seconds < math.inf
+    ):
         raise InputError(f"optimize: seconds must be positive and finite, got {seconds!r}")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class Callback(Listener):
     """Receiver of the events of a run. Override the methods of interest; the run's time does not include them.
 
-    User code and the parts of a run besides its steps (budget, refinement, verification, the run folder) are callbacks alike. The run
+    User code and the parts of a run other than its steps (budget, refinement, verification, the run folder) are callbacks alike. The run
     calls each event on all of them, in order:
 
         on_warm_up → on_start → (before_step → on_update → on_step)* → on_result → on_end
@@ -53,7 +53,8 @@ class Callback(Listener):
         """Called before each step. This time is not counted as the run's."""
 
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
-        """Called after a step, before its record is made. `applied` is false for a step whose estimate was not finite."""
+        """Called after a step, before its record is made. `applied` is false if the estimate or the optimizer's step
+        was not finite."""
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """Called after each step, with its record, the last of the history. `run.stop()` ends the run."""

@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.runs.image_sensitivity import seen_cells
+from unrender.runs.numbers import tested_views
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import render
@@ -25,7 +26,6 @@ _ERRORS = 2.0
 """Number of standard errors by which a change must be below its limit."""
 _UNSEEN = 0.05
 """Fraction of unseen cells of a texture or grid from which a line is returned."""
-_MOST_VIEWS = 4
 _SEEDS, _RENDERINGS = (3, 4), 8
 """Seeds of the two independent halves, and number of renderings per view for two changes."""
 
@@ -123,7 +123,7 @@ def common_factor(
         return []
     started = time.perf_counter()
     render(problem, values, 0, spp, _SEEDS[0], per_pass)
-    if _RENDERINGS * len(_views(problem)) * (time.perf_counter() - started) > seconds:
+    if _RENDERINGS * len(tested_views(problem)) * (time.perf_counter() - started) > seconds:
         return []
     brighter = {key: x * np.float32(_FACTOR) if key in lights else x for key, x in values.items()}
     darker = {key: x / np.float32(_FACTOR) if key in colours else x for key, x in brighter.items()}
@@ -154,12 +154,6 @@ def _factor(problem: Problem, key: str, values: np.ndarray) -> float | None:
     return float(np.mean(values) / np.mean(truth))
 
 
-def _views(problem: Problem) -> list[int]:
-    """Return the views to render: all, or an even selection of many."""
-    count = len(problem.views)
-    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
-
-
 def _change(
     problem: Problem, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], spp: int, per_pass: int | None
 ) -> Change:
@@ -168,7 +162,7 @@ def _change(
     The product of two independent differences has no noise bias; each uses equal random numbers.
     """
     products, squares = [], []
-    for view in _views(problem):
+    for view in tested_views(problem):
         differences = []
         for seed in _SEEDS:
             first, second = (render(problem, state, view, spp, seed, per_pass) for state in (before, after))

@@ -1,4 +1,4 @@
-"""Directions of textures and grids that change the pictures as given pictures do, by adjoints."""
+"""Directions of textures and grids whose changes of the pictures approximate those of numbers, by adjoints."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _HARDLY = 0.05
 
 @dataclass(frozen=True)
 class Curvature:
-    """Diagonal of the Gauss-Newton matrix JᵀJ, where J is the derivative of all views' pixels by the parameters.
+    """Diagonal of the Gauss-Newton matrix JᵀJ, where J is the derivative of all views' pixels with respect to the parameters.
 
     Attributes:
         squares: {key: diagonal elements} of the parameters' shapes. Estimates below 0 are 0.
@@ -213,7 +213,10 @@ def adjoint_spp(problem: Problem) -> int:
 
 
 def derivative_session(problem: Problem) -> tuple[RenderSession | None, frozenset[str]]:
-    """Return a session with derivatives, and their keys: all, or all that are differentiable and no poses."""
+    """Return a session with derivatives, and their keys: all, or all that are differentiable and no poses.
+
+    The session is None, without keys, if no unknown has a path gradient.
+    """
     known, keys = problem.renderer.parameters(), list(problem.shapes())
     for chosen in (keys, [key for key in keys if known[key].differentiable and not known[key].rigid]):
         if chosen:
@@ -257,8 +260,8 @@ def adjoints(
 
     Args:
         problem: problem with views and scene.
-        session: session with derivatives by `keys`.
-        parameters: point.
+        session: session with derivatives with respect to `keys`.
+        parameters: point of the derivatives.
         keys: keys of the parameters.
         spp: samples per pixel of a rendering.
         seeds: {view: key of its random numbers}.

@@ -79,7 +79,11 @@ class NumbersCheck:
     fixed: Mapping[str, str] = field(default_factory=dict)
 
     def missing(self, told: Collection[str] = ()) -> list[str]:
-        """Return a line that says why standard errors are unknown; [] if all are known, or if other lines `told` of these numbers."""
+        """Return at most one line: why the standard errors of the unchecked numbers are unknown.
+
+        Args:
+            told: keys to leave out, since other lines are about them.
+        """
         keys = [key for key in self.unchecked if key not in told]
         if not keys:
             return []
@@ -117,7 +121,7 @@ def check_numbers(
     seconds: float,
     sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> NumbersCheck:
-    """Return what least squares at `values` says about the problem's numbers.
+    """Test the problem's numbers by least squares at `values`.
 
     The derivatives J of the pictures are differences of renders, along directions of which the pictures change independently. The
     covariance of the numbers is (JᵀJ)⁻¹ C (JᵀJ)⁻¹, with the covariance C of Jᵀ r (`statistics.scores`) from the residual r after the step
@@ -125,8 +129,10 @@ def check_numbers(
     references do not determine them. Where the step −(JᵀJ)⁻¹ Jᵀ r is long, the run ended early.
 
     Textures and grids move along directions that trade off against the numbers, see `beside_fields`. Other unknowns are fixed, and so
-    are those with a prior. Standard errors beside these would be too small, so there are none: the numbers are `unchecked`. Steps are
-    reported for losses with a linear derivative only: others have their minimum elsewhere.
+    are those with a prior. Standard errors with fixed unknowns would be too small, so there are none: the numbers are `unchecked`.
+
+    Steps are reported for losses with a linear derivative only: others have their minimum elsewhere. The result is empty if there are
+    no numbers (see `Numbers.of`), or if the renderer rejects a value.
 
     Args:
         problem: problem with views and scene.

@@ -40,7 +40,7 @@ _FEWEST, _ERRORS = 8, 3.0
 _MOST_OVERLAP = 2.0
 """Overlap from which on texels are not independent, such as with more texels than pixels that see them."""
 _ELEMENTS, _LEAST = 9.0, 0.1
-"""Number of elements that the mean over all cells weighs as much as beside the neighbours, and the least ratio to it."""
+"""Number of elements whose weight the mean over all cells has in a mean with the neighbours, and the least ratio to it."""
 _NEARBY, _LEAST_NOISE = 5, 0.02
 """Side of the squares of pixels that share a variance, and least variance relative to the mean."""
 
@@ -70,12 +70,12 @@ def uncertainty(
 
     Numbers, 24 elements at most, are tested by least squares at `values`, together with directions of textures and grids that trade off
     against them. Their standard errors contain the references' noise, and the distance from the least-squares solution. Numbers have none
-    beside meshes, beside unknowns with a prior, beside textures that are too large or have no path gradient, and where there was no
-    time. `missing` tells the reason. Nor has any unknown of a problem of few numbers whose pictures differ from the references by more
-    than noise, in up to four views.
+    if another unknown is a mesh, has a prior, or is a texture that is too large or has no path gradient, nor if time runs out. `missing`
+    contains the reason. No unknown has any if the problem has few numbers and its pictures differ from the references by more than
+    noise, in up to four views.
 
-    For textures, with the pictures' residual r, their derivative J by the parameters, and the diagonal elements H of the Gauss-Newton
-    JᵀJ, the variance of an element is that of a posterior with independent elements:
+    For textures, r is the pictures' residual, J their derivative with respect to the parameters, and H a diagonal element of the
+    Gauss-Newton matrix JᵀJ. The variance of an element is that of a posterior with independent elements:
 
         1 / se² = H / c + 1 / τ² + p        share of the data = (H / c) se²
         c = m + max(σ − √m, 0)²      m = ⟨(Jᵀr)² / (κ H)⟩        κ = Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²      σ² = (JᵀΣJ) / H

@@ -28,7 +28,7 @@ class GradientNoise:
     weight: float = 0.0
 
     def update(self, gradient: Tree, variance: Tree | None = None) -> float | None:
-        """Add a gradient. Returns the fraction in [0, 1]; None for fewer than ten gradients, unless the variance is given.
+        """Add a gradient, and return the fraction in [0, 1]; None for fewer than ten gradients without variance, and for a zero gradient.
 
         With the estimator's variance, the result is its fraction of ‖g‖². Gradients of an estimator that reuses earlier samples resemble
         each other, and would otherwise appear free of noise.

@@ -48,7 +48,7 @@ def numbers_of(problem: Problem, optimizer: Any) -> dict[str, tuple[int, ...]]:
 def averaged(run: Run, result: Result) -> Result:
     """Return the result with the mean of each number over its last steps, where these are stationary, and its standard error.
 
-    There are no standard errors beside other unknowns, such as textures: numbers may follow these slowly, with little noise.
+    There are no standard errors if other parameters are unknown, such as textures: numbers may follow these slowly, with little noise.
     """
     trace = run.state.numbers
     shapes = numbers_of(run.problem, run.optimizer)

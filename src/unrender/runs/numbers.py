@@ -1,4 +1,4 @@
-"""A problem's numbers at a point, with directions of its textures and grids, and differences of pictures along them."""
+"""Numbers of a problem at a point, directions of its textures and grids, and differences of pictures along both."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ _PATHS, _SPP = 1 << 18, (4, 32)
 
 @dataclass(frozen=True)
 class Differences:
-    """Differences of pictures along K directions.
+    """Central differences of pictures along K directions.
 
     Attributes:
-        directions: half of the differences of parameters, (n, K).
-        one, other: halves of the pictures' differences, independent of each other, (K, P, 3) with roots of the pixels' weights.
+        directions: half of the differences of numbers and factors, (n + k, K), see `Numbers`.
+        one, other: half of the pictures' differences, (K, P, 3), with two independent sets of random numbers. They are multiplied by the
+            roots of the pixels' weights.
     """
 
     directions: np.ndarray
@@ -81,8 +82,8 @@ class Numbers:
         keys: keys of the numbers.
         views: indices of the rendered views.
         point: numbers, then the factors, which are 0, (n + k,).
-        sizes: sizes of the numbers, by which changes are judged, (n,); 0 where nothing is known.
-        limits: longest difference of each, (n + k,).
+        sizes: sizes of the numbers, to which changes are relative, (n,); 0 if a number is 0 at the start and at the end.
+        limits: largest change of each in one direction, (n + k,).
         rigid: whether a number is of a pose, (n,).
         spp: samples per pixel of a picture.
         fields: {key: (k, *shape)}, directions of textures and grids.
@@ -101,6 +102,17 @@ class Numbers:
 
     @classmethod
     def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> Numbers | None:
+        """Return the numbers of a problem without directions of textures and grids.
+
+        Numbers are parameters of at most one axis and four elements that can be perturbed and have no prior. Parameters of sensors count
+        only if one of the tested views shows them. The result is None if there are no numbers, if they have more than 24 elements, or if
+        the pictures of a pass are too large.
+
+        Args:
+            problem: problem with views and scene.
+            values: {key: array} of all unknowns.
+            start: {key: array}, initial values, for the sizes.
+        """
         known, views = problem.renderer.parameters(), tested_views(problem)
         sensors = {problem.views[view].sensor for view in views}
         keys = [
@@ -171,7 +183,7 @@ class Numbers:
         }
 
     def tangents(self) -> np.ndarray:
-        """Return the projection (n + k, n + k) of changes that leaves out those of the lengths of directions, which no picture shows."""
+        """Return the matrix (n + k, n + k) that removes changes of the lengths of direction vectors; no picture depends on these."""
         matrix, known = np.eye(self.point.size), self.problem.renderer.parameters()
         for key, of in self.places().items():
             own = self.point[of]
@@ -216,7 +228,7 @@ class Numbers:
         return mask_roots(self.problem, view).reshape(-1, 1) * math.sqrt(self.problem.views[view].weight)
 
     def differences(self, directions: np.ndarray, key: Key) -> Differences:
-        """Return the differences along directions (n, K) of some length."""
+        """Return the differences of `point` ± each column of directions (n + k, K), within the bounds."""
         count = directions.shape[1]
         ends = self.inside(np.concatenate([self.point + directions.T, self.point - directions.T]))
         halves = [self.pictures(ends, key.fold(half)) for half in (0, 1)]

@@ -28,14 +28,15 @@ class Result:
 
     Attributes:
         parameters: {key: array}, float32, the recovered values: the best ones that new images verify, see `verification`. Numbers and
-            colours are means over the last steps where these have become stationary; `adapted` tells how many steps.
+            colours are means over the last steps where these have become stationary; `adapted` contains the number of these steps.
         initial: {key: array}, the initial values.
         last: {key: array}, the values after the last step; equal to `parameters` unless means or earlier values were better.
         history: one dictionary per step (in a run folder with millions of steps, per second, fourth, ... of the earlier ones): "step"
             (from 0), "seconds" (of optimisation so far, without warm-up and callbacks), "loss", "samples" (paths traced so far),
             "gradient_noise" (fraction in [0, 1] or None), and, if the truth is known, "parameter_error" ({key: error}, see
             `Problem.parameter_error`) at intervals and at the last step. For parameters with a coarse initial resolution, "resolution"
-            ({key: texels along each axis}) at the first step of each resolution.
+            ({key: texels along each axis}) at the first step of each resolution. For meshes, "faces" ({key: number of triangles}) at the
+            first step after each remeshing.
         seconds: seconds of optimisation.
         warmup_seconds: seconds of tracing and compiling kernels before the first step.
         stopped: "steps", "seconds", "callback" or "pruned" (finished); "interrupted" (Ctrl-C, or a stop command) or "terminated"
@@ -55,15 +56,15 @@ class Result:
             and the image's expectation, without rendering noise; see `statistics.debiased`.
         standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings
             and of the references, infinite where the images do not determine it. Runs with a run folder have it for up to 24 elements of
-            numbers, also beside textures and grids. There is none beside unknowns that the test cannot move or has no time for; a line
-            of `undetermined` says so. Other runs have it if all unknowns are numbers: for those optimised by `AveragedNewton`, and for
+            numbers, also if textures and grids are unknown. There is none if the test cannot change another unknown, or has no time; a
+            line of `undetermined` says so. Other runs have it if all unknowns are numbers: for those optimised by `AveragedNewton`, and for
             means over enough steps, without the references' noise. Few numbers have none where the final picture differs from the
             references by more than noise; a warning says so. Textures of runs with a run folder have a map, see
             `unrender.runs.uncertainty`.
         data_share: {key: array} of the parameters' shapes, in [0, 1], for textures: weight of the references in each element, see
             `unrender.runs.uncertainty`. {} for runs without a run folder.
-        phases: {phase: seconds} in order: "compiling", "steps", "checkpoints and callbacks", "final pictures", and, on the command line,
-            earlier phases. For a resumed run, those of the last session.
+        phases: {phase: seconds} in order: on the command line, earlier phases such as loading; then "compiling", "steps", "checkpoints
+            and callbacks", "verification", "final pictures". For a resumed run, those of the last session.
         sensitivity: {key: array} of the parameters' shapes: change of the images per unit of each element, as root sum of squares over
             all pixels and channels, see `unrender.runs.sensitivity`. {} for runs without a run folder, and for parameters without path
             gradients. Where it is small, the images do not determine the element.

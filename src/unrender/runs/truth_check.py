@@ -9,7 +9,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.estimators.fresh_pictures import FreshPictures
-from unrender.runs.image_sensitivity import seen_cells, sensitivity
+from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, sensitivity
 from unrender.scene.problem import Problem
 
 __all__ = ["FEW_NEWTON_STEPS", "FEW_STEPS", "further_from_truth"]
@@ -20,7 +20,6 @@ FEW_NEWTON_STEPS = 8
 """The same number for Gauss-Newton steps of all unknowns."""
 _FURTHER, _FURTHER_EARLY = 1.1, 1.5
 """Ratio of a parameter's last error to its first from which a warning is given; the second one for runs of few steps."""
-_MAP_AXES = 3
 _ERRORS = 2.0
 """Number of standard errors of a parameter that its last error must exceed in addition to its first error."""
 _HARDLY = 0.05
@@ -54,7 +53,7 @@ def further_from_truth(
     ratio = _FURTHER_EARLY if few else _FURTHER
     before, after = problem.parameter_error(first), problem.parameter_error(last)
     # The error over all cells grows less than that of the seen ones if the others do not change.
-    least = {key: 1.0 if last[key].ndim >= _MAP_AXES else _FURTHER for key in after}
+    least = {key: 1.0 if last[key].ndim >= MAP_AXES else _FURTHER for key in after}
     suspects = [key for key, error in after.items() if 0.0 < least[key] * before[key] < error]
     if not suspects:
         return []

@@ -28,6 +28,8 @@ LARGEST = 1 << 30
 MOST_KEPT = 1 << 26
 """Size in bytes from which a run's earlier steps are thinned."""
 _CHUNK = 1 << 20
+_REFINEMENTS = frozenset({"resolution", "faces"})
+"""Fields of the records that are never removed."""
 
 
 # ---------------------------------------------------------------------- records
@@ -41,19 +43,21 @@ def steps_in(records: Sequence[Mapping[str, Any]]) -> int:
 def thinned(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Remove about every second record of the earlier three quarters.
 
-    Records remain if their step is a multiple of twice the current stride, or if they record a change of resolution. A history that is
-    thinned repeatedly stays evenly spaced, by powers of two.
+    Records remain if their step is a multiple of twice the current stride, or if they record a change of resolution or of a mesh. A
+    history that is thinned repeatedly stays evenly spaced, by powers of two.
     """
     early = len(records) - len(records) // 4
     if early < 2:
         return list(records)
     stride = 1
-    while all(record["step"] % (2 * stride) == 0 for record in records[: early // 2] if "resolution" not in record):
+    while all(
+        record["step"] % (2 * stride) == 0 for record in records[: early // 2] if _REFINEMENTS.isdisjoint(record)
+    ):
         stride *= 2
         if stride > records[-1]["step"]:
             return list(records)
-    thinned_records = [r for r in records[:early] if r["step"] % (2 * stride) == 0 or "resolution" in r]
-    return [*thinned_records, *records[early:]]
+    kept = [r for r in records[:early] if r["step"] % (2 * stride) == 0 or not _REFINEMENTS.isdisjoint(r)]
+    return [*kept, *records[early:]]
 
 
 # ---------------------------------------------------------------------- writing

@@ -66,7 +66,7 @@ HISTORY_COLUMNS = (*HISTORY_AXES, "loss", "gradient_noise")
 """Numeric columns.
 
 The last two are null if a step was not finite or they are unknown. A record also has "step", from 0, and may have "parameter_error",
-{key: see `Problem.parameter_error`}, and "resolution", {key: texels along each axis}.
+{key: see `Problem.parameter_error`}, "resolution", {key: texels along each axis}, and "faces", {key: number of triangles}.
 """
 
 _Count = Annotated[StrictInt, Field(ge=0, lt=2**63)]
