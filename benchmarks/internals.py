@@ -21,7 +21,6 @@ from unrender.core import arrays, trees
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
-from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import GradientRequest, leave_one_out_groups
 from unrender.gallery import parts, volumes
@@ -150,15 +149,8 @@ def element_scales(like: Tree, squares: np.ndarray) -> np.ndarray:
     """What adaptive pixels multiply the derivative of each element by, for mean squared gradients (n,) in the order of `like`."""
     from unrender.pixels.pixel_statistics import scales
 
-    tree = _split(like, squares)
+    tree = trees.parts(squares, like)
     return np.concatenate([np.ravel(x) for x in scales(tree, tree).values()])
-
-
-def _split(like: Tree, values: np.ndarray) -> dict[str, np.ndarray]:
-    shapes = trees.shapes(like)
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
-    parts = np.split(values, ends[:-1])
-    return {key: part.reshape(shape) for (key, shape), part in zip(shapes.items(), parts, strict=True)}
 
 
 def pixel_shares(problem: ur.Problem, sampler: Any, state: Any) -> np.ndarray:
@@ -189,7 +181,7 @@ def second_moments(
     each = 8
     rounds = max(1, round(paths / (problem.pixels * parts * each)))
     session = prepare(problem, at)
-    factors = [{name: problem.renderer.array(value) for name, value in _split(at, one).items()} for one in scales]
+    factors = [{name: problem.renderer.array(value) for name, value in trees.parts(one, at).items()} for one in scales]
     found = np.zeros((len(scales), parts, problem.pixels))
     for part in range(parts):
         first = 0
@@ -210,13 +202,9 @@ def second_moments(
     return found
 
 
-def gradient_of(
-    problem: ur.Problem, parameters: Tree, batch: Any, key: Key, spp: int = 2, emitters: np.ndarray | None = None
-) -> list[np.ndarray]:
-    """The gradient from a pixel mini-batch, None for whole views, in the coordinates of the descent; with probabilities of emitters, None
-    for the scene's own."""
-    request = None if emitters is None else EmitterRequest(emitters, {})
-    asked = GradientRequest(parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch, emitters=request)
+def gradient_of(problem: ur.Problem, parameters: Tree, batch: Any, key: Key, spp: int = 2) -> list[np.ndarray]:
+    """The gradient from a pixel mini-batch, in the coordinates of the descent."""
+    asked = GradientRequest(parameters, ur.images.Plain(), PlainState(), spp, key, batch=batch)
     found = LOCAL.estimate_gradient(problem, asked)
     coordinates = problem.coordinates
     moved = coordinates.pull_back(coordinates.wrt_u(found.gradient, parameters), {})

@@ -41,17 +41,6 @@ def geometric(problem: ur.Problem, steps: int, half_life: float) -> list[Tree]:
     return path
 
 
-def straight(problem: ur.Problem, steps: int) -> list[Tree]:
-    """From the initial values to the truth in equal steps."""
-    start, end = problem.initial(), truth(problem)
-    path = [
-        {key: x + (end[key] - x) * arrays.scalar(step / (steps - 1), x) for key, x in start.items()}
-        for step in range(steps)
-    ]
-    arrays.evaluate(path)
-    return path
-
-
 class _Recorder(ur.protocols.Callback):
     """Keeps the parameters of every step of a run."""
 

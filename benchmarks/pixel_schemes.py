@@ -38,7 +38,10 @@ def gradients(
     return np.array(rows), samples, first.info.get("pixel_probability", {})
 
 
-def spread(rows: np.ndarray) -> tuple[float, float]:
-    """The variance summed over parameters, and its standard error, from four parts."""
-    parts = [np.var(part, axis=0, ddof=1).sum() for part in np.array_split(rows, 4)]
-    return float(np.var(rows, axis=0, ddof=1).sum()), float(np.std(parts, ddof=1) / 2)
+def spread(rows: np.ndarray, weights: np.ndarray | float = 1.0, parts: int = 4) -> tuple[float, float]:
+    """The weighted sum of the variances of the elements, and its standard error from so many parts of the rows."""
+
+    def summed(part: np.ndarray) -> float:
+        return float((np.var(part, axis=0, ddof=1, dtype=np.float64) * weights).sum())
+
+    return summed(rows), float(np.std([summed(part) for part in np.array_split(rows, parts)], ddof=1) / np.sqrt(parts))

@@ -20,14 +20,13 @@ from benchmarks import figures, markdown
 from benchmarks.internals import dr, mi, scene_description
 from benchmarks.own_loop import loops
 from benchmarks.own_loop.loops import Clock, Task
-from benchmarks.races import median_and_range
+from benchmarks.races import TUNING_SEED, median_and_range
 from benchmarks.runner.records import Record
 
 QUICK = {
     "loss": ("l2",), "seconds": 0.5, "tuning_seconds": 0.2, "seeds": 1, "resolution": 16, "texture_resolution": 8,
     "reference_spp": 16, "spp": (4,), "rates": (0.02,),
 }  # fmt: skip
-TUNING_SEED = 1000
 KEY = "back.bsdf.reflectance.data"
 
 

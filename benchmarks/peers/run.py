@@ -27,14 +27,13 @@ import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import mi
 from benchmarks.peers import scenes
-from benchmarks.races import search, total_error
+from benchmarks.races import TUNING_SEED, first_at, search
 from benchmarks.runner.records import Record, scratch
-from benchmarks.suite.run import visible
+from benchmarks.suite.run import errors_of
 from benchmarks.timed_runs import Kept, blind
 
 _POINTS = 20
 _PICTURE_SPP = 256
-TUNING_SEED = 1000
 MERGE = ("problems",)
 QUICK = {"problem": ("plane",), "seconds": 4.0, "seeds": 1, "resolution": 16, "reference_spp": 64}
 NOTHING_GIVEN = (
@@ -75,28 +74,22 @@ class Judge:
 
     def __init__(self, case: scenes.Case):
         self.case, self._truth = case, case.problem.truth
-        self._seen = visible(case.problem)
+        self._errors = errors_of(case.problem)
         with np.load(case.folder / "others.npz") as found:
             self._pictures = [found[f"arr_{n}"] for n in range(len(found.files))]
         self._scene = mi.load_file(str(case.folder / "others.xml"))
         self._parameters = mi.traverse(self._scene)
         self._path = mi.load_dict({"type": "path", "max_depth": scenes.DEPTH})
         begin = {key: np.full(truth.shape, 0.5, np.float32) for key, truth in self._truth.items()}
-        self._start, self._begin = self._rmse(begin), self._others(begin)
-
-    def _rmse(self, values: dict[str, np.ndarray]) -> dict[str, float]:
-        return {
-            key: float(np.sqrt(np.mean((values[key].reshape(truth.shape) - truth)[self._seen[key]] ** 2)))
-            for key, truth in self._truth.items()
-        }
-
-    def textures(self, values: dict[str, np.ndarray]) -> float:
-        """The mean over textures of the error where seen."""
-        return total_error(self._rmse(values), self._start)
+        self._begin = self._others(begin)
 
     def each(self, values: dict[str, np.ndarray]) -> dict[str, float]:
-        """Of each texture, by its channel."""
-        return {key.split(".")[-2]: error / self._start[key] for key, error in self._rmse(values).items()}
+        """The error of each texture where seen, by its channel."""
+        return {key.split(".")[-2]: error for key, error in self._errors(values).items()}
+
+    def textures(self, values: dict[str, np.ndarray]) -> float:
+        """The mean over textures."""
+        return float(np.mean(list(self.each(values).values())))
 
     def pictures(self, values: dict[str, np.ndarray]) -> float:
         """Of held-out pictures."""
@@ -287,8 +280,7 @@ _RATES = ("base_learning_rate", "learning_rate")
 
 def _reached(runs: Sequence[Record], error: float) -> str:
     """The median over runs of the seconds after which the error is first at most so much."""
-    firsts = [next((seconds for seconds, found in run["curve"] if found <= error), np.inf) for run in runs]
-    found = float(np.median(firsts))
+    found = float(np.median([first_at(list(zip(*run["curve"], strict=True)), error) for run in runs]))
     return f"{found:.1f} s" if np.isfinite(found) else "never"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import mi
-from benchmarks.suite.scenes import photograph
+from benchmarks.suite.scenes import photograph, references
 
 DEPTH = 5
 MATERIAL = "mat-object"
@@ -119,23 +119,6 @@ def _material(folder: Path, unknown: tuple[str, ...], mipmaps: bool) -> str:
     return "".join(channel(name, constant) for name, constant in _CHANNELS.items())
 
 
-def _references(file: Path, kept: Path, spp: int) -> list[np.ndarray]:
-    """Of every sensor of a scene, by Mitsuba's `path`; kept in a file."""
-    if not kept.exists():
-        scene, path = mi.load_file(str(file)), mi.load_dict({"type": "path", "max_depth": DEPTH})
-        parts = max(1, spp // 256)
-        images = [
-            np.mean(
-                [np.array(mi.render(scene, sensor=n, integrator=path, spp=spp // parts, seed=k)) for k in range(parts)],
-                0,
-            )
-            for n in range(len(scene.sensors()))
-        ]
-        np.savez(kept, *(image.astype(np.float32) for image in images))
-    with np.load(kept) as found:
-        return [found[f"arr_{n}"] for n in range(len(found.files))]
-
-
 def case(
     name: str, folder: Path, assets: Path | None, svbrdf: Path | None, resolution: int, texture: int, spp: int
 ) -> Case:
@@ -148,14 +131,14 @@ def case(
             f'{cameras.xml(resolution)}<emitter type="envmap"><string name="filename" value="{environment}"/></emitter>'
             f'<shape type="obj" id="mesh-object"><string name="filename" value="{shape}"/><ref id="{MATERIAL}"/></shape></scene>'
         )
-    references = _references(folder / "scene.xml", folder / "references.npz", spp)
-    _references(folder / "others.xml", folder / "others.npz", spp)
+    pictures = references(folder / "scene.xml", folder / "references.npz", spp, DEPTH)
+    references(folder / "others.xml", folder / "others.npz", spp, DEPTH)
     keys = tuple(f"{MATERIAL}.{channel}.data" for channel in UNKNOWN[name])
     truth = mi.traverse(mi.load_file(str(folder / "scene.xml")))
     problem = ur.Problem(
         folder / "scene.xml",
         [ur.Parameter(key, initial=0.5) for key in keys],
-        [ur.View(reference, sensor=n) for n, reference in enumerate(references)],
+        [ur.View(reference, sensor=n) for n, reference in enumerate(pictures)],
         max_depth=DEPTH,
         truth={key: np.array(truth[key], np.float32) for key in keys},
         name=name,

@@ -46,15 +46,9 @@ LAST_RATE = 1 / 20
 """Of the stock loop's falling rates, as a share of the first."""
 MERGE = ("races.*.found", "maps")
 QUICK = {
-    "seconds": 0.2,
-    "resolution": 16,
-    "texture": 16,
-    "faces": 300,
+    "seconds": 0.2, "resolution": 16, "texture": 16, "faces": 300, "spp": (2,), "rates": (0.02,), "final_spp": 2,
     "entrant": ("start", "projection", "stages", "auto", "stock", "stock-normals"),
-    "spp": (2,),
-    "rates": (0.02,),
-    "final_spp": 2,
-}
+}  # fmt: skip
 
 
 class Judge:

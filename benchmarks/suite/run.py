@@ -26,7 +26,7 @@ import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.fixed_point import applies, fixed_point
 from benchmarks.internals import dr, hardly_seen
-from benchmarks.races import Recorder, total_error
+from benchmarks.races import TUNING_SEED, Recorder
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
 from benchmarks.stock_loop import stock_loop
@@ -37,17 +37,10 @@ GALLERY = (
     "plain-and-textured", "two-planets", "caustic", "poster", "three-bodies", "tea", "smoke", "wall",
 )  # fmt: skip
 FOREIGN = tuple(f"{scene}, {loss}" for scene in scenes.SCENES for loss in scenes.LOSSES)
-TUNING_SEED = 1000
 QUICK = {
-    "problem": ("mirror-trio",),
-    "seconds": 0.4,
-    "seeds": 1,
-    "option": ("spp=2",),
-    "spp": (4,),
-    "rates": (0.02,),
-    "gallery_reference_spp": 1,
-    "every": 1,
-}
+    "problem": ("mirror-trio",), "seconds": 0.4, "seeds": 1, "option": ("spp=2",), "spp": (4,), "rates": (0.02,),
+    "gallery_reference_spp": 1, "every": 1,
+}  # fmt: skip
 MERGE = ("problems.*",)
 FIXED_POINT_SPP = 16
 Points = list[tuple[float, float]]
@@ -62,8 +55,8 @@ def visible(problem: ur.Problem) -> dict[str, np.ndarray]:
     return found
 
 
-def error_of(problem: ur.Problem) -> Callable[[dict[str, Any]], float]:
-    """The error of given parameters where they are seen: each one's RMSE over its RMSE at the start, averaged."""
+def errors_of(problem: ur.Problem) -> Callable[[dict[str, Any]], dict[str, float]]:
+    """The errors of given parameters where they are seen: each one's RMSE over its RMSE at the start."""
     seen = visible(problem)
 
     def errors(values: dict[str, Any]) -> dict[str, float]:
@@ -74,7 +67,13 @@ def error_of(problem: ur.Problem) -> Callable[[dict[str, Any]], float]:
         }
 
     start = errors(problem.initial())
-    return lambda values: total_error(errors(values), start)
+    return lambda values: {key: error / start[key] for key, error in errors(values).items()}
+
+
+def error_of(problem: ur.Problem) -> Callable[[dict[str, Any]], float]:
+    """The mean of `errors_of`."""
+    errors = errors_of(problem)
+    return lambda values: float(np.mean(list(errors(values).values())))
 
 
 def ours(

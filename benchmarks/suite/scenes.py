@@ -221,36 +221,35 @@ LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 DEPTH = 6
 
 
+def references(file: Path, kept: Path, spp: int, depth: int) -> list[np.ndarray]:
+    """Pictures of every sensor of a scene, rendered by Mitsuba in parts of at most 256 samples per pixel, and kept in a file."""
+    if not kept.exists():
+        integrator = "volpath" if "<medium" in file.read_text() else "path"
+        scene, path = mi.load_file(str(file)), mi.load_dict({"type": integrator, "max_depth": depth})
+        parts = max(1, spp // 256)
+
+        def picture(sensor: int, part: int) -> np.ndarray:
+            return np.array(mi.render(scene, sensor=sensor, integrator=path, spp=spp // parts, seed=part))
+
+        sensors = range(len(scene.sensors()))
+        np.savez(kept, *(np.mean([picture(sensor, part) for part in range(parts)], 0) for sensor in sensors))
+    with np.load(kept) as found:
+        return [found[f"arr_{sensor}"].astype(np.float32) for sensor in range(len(found.files))]
+
+
 def problem(name: str, assets: Path, resolution: int, texture: int, spp: int) -> ur.Problem:
     """The problem of a name such as "cbox, L2"; references of `spp` samples per pixel are rendered by Mitsuba and kept."""
     scene, loss = name.split(", ")
     folder = scratch(f"suite/{scene}-{resolution}-{texture}")
     folder.mkdir(parents=True, exist_ok=True)
     unknown, views = SCENES[scene](assets.resolve(), folder, resolution, texture)
-    kept = folder / f"references-{spp}.npz"
-    if not kept.exists():
-        integrator = "volpath" if "<medium" in (folder / "scene.xml").read_text() else "path"
-        loaded, path = mi.load_file(str(folder / "scene.xml")), mi.load_dict({"type": integrator, "max_depth": DEPTH})
-        parts = max(1, spp // 256)
-        images = [
-            np.mean(
-                [
-                    np.array(mi.render(loaded, sensor=view, integrator=path, spp=spp // parts, seed=n))
-                    for n in range(parts)
-                ],
-                0,
-            )
-            for view in range(views)
-        ]
-        np.savez(kept, *images)
-    with np.load(kept) as found:
-        references = [found[f"arr_{view}"].astype(np.float32) for view in range(views)]
+    pictures = references(folder / "scene.xml", folder / f"references-{spp}.npz", spp, DEPTH)
     if isinstance(unknown, str):
         unknown = {unknown: (0.5, np.array(mi.Bitmap(str(folder / "truth.exr")))[..., :3])}
     return ur.Problem(
         folder / "scene.xml",
         [ur.Parameter(key, initial=initial) for key, (initial, _) in unknown.items()],
-        [ur.View(reference, sensor=view) for view, reference in enumerate(references)],
+        [ur.View(reference, sensor=view) for view, reference in enumerate(pictures[:views])],
         loss=LOSSES[loss],
         max_depth=DEPTH,
         truth={key: np.array(truth, np.float32) for key, (_, truth) in unknown.items()},

@@ -37,17 +37,6 @@ MERGE = ("methods",)
 QUICK = {"resolution": 16, "grid": 16, "views": 4, "every": 2, "after": 2, "count": 64, "seeds": 1, "reference_spp": 4}
 
 
-class Falling:
-    """1 until a step, from there half a cosine down to a twentieth."""
-
-    def __init__(self, start: int, end: int):
-        self.start, self.end = start, end
-
-    def __call__(self, step: float) -> float:
-        share = min(max((step - self.start) / max(self.end - self.start, 1), 0.0), 1.0)
-        return 0.05 + 0.95 * (1 + float(np.cos(np.pi * share))) / 2
-
-
 def resolutions(grid: int, every: int) -> tuple[int, ...]:
     """The steps at which a grid of 8³ doubles until it is `grid`³."""
     return tuple(every * number for number in range(1, (grid // COARSEST).bit_length()))
@@ -95,7 +84,8 @@ def run(
         if result.warnings:
             raise RuntimeError(f"{name}, seed {seed}: {result.warnings}")
 
-    adam = scaled(ur.optimizers.Adam, Falling(changes[-1], steps))
+    fall = ur.schedules.Cosine(after, 0.05)
+    adam = scaled(ur.optimizers.Adam, lambda step: fall(max(step - changes[-1], 0.0)))
     conditions = {**options, "changes": changes, "steps": steps, "count": count, "seeds": seeds}
     for name in only:
         scheme, coarse = WAYS[name]

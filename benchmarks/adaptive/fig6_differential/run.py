@@ -22,7 +22,7 @@ from benchmarks import figures, markdown
 from benchmarks.adaptive.over_uniform.run import rough_box
 from benchmarks.internals import Key, SampleRequest, Tree, with_differential_bsdf
 from benchmarks.paths import descent
-from benchmarks.pixel_schemes import pixels
+from benchmarks.pixel_schemes import pixels, spread
 from benchmarks.runner.records import Record
 from unrender.gallery import parts
 
@@ -106,7 +106,7 @@ def compared(contenders: dict[str, Callable[[Any], float]], runs: int) -> dict[s
             rows[kind].append(contenders[kind](Key(number, run)))
             times[kind].append(time.process_time() - began)
     one, other = (np.array(rows[kind][WARM:]) for kind in KINDS)
-    (a, error_a), (b, error_b) = (_variance(values) for values in (one, other))
+    (a, error_a), (b, error_b) = (spread(values[:, None], parts=8) for values in (one, other))
     return {
         "ratio": b / a,
         "error": b / a * float(np.hypot(error_a / a, error_b / b)),
@@ -115,12 +115,6 @@ def compared(contenders: dict[str, Callable[[Any], float]], runs: int) -> dict[s
         "deviation": [float(np.sqrt(a)), float(np.sqrt(b))],
         "z": float((one.mean() - other.mean()) / np.sqrt((a + b) / runs)),
     }
-
-
-def _variance(values: np.ndarray) -> tuple[float, float]:
-    """With its standard error, from eight parts."""
-    parts_of = [np.var(part, ddof=1) for part in np.array_split(values, 8)]
-    return float(np.var(values, ddof=1)), float(np.std(parts_of, ddof=1) / np.sqrt(8))
 
 
 def descents(

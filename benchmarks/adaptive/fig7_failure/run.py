@@ -23,14 +23,9 @@ FEW, COUNT = 4, 512
 QUICK = {"problem": ("caustic",), "resolution": 16, "many": 8, "repeats": 2, "runs": 8}
 
 
-def pixel_count(problem: ur.Problem) -> int:
-    """Of all views."""
-    return sum(int(np.prod(np.asarray(view.reference).shape[:2])) for view in problem.views)
-
-
 def probabilities(problem: ur.Problem, spp: int, seed: int) -> np.ndarray:
     """Raw probabilities over uniform ones, one per pixel of view 0."""
-    paths = spp * pixel_count(problem)
+    paths = spp * problem.pixels
     return pixel_probability(
         problem,
         ur.pixels.Adaptive(256, samples=paths, denoiser="none", uniform=0.01, learn_from_draws=False, by_cost=False),
@@ -45,7 +40,7 @@ def variances(problem: ur.Problem, many: int, repeats: int, runs: int) -> dict[s
         return spread(gradients(problem, ur.PathGradient(pixels=sampler, spp=1), runs, seed)[0])[0]
 
     def adaptive(spp: int, denoiser: Any) -> PixelSampler:
-        paths = spp * pixel_count(problem)
+        paths = spp * problem.pixels
         fixed: Any = {"uniform": 0.1, "learn_from_draws": False, "by_cost": False, "relative": False}
         return ur.pixels.Adaptive(COUNT, samples=paths, refresh=10 * runs, denoiser=denoiser, **fixed)
 

@@ -23,23 +23,15 @@ import numpy as np
 import unrender as ur
 from benchmarks import markdown
 from benchmarks.internals import Key, PixelSampler, Tree, element_scales, gradient_of, mi, pixel_shares, second_moments
+from benchmarks.pixel_schemes import spread
 from benchmarks.runner.records import Record
 from benchmarks.suite.scenes import problem as foreign_problem
 
+_LARGE = ("caustic", "mirror-trio", "sun-glossy", "plain-and-textured", "two-planets", "smoke", "nerf-volume")
+_SMALL = ("indirect-room", "ajar", "spiral", "sunlit-vase", "chalice")
 GALLERY: dict[str, dict[str, Any]] = {
-    "rough-box": {},
-    "caustic": {},
-    "mirror-trio": {},
-    "sun-glossy": {},
-    "plain-and-textured": {},
-    "two-planets": {},
-    "indirect-room": {"resolution": 64},
-    "ajar": {"resolution": 64},
-    "spiral": {"resolution": 64},
-    "sunlit-vase": {"resolution": 64},
-    "chalice": {"resolution": 64},
-    "smoke": {},
-    "nerf-volume": {},
+    **{name: {} for name in ("rough-box", *_LARGE)},
+    **{name: {"resolution": 64} for name in _SMALL},
 }
 """Problems and their options."""
 FOREIGN = ("plates, L2", "painting, L2", "tray, L2", "numbers, L2")
@@ -54,13 +46,8 @@ PARTS = 8
 BOX = "large-box.bsdf.alpha.value"
 MERGE = ("problems.*",)
 QUICK = {
-    "problem": ("mirror-trio",),
-    "sampler": ("adaptive",),
-    "count": 64,
-    "runs": 16,
-    "paths": 1,
-    "gallery_reference_spp": 4,
-}
+    "problem": ("mirror-trio",), "sampler": ("adaptive",), "count": 64, "runs": 16, "paths": 1, "gallery_reference_spp": 4,
+}  # fmt: skip
 
 
 def rough_box(reference_spp: int = 2048, resolution: int = 64) -> ur.Problem:
@@ -113,17 +100,6 @@ def rows(problem: ur.Problem, sampler: PixelSampler, at: Tree, state: Any, runs:
     return np.array(found, np.float32)
 
 
-def spread(gradients: np.ndarray, weights: np.ndarray) -> tuple[float, float]:
-    """The weighted sum of the variances, and its relative standard error."""
-
-    def summed(part: np.ndarray) -> float:
-        return float(np.var(part, axis=0, ddof=1, dtype=np.float64) @ weights)
-
-    parts = np.array([summed(part) for part in np.array_split(gradients, PARTS)])
-    mean = summed(gradients)
-    return mean, float(parts.std(ddof=1) / np.sqrt(PARTS) / max(mean, 1e-300))
-
-
 def by_paths(moments: np.ndarray, shares: np.ndarray) -> tuple[float, float]:
     """Σ_j s_j / p_j over Σ_j s_j, for second moments s (parts, pixels) and probabilities p relative to uniform ones; with its error."""
     parts = len(moments)
@@ -157,8 +133,8 @@ def point(
         found["ratio"].append(ratio)
         found["error"].append(error)
         if direct:
-            (a, error_a), (u, error_u) = spread(ours, np.square(factors)), spread(theirs, np.square(factors))
-            found["gradients"].append([a / u, a / u * float(np.hypot(error_a, error_u))])
+            (a, error_a), (u, error_u) = (spread(each, np.square(factors), PARTS) for each in (ours, theirs))
+            found["gradients"].append([a / u, a / u * float(np.hypot(error_a / a, error_u / u))])
     return found
 
 

@@ -54,7 +54,7 @@ class Settings:
         return float(self.sigma + share * (self.last_sigma - self.sigma))
 
 
-_TWENTY_DEGREES, _PIXEL = float(np.radians(20.0)), 2.0 / 500.0
+_TWENTY_DEGREES = float(np.radians(20.0))
 SETTINGS: dict[str, dict[str, Settings]] = {
     "MUG": {
         "FR22, published": Settings(3.0, 0.01, 300, 50, 100, rate=0.1, unit=_TWENTY_DEGREES),
@@ -68,12 +68,8 @@ SETTINGS: dict[str, dict[str, Settings]] = {
         "FR22, published": Settings(0.004, 0.004, 200, rate=0.02, pairs=2),
         "OurHVPA, published": Settings(0.06, 0.005, 100, 20, 20, trust=2.0, pairs=2),
     },
-    "BOX10": {
-        "FR22, published": Settings(50.0, 0.1, 7000, 2000, 500, rate=0.05, pairs=6, unit=_PIXEL),
-        "OurHVPA, published": Settings(50.0, 0.1, 400, 0, 50, trust=10.0, pairs=6, unit=_PIXEL),
-    },
 }
-"""Of the public code, by task. BOX10's number of steps of OurHVPA, and what stays constant there, are ours: they are not published."""
+"""Of the public code, by task."""
 
 
 def descend(name: str, method: str, problem: ur.Problem, seed: int) -> Descent:

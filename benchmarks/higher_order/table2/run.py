@@ -156,7 +156,7 @@ GOALS = "image 90 % | 99 % | 99.9 % | parameters 90 % | 99 % | 99.9 %"
 
 
 def table(record: Record) -> str:
-    """Seconds to each reduction of the error, and FR22's and CMA-ES's against the better of `OURS`."""
+    """Seconds to each reduction of the error, and ratios of times by our goals and by the paper's."""
     entries = list(markdown.named(record["tasks"], "task", "methods", "method"))
     rows = []
     for entry in entries:
@@ -171,9 +171,6 @@ def table(record: Record) -> str:
         markdown.table(f"task | method | {GOALS} | runs that got there", rows),
         "Made by\n\n" + "\n".join(f"- `{command}`" for command in commands),
     ]
-    for rival in ("FR22", "CMA-ES"):
-        text = "'s time over the better of OurHVPA and OurJoint, per goal (>: its budget over theirs where it never got there):"
-        parts += [rival + text, _gains(record["tasks"], rival)]
     text = (
         "Times over those of one method alone, OurHVPA, the paper's, and OurJoint: means over the goals that both reached, with standard "
         "errors by a bootstrap over runs."
@@ -260,32 +257,6 @@ def _spread(methods: dict[str, Any], rival: str, method: str, resamples: int = 1
         if both.any():
             found.append(float(np.mean(theirs[both] / ours[both])))
     return float(np.std(found))
-
-
-def _gains(tasks: dict[str, Any], rival: str) -> str:
-    """A row of ratios per task, their mean, and the mean of all."""
-    rows, everything = [], []
-    for name, task in tasks.items():
-        if rival not in task["methods"]:
-            continue
-        mine = [entry for method, entry in task["methods"].items() if method in OURS]
-        ours, longest = ([entry["summary"] for entry in mine], max(entry["seconds"] for entry in mine))
-        theirs, known, cells = task["methods"][rival], [], []
-        for which, goal in itertools.product(("image", "parameter"), range(3)):
-            times = [summary[which][goal] for summary in ours if summary[which][goal] is not None]
-            time = theirs["summary"][which][goal]
-            if not times and time is None:
-                cells.append("—")
-                continue
-            ratio = (time or theirs["seconds"]) / min([*times, longest])
-            known.append(ratio)
-            cells.append(f"{'> ' * (time is None)}{'< ' * (not times)}{ratio:.2f}")
-        everything += known
-        rows.append([name, *cells, f"{sum(known) / len(known):.2f}" if known else "—"])
-    mean = (
-        f"Mean of all {len(everything)}, bounds counted as they are: {sum(everything) / max(len(everything), 1):.2f}."
-    )
-    return markdown.table(f"task | {GOALS} | mean", rows) + f"\n\n{mean}"
 
 
 def plot(record: Record) -> figures.Figure:

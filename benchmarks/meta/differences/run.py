@@ -33,10 +33,6 @@ QUICK = {"problem": ("chalice",), "resolution": 8, "runs": 3, "spp": 2, "noise_r
 def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:
     """Summed over elements, per space: of the gradient, and of its difference for each step length; and the slope."""
     start, end = problem.initial(), truth(problem)
-
-    def flat(tree: Any) -> np.ndarray:
-        return np.concatenate([arrays.numpy(x).ravel() for x in tree.values()])
-
     found: dict[str, Any] = {"steps": STEPS}
     for space in ("path", "primary"):
         rows: list[float] = []
@@ -45,8 +41,8 @@ def variances(problem: ur.Problem, spp: int, runs: int) -> dict[str, Any]:
             previous = {k: x + (end[k] - x) * arrays.scalar(share, x) for k, x in start.items()}
             arrays.evaluate(previous)
             pairs = [coupled_gradients(problem, start, previous, space, spp, Key(1, n)) for n in range(runs)]
-            gradient = float(np.stack([flat(F) for F, _ in pairs]).var(0, ddof=1).sum())
-            rows.append(float(np.stack([flat(trees.subtract(F, H)) for F, H in pairs]).var(0, ddof=1).sum()))
+            gradient = float(np.stack([trees.ravel(F) for F, _ in pairs]).var(0, ddof=1).sum())
+            rows.append(float(np.stack([trees.ravel(trees.subtract(F, H)) for F, H in pairs]).var(0, ddof=1).sum()))
         slope = float(np.polyfit(np.log(STEPS), np.log(rows), 1)[0])
         found[space] = {"gradient": gradient, "difference": rows, "slope": slope}
         print(problem.name, space, f"slope {slope:.3f}", [f"{r / gradient:.2g}" for r in rows], flush=True)
@@ -64,8 +60,8 @@ def noise(problem: ur.Problem, runs: int) -> list[float]:
         for seed in range(runs):
             state = estimator.init(problem, parameters)
             gradient = estimator.estimate(problem, parameters, state, Key(2, seed))[0].gradient
-            rows.append(np.concatenate([arrays.numpy(x).ravel() for x in gradient.values()]))
-        found.append(float(np.stack(rows).astype(np.float64).var(0, ddof=1).sum()))
+            rows.append(trees.ravel(gradient))
+        found.append(float(np.stack(rows).var(0, ddof=1).sum()))
     print(
         problem.name,
         "Var F of equal paths",

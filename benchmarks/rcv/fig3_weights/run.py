@@ -1,18 +1,8 @@
 """Steady state of the control weights (RCV Fig. 3): weights and variance on a scene that does not change.
 
-On an unchanging `indirect-room` the best weight is n/(n+1) and the variance 1/(n+1) of one render's. Five rules weigh
-the same renders (`benchmarks/weight_rules.py`):
-
-- analytic: n/(n+1);
-- online: Eq. 8 with Var[F_CV] from running statistics of F_CV itself, as if consecutive images were independent;
-- absolute: Eq. 8 with the recurrence (10) in absolute units, which keeps early, bad estimates of Var[F];
-- relative: with the recurrence kept relative to Var[F];
-- greater: with the greater of both where anything has moved, and the weight of an average while the statistics know no variance, where the
-  others have the paper's 0: `unrender.images.RecursiveControlVariate` itself.
-
-All but the analytic rule estimate variances from earlier renders, from step 1 on, so that the first weight from
-statistics is that of step 3. With weight 0 until then, the best that they can reach is 1/(n-1), a dotted line in the
-figure. The variance is that over independent runs, per pixel, summed, divided by that of one render. The bias is the
+On an unchanging `indirect-room` the best weight is n/(n+1) and the variance 1/(n+1) of one render's. Five of the rules of
+`benchmarks/weight_rules.py` weigh the same renders. With weight 0 until the statistics have a variance, the best that they
+can reach is 1/(n-1). The variance is that over independent runs, per pixel, summed, divided by that of one render. The bias is the
 mean over runs less that of the analytic rule on the same renders (which is unbiased), relative to the mean of the image.
 """
 

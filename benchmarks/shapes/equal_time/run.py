@@ -10,6 +10,7 @@ from their references, relative to the start. Time is the processor's, of all th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
-from benchmarks.races import TUNING_SEED, search
+from benchmarks.races import TUNING_SEED, first_at, search
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import backward
@@ -119,11 +120,6 @@ def ours(problem: ur.Problem, seconds: float, seed: int) -> dict[str, Any]:
     return measured(problem, kept.found)
 
 
-def time_to(curve: Sequence[Sequence[float]], level: float) -> float | None:
-    """Seconds at which an error first is at most `level`; None where it never is."""
-    return next((seconds for seconds, error in zip(*curve, strict=True) if error <= level), None)
-
-
 def tuned(
     problem: ur.Problem, kind: str, seconds: float, rates: Sequence[float], others: Mapping[str, Sequence[float]]
 ) -> Setting:
@@ -168,7 +164,8 @@ def race(
             loop = StockShapes(problem, settings[kind])
             found[kind]["runs"].append(measured(problem, loop.run(seconds, seed)))
     best_final = min(float(np.median([run["surface"] for run in found[kind]["runs"]])) for kind in STOCK)
-    found["seconds to the stock loops' best"] = [time_to(run["curve"], best_final) for run in found["auto"]["runs"]]
+    reached = (first_at(run["curve"], best_final) for run in found["auto"]["runs"])
+    found["seconds to the stock loops' best"] = [at if math.isfinite(at) else None for at in reached]
     return found
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.internals import dr, mi
+from benchmarks.internals import dr, mi, parts
 from benchmarks.runner.records import Record
 
 MERGE = ("cases.*",)
@@ -40,7 +40,7 @@ def light(name: str) -> dict[str, Any]:
             return {"type": "projector", "to_world": down, "irradiance": _bitmap(picture), "fov": 35.0, "scale": 9.0}
         case "area":
             place = mi.ScalarTransform4f().translate([0.4, 2.2, 0.3]).rotate([1, 0, 0], 90).scale(0.3)
-            return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": _rgb(12.0)}}
+            return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": parts.colour(12.0)}}
     return {"type": "envmap", "bitmap": picture}
 
 
@@ -48,29 +48,15 @@ def _bitmap(picture: Any) -> dict[str, Any]:
     return {"type": "bitmap", "bitmap": picture, "raw": True}
 
 
-def _rgb(value: float) -> dict[str, Any]:
-    return {"type": "rgb", "value": [value] * 3}
-
-
 def scene(name: str, views: int, resolution: int) -> dict[str, Any]:
     """The true scene."""
-    film = {"type": "hdrfilm", "width": resolution, "height": resolution, "rfilter": {"type": "box"}}
     places = ([0, 2.5, 4], [3.5, 2.5, 2], [-3.5, 2.5, 2])[:views]
-    cameras = {
-        f"camera_{n}": {
-            "type": "perspective",
-            "fov": 45,
-            "to_world": mi.ScalarTransform4f().look_at(place, [0, 0.2, 0], [0, 1, 0]),
-            "film": film,
-        }
-        for n, place in enumerate(places)
-    }
     box = mi.ScalarTransform4f().translate([-0.3, 0.35, 0.0]).rotate([0, 1, 0], 30).scale(0.35)
     return {
         "type": "scene",
-        **cameras,
+        **{f"camera_{n}": parts.camera(place, (0, 0.2, 0), 45, resolution) for n, place in enumerate(places)},
         "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(2)},
-        "box": {"type": "cube", "to_world": box, "bsdf": {"type": "diffuse", "reflectance": _rgb(0.7)}},
+        "box": {"type": "cube", "to_world": box, "bsdf": {"type": "diffuse", "reflectance": parts.colour(0.7)}},
         "lamp": light(name),
     }
 

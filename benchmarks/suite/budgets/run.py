@@ -21,13 +21,8 @@ from benchmarks.suite.run import FOREIGN, GALLERY, compare, error_of, loop, midd
 PROBLEMS = ("wall", "smoke")
 MERGE = ("entries.*",)
 QUICK = {
-    "problem": ("mirror-trio",),
-    "seconds": (0.4,),
-    "seeds": 1,
-    "settings": 1,
-    "gallery_reference_spp": 1,
-    "every": 1,
-}
+    "problem": ("mirror-trio",), "seconds": (0.4,), "seeds": 1, "settings": 1, "gallery_reference_spp": 1, "every": 1
+}  # fmt: skip
 
 
 def best_settings(name: str, count: int) -> list[dict[str, Any]]:

@@ -19,44 +19,14 @@ DENSEST = 6.0
 
 
 @dataclass(frozen=True)
-class Volume:
-    """The specification of a problem whose unknowns, cameras and sizes are those of `smoke`.
+class Volume(Smoke):
+    """The specification of `smoke` with another scene, which `change` makes from the smoke's and the size of its grids."""
 
-    Attributes:
-        smoke: these.
-        change: makes its scene another's; the size of grids is given.
-    """
-
-    smoke: Smoke
-    change: Callable[[dict[str, Any], int], dict[str, Any]]
-
-    @property
-    def resolution(self) -> int:
-        """Of the films."""
-        return self.smoke.resolution
-
-    @property
-    def reference_spp(self) -> int:
-        """Of the references."""
-        return self.smoke.reference_spp
-
-    @property
-    def max_depth(self) -> int:
-        """Of paths."""
-        return self.smoke.max_depth
-
-    @property
-    def loss(self) -> Any:
-        """L1."""
-        return self.smoke.loss
+    change: Callable[[dict[str, Any], int], dict[str, Any]] = lambda scene, grid: scene
 
     def scene(self) -> dict[str, Any]:
         """A new one at each call."""
-        return self.change(self.smoke.scene(), self.smoke.grid_resolution)
-
-    def parameters(self) -> tuple[ur.Parameter, ...]:
-        """Extinction and albedo."""
-        return self.smoke.parameters()
+        return self.change(super().scene(), self.grid_resolution)
 
 
 def lit_inside(scene: dict[str, Any], grid: int) -> dict[str, Any]:
@@ -89,13 +59,13 @@ def from_file(file: Path) -> Callable[[dict[str, Any], int], dict[str, Any]]:
 
 def problem(name: str, resolution: int, grid: int, reference_spp: int, assets: Path) -> ur.Problem | None:
     """The problem of "smoke", "lit inside" or "tutorial"; None where the file of the last is not below `assets`."""
-    smoke = Smoke(resolution=resolution, grid_resolution=grid, reference_spp=reference_spp)
+    sizes: dict[str, Any] = {"resolution": resolution, "grid_resolution": grid, "reference_spp": reference_spp}
     if name == "smoke":
-        return ur.gallery.problem("smoke", resolution=resolution, grid_resolution=grid, reference_spp=reference_spp)
+        return ur.gallery.problem("smoke", **sizes)
     if name == "lit inside":
-        return build_problem(name, Volume(smoke, lit_inside))
+        return build_problem(name, Volume(**sizes, change=lit_inside))
     file = assets / FILE
-    return build_problem(name, Volume(smoke, from_file(file))) if file.is_file() else None
+    return build_problem(name, Volume(**sizes, change=from_file(file))) if file.is_file() else None
 
 
 def smoothed(made: ur.Problem) -> ur.Problem:

@@ -93,8 +93,7 @@ def table(record: Record) -> str:
 
 
 def _median(runs: list[list[float]]) -> str:
-    last = sorted(sum(run[-(len(run) // 5) :]) / (len(run) // 5) for run in runs)
-    return markdown.median_range((last[len(last) // 2], last[0], last[-1]))
+    return markdown.spread([float(np.mean(run[-(len(run) // 5) :])) for run in runs])
 
 
 def plot(record: Record) -> figures.Figure:

@@ -38,11 +38,10 @@ def sample(
     runs: int,
     reference: np.ndarray,
     slope_spp: int,
-    common: bool = False,
 ) -> Values:
     """Loss and derivative of every run at every factor. The derivative is the mean of loss' (noisy image) · dI/dfactor.
 
-    With `common` random numbers a run has the same ones at every factor, and what the factor does not change has the same noise.
+    A run has the same random numbers at every factor, so that what the factor does not change has the same noise.
     """
     found: Values = {name: {str(spp): np.zeros((len(factors), runs, 2)) for spp in SPP} for name in LOSSES}
     for index, factor in enumerate(factors):
@@ -50,7 +49,7 @@ def sample(
         session = prepare(problem, parameters)
         for spp in SPP:
             for run in range(runs):
-                request = SampleRequest(problem.views[0].sensor, spp, Key(run, 0 if common else index, spp).uint32())
+                request = SampleRequest(problem.views[0].sensor, spp, Key(run, 0, spp).uint32())
                 image = arrays.numpy(session.image(parameters, request).images[0]).astype(np.float64)
                 for name, loss in LOSSES.items():
                     value, derivative = loss.value(image, reference), loss.derivative(image, reference) * slope

@@ -61,7 +61,7 @@ def run(resolution: int = 32, runs: int = 96, factors: int = 11, reference_spp: 
 
     points = np.linspace(0.5, 1.5, factors).tolist()
     reference = converged(problem, at(1.0), reference_spp).mean
-    values = sample(problem, at, points, runs, reference, reference_spp // 8, common=True)
+    values = sample(problem, at, points, runs, reference, reference_spp // 8)
     return {
         "factors": points,
         "table": statistics(values),

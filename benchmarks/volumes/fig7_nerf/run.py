@@ -3,7 +3,7 @@
 Adam on plain gradients at 2, 4 and 8 samples per pixel, against meta-estimation with MetaAdam in the paper's form (1
 difference, 2 proportional samples), in the coupled one, and in that on a control variate's images; two of them with more
 samples as well. Each is tuned on a seed of its own for the whole budget: the emission's learning rate, extinction's
-being 20 times that; constant, or falling along half a cosine over the steps that fit into the budget.
+being 20 times that, falling along half a cosine over the steps that fit into the budget.
 
 The field has no truth, so errors are of images: root mean square over the 8 views that the descent sees, and over 4
 between them that it does not, relative to where it began. They are free of rendering noise: products of two independent
@@ -27,25 +27,17 @@ from unrender.schedules import Constant, Cosine, Schedule
 SPP = (2, 4, 8)
 VIEWS = 12
 UNSEEN = (1, 4, 7, 10)
-RATES = {
-    ("Adam", "constant"): (0.01, 0.02, 0.04),
-    ("meta", "constant"): (0.005, 0.01, 0.02),
-    ("Adam", "falling"): (0.02, 0.04, 0.08),
-    ("meta", "falling"): (0.01, 0.02, 0.04),
-}
-SCHEDULES = ("constant", "falling")
+RATES = {"Adam": (0.02, 0.04, 0.08), "meta": (0.01, 0.02, 0.04)}
 FLOOR = 0.05
 USUAL_GRID = 64
 MERGE = ("schedules.*.methods",)
 QUICK = {
-    "seconds": 0.5, "seeds": 1, "resolution": 8, "grid": 8, "schedule": ("constant",), "only": ("Adam, 2 spp", "meta"),
-    "reference_spp": 16,
+    "seconds": 0.5, "seeds": 1, "resolution": 8, "grid": 8, "only": ("Adam, 2 spp", "meta"), "reference_spp": 16,
 }  # fmt: skip
 
 
-def entrants(kind: str, schedule: Schedule) -> list[Entrant]:
-    """Who races, by a kind of schedule."""
-
+def entrants(schedule: Schedule) -> list[Entrant]:
+    """Who races."""
     adam, meta = scaled(ur.optimizers.Adam, schedule), scaled(ur.optimizers.MetaAdam, schedule)
     control = ur.images.RecursiveControlVariate()
     others: dict[str, Estimator] = {
@@ -55,8 +47,8 @@ def entrants(kind: str, schedule: Schedule) -> list[Entrant]:
         "meta, 8 and 4 spp": ur.MetaEstimator(proportional_spp=8, difference_spp=4),
         "coupled on rcv, 8 spp": ur.MetaEstimator(coupled=True, spp=8, image=control),
     }
-    found = [Entrant(f"Adam, {n} spp", "Adam", ur.PathGradient(spp=n), adam, RATES["Adam", kind]) for n in SPP]
-    return found + [Entrant(name, "meta", estimator, meta, RATES["meta", kind]) for name, estimator in others.items()]
+    found = [Entrant(f"Adam, {n} spp", "Adam", ur.PathGradient(spp=n), adam, RATES["Adam"]) for n in SPP]
+    return found + [Entrant(name, "meta", estimator, meta, RATES["meta"]) for name, estimator in others.items()]
 
 
 def steps_in(problem: ur.Problem, entrant: Entrant, errors: ImageErrors, seconds: float, processor: bool) -> int:
@@ -76,23 +68,22 @@ def steps_in(problem: ur.Problem, entrant: Entrant, errors: ImageErrors, seconds
 
 
 def measure(
-    problem: ur.Problem, errors: ImageErrors, name: str, kind: str, seconds: float, seeds: int, processor: bool
+    problem: ur.Problem, errors: ImageErrors, name: str, seconds: float, seeds: int, processor: bool
 ) -> dict[str, Any]:
     """One entrant's figures."""
 
     def entrant(schedule: Schedule) -> Entrant:
-        return next(e for e in entrants(kind, schedule) if e.name == name)
+        return next(e for e in entrants(schedule) if e.name == name)
 
     steps = steps_in(problem, entrant(Constant()), errors, seconds, processor)
-    schedule = Constant() if kind == "constant" else Cosine(steps, FLOOR)
     budget: dict[str, Any] = {"steps": steps} if processor else {"seconds": seconds}
-    return race(problem, [entrant(schedule)], seeds, measure=errors, by="seen", **budget)
+    return race(problem, [entrant(Cosine(steps, FLOOR))], seeds, measure=errors, by="seen", **budget)
 
 
-def label(kind: str, grid: int, balls: int) -> str:
+def label(grid: int, balls: int) -> str:
     """The name of an entry of the record."""
     of = [f"{grid}³"] * (grid != USUAL_GRID) + [f"{balls} balls"] * (balls > 0)
-    return ", ".join([kind, *of])
+    return ", ".join(["falling", *of])
 
 
 def run(
@@ -100,18 +91,16 @@ def run(
     seeds: int = 2,
     resolution: int = 64,
     grid: int = USUAL_GRID,
-    schedule: tuple[str, ...] = SCHEDULES,
     only: tuple[str, ...] = (),
     balls: int = 0,
     processor: bool = False,
     reference_spp: int = 1024,
 ) -> Iterator[dict[str, Any]]:
-    """A part per schedule and method.
+    """A part per method.
 
     Args:
         seconds: budget of every run
         grid: voxels along a side; the others' figures stay
-        schedule: of learning rates; the other's figures stay
         only: methods to run; the others' figures stay
         balls: in place of the toy, so that the volume is sparse (Fig. 8); 0: the toy. The other's figures stay
         processor: whether seconds are those of one thread of the processor, which tell the steps of a run
@@ -125,16 +114,11 @@ def run(
     if processor:
         dr.set_thread_count(1)
     groups = {"seen": [n for n in range(VIEWS) if n not in UNSEEN], "unseen": list(UNSEEN)}
-    errors, conditions = (
-        ImageErrors(made, options, groups, 16),
-        {"seconds": seconds, "seeds": seeds, "resolution": resolution},
-    )
-    conditions |= {"processor": processor}
-    for kind in schedule:
-        for name in (e.name for e in entrants(kind, Constant()) if not only or e.name in only):
-            methods = measure(problem, errors, name, kind, seconds, seeds, processor)
-            case = label(kind, grid, balls)
-            yield {"schedules": {case: {**conditions, "grid": grid, "kind": kind, "balls": balls, "methods": methods}}}
+    errors, conditions = ImageErrors(made, options, groups, 16), {"seconds": seconds, "seeds": seeds}
+    conditions |= {"resolution": resolution, "processor": processor, "grid": grid, "balls": balls}
+    for name in (e.name for e in entrants(Constant()) if not only or e.name in only):
+        methods = measure(problem, errors, name, seconds, seeds, processor)
+        yield {"schedules": {label(grid, balls): {**conditions, "methods": methods}}}
 
 
 def table(record: Record) -> str:
@@ -143,7 +127,7 @@ def table(record: Record) -> str:
     for entry in record["schedules"].values():
         of = " of {balls} balls" if entry["balls"] else ""
         by = " of the processor" if entry["processor"] else ""
-        text = f"`nerf-volume`{of}, {{resolution}}², grids of {{grid}}³, {{kind}} rates, {{seconds:g}} s{by}, {{seeds}} seeds. "
+        text = f"`nerf-volume`{of}, {{resolution}}², grids of {{grid}}³, falling rates, {{seconds:g}} s{by}, {{seeds}} seeds. "
         rows = [
             [
                 markdown.fill("{name} | {rate:g} | {final[seen]!m} | {final[unseen]!m}", found),
