@@ -23,6 +23,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
+from benchmarks.internals import dr
 from benchmarks.pixel_schemes import pixels
 from benchmarks.races import Entrant, Runs, follow, over, race, reached, scaled, tenths
 from benchmarks.runner.records import Record
@@ -74,7 +75,8 @@ LEVELS: dict[str, dict[str, Any] | None] = {
 
 
 def race_levels(count: int, steps: int, seeds: int, only: tuple[str, ...], options: dict[str, Any]) -> dict[str, Any]:
-    """Race samplers of one and of five levels at the rate that the race by time chose for each."""
+    """Race samplers of one and of five levels at the rate that the race by time chose for each. On one thread a seed gives one run."""
+    dr.set_thread_count(1)
     adam, chosen = scaled(ur.optimizers.Adam, ur.schedules.Cosine(steps)), []
     for name, own in ((name, own) for name, own in LEVELS.items() if not only or name in only):
         sampler = ur.pixels.Uniform(count) if own is None else ur.pixels.Adaptive(count, **own)

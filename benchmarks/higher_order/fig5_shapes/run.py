@@ -36,7 +36,7 @@ STRENGTH = 19.0
 RATES = (3.0, 9.0, 27.0)
 """Of Adam, in units of σ; one for all elements where steps are smooth."""
 RADII = (0.5, 1.5, 4.5)
-"""Of Newton's steps: by how many σ the elements of each parameter move at most, in the mean square."""
+"""Of Newton's steps: by how many σ each element moves at most, in the mean square."""
 
 
 SIGMA = 0.05
@@ -63,7 +63,7 @@ def _adam(rate: float, smooth: bool) -> ur.optimizers.Adam:
 
 
 def _newton(radius: float, n: int) -> ur.optimizers.NewtonCG:
-    return ur.optimizers.NewtonCG(trust_radius=radius * math.sqrt(n), iterations=1, line=True, balanced=True)
+    return ur.optimizers.NewtonCG(trust_radius=radius * math.sqrt(n), iterations=1, line=True)
 
 
 Make = Callable[[float, int, bool], tuple[Any, Any]]

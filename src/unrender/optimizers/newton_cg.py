@@ -59,9 +59,6 @@ class NewtonCG:
             parameters and one step to either side. This takes two evaluations, and the estimator must provide losses. It suits many
             parameters, where the gradient is mostly noise and its curvature, from the same samples, is not that of the loss. These losses
             are not smoothed.
-        balanced: whether each parameter's scale is also divided by the square root of its gradient's RMS, relative to the mean RMS of all
-            elements. A step along −g then moves the elements of every parameter equally far in the mean square, as Adam does, and Δ / √n
-            is how far. It suits parameters of many elements and different kinds, such as vertices and their colours.
     """
 
     learning_rate: float = 1.0
@@ -73,7 +70,6 @@ class NewtonCG:
     inner_optimizer: Adam | None = None
     schedule: Schedule | None = None
     line: bool = False
-    balanced: bool = False
 
     def __post_init__(self):
         check_options("NewtonCG", self)
@@ -94,8 +90,6 @@ class NewtonCG:
         """Return the steps and the next state. On the host, between products."""
         hvp = estimate.require("NewtonCG", HessianProduct).apply
         scale = coordinate_scales(estimate, state, parameters)
-        if self.balanced:
-            scale = scale * _balance(scale * trees.ravel(estimate.gradient), parameters)
 
         def product(v: np.ndarray) -> np.ndarray:
             return scale * trees.ravel(hvp(trees.unravel(scale * v, parameters)))
@@ -122,17 +116,3 @@ class NewtonCG:
         if slope >= 0.0 or not np.isfinite(losses).all():
             return np.zeros_like(step)
         return (longest if curvature * longest <= -slope else -slope / curvature) * step
-
-
-_LEAST_SHARE = 1e-6
-"""Smallest RMS of a parameter's gradient that `NewtonCG.balanced` distinguishes, relative to the mean."""
-
-
-def _balance(gradient: np.ndarray, parameters: Tree) -> np.ndarray:
-    """Return √(r̄ / r) of each element, (n,), with the RMS r of its parameter's gradient and the mean r̄ over all elements."""
-    rms = {key: float(np.sqrt(np.mean(part**2))) for key, part in trees.parts(gradient, parameters).items()}
-    found = trees.repeat_per_element(rms, parameters)
-    mean = float(np.mean(found))
-    if not 0.0 < mean < np.inf:
-        return np.ones_like(gradient)
-    return np.sqrt(mean / np.maximum(found, _LEAST_SHARE * mean))
