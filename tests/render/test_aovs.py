@@ -212,3 +212,11 @@ def test_what_has_no_such_pictures_is_refused() -> None:
     made = problem(views, ("camera.rotation.y",))
     with pytest.raises(InputError, match="path gradients of moving sensors do not support depth"):
         ur.optimize(made, "plain", steps=1)
+
+
+def test_only_rays_that_hit_a_surface_have_a_vertex() -> None:
+    renderer, request = MitsubaRenderer(scene()), SampleRequest(0, 4, 1)
+    session: Any = renderer.with_aov("mask").prepare([FLOOR], None)
+    mask = session.image({}, request).images.numpy()[0]
+    assert 0 < mask.mean() < 1
+    np.testing.assert_array_equal(session.vertices({}, request).numpy(), mask)

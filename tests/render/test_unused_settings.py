@@ -15,7 +15,7 @@ XML = """<scene version="3.0.0">
         <integer name="width" value="4"/><integer name="height" value="4"/>{film}
     </film></sensor>{integrator}
     <shape type="rectangle"><bsdf type="diffuse"/></shape>
-    <shape type="sphere" id="lamp"><emitter type="area"/></shape>
+    <shape type="sphere" id="lamp"><point name="center" x="0" y="0" z="5"/><emitter type="area"/></shape>
 </scene>"""
 BOX = '<rfilter type="box"/>'
 KEY = "lamp.emitter.radiance.value"
@@ -96,10 +96,17 @@ def test_a_path_without_a_limit_has_a_documented_one(tmp_path: Path) -> None:
 def test_reconstruction_filters_and_hidden_emitters_are_used(tmp_path: Path) -> None:
     for film in ("", '<rfilter type="gaussian"/>', '<rfilter type="lanczos"/>'):
         assert notices(xml(tmp_path, film=film)) == []
+    assert ur.render(problem(xml(tmp_path)), spp=4).any()
     hidden = '<integrator type="path"><integer name="max_depth" value="6"/><boolean name="hide_emitters" value="true"/></integrator>'
     made = problem(xml(tmp_path, hidden))
     assert made.notices == []
     assert not ur.render(made, spp=4).any()
+
+
+def test_a_parameter_of_the_file_hides_emitters(tmp_path: Path) -> None:
+    for value in ("true", "false"):
+        hidden = f'<default name="hide" value="{value}"/><integrator type="path"><boolean name="hide_emitters" value="$hide"/></integrator>'
+        assert ur.render(problem(xml(tmp_path, hidden)), spp=4).any() == (value == "false")
 
 
 def test_hidden_emitters_beside_what_moves_are_refused() -> None:

@@ -222,3 +222,17 @@ def test_auto_finds_cameras() -> None:
     for name, distance in (("left", 2.94), ("middle", 2.98), ("right", 2.74)):
         assert np.degrees(np.linalg.norm(result.parameters[f"{name}.rotation"])) < 0.25
         assert np.linalg.norm(result.parameters[f"{name}.translation"]) < 0.005 * distance
+
+
+def test_a_sensor_does_not_move_by_path_gradients_beside_shapes_without_silhouette_curves() -> None:
+    side = np.linspace(-0.5, 0.5, 6)
+    distance = np.sqrt(sum(np.square(axis) for axis in np.meshgrid(side, side, side)))[..., None] - 0.3
+    described = {
+        "type": "scene",
+        "eye": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "blob": {"type": "sdfgrid", "grid": mi.TensorXf(distance.astype(np.float32)), "normals": "smooth"},
+    }
+    info = MitsubaRenderer(described, 2).parameters()
+    assert info["eye.rotation.x"].differentiable
+    assert not info["eye.translation.x"].differentiable
+    assert "boundary derivatives do not support the silhouettes of SDFGrid" in info["eye.translation.x"].reason

@@ -149,6 +149,19 @@ def test_all_states_of_a_batch_share_their_random_numbers() -> None:
     assert not np.array_equal(batch, session.image_batch({"block.rotation.y": turns}, SampleRequest(0, 2, 6)).numpy())
 
 
+def test_an_omitted_pose_is_as_loaded() -> None:
+    renderer, request = MitsubaRenderer(scene, DEPTH), SampleRequest(0, 2, 5)
+    keys = ["block.translation.x", "block.rotation.y"]
+    session = renderer.prepare(keys, None, derivatives=False)
+    zero, shift = renderer.array(np.array(0.0)), renderer.array(np.array(0.2))
+    full = session.image({keys[0]: shift, keys[1]: zero}, request).images.numpy()
+    np.testing.assert_array_equal(session.image({keys[0]: shift}, request).images.numpy(), full)
+    np.testing.assert_array_equal(session.image_batch({keys[0]: np.array([0.2])}, request).numpy(), full)
+    loaded = session.image(dict.fromkeys(keys, zero), request).images.numpy()
+    assert not np.array_equal(loaded, full)
+    assert session.image({}, request).images.shape == full.shape
+
+
 def test_what_poses_refuse() -> None:
     renderer = MitsubaRenderer(scene, DEPTH)
     known = renderer.parameters()

@@ -44,8 +44,8 @@ _LONGEST, _DEEPEST = 1000, 50
 def parse(key: str, text: str) -> Function:
     """Return the function that a text describes.
 
-    The text has numbers, lists of numbers, names of unknowns, + - * / **, brackets, name[i] for the i-th row, and the functions abs, cos,
-    exp, log, max, min, mix(a, b, t), sin, sqrt and tanh. Raises `KeyedError` for anything else.
+    The text has numbers, lists of numbers, names of unknowns, + - * / **, parentheses, name[i] for the i-th row, and the functions abs,
+    cos, exp, log, max, min, mix(a, b, t), sin, sqrt and tanh. Raises `KeyedError` for anything else.
     """
     try:
         if len(text) > _LONGEST:

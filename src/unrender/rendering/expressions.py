@@ -53,7 +53,7 @@ class Expression:
 
     @classmethod
     def of(cls, key: str, expression: Any) -> Expression:
-        """Return the expression that a user gives: a function, or a text. Raises `KeyedError`."""
+        """Return the expression for a function or a text. Raises `KeyedError` for other types and malformed texts."""
         if isinstance(expression, str):
             return cls(key, parse(key, expression), expression)
         if not callable(expression):
@@ -96,7 +96,7 @@ class ExpressionRenderer(RendererWrapper):
         unknowns: {name: initial value} of the unknowns that the functions may read.
 
     Raises:
-        KeyedError: A function reads what is no unknown, fails, or its result does not suit the parameter.
+        KeyedError: A function reads a name that is no unknown, fails, or its result does not suit the parameter.
         InputError: No function reads one of the unknowns.
     """
 
@@ -189,7 +189,8 @@ def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknown
     Args:
         renderer: Renders the scene.
         expressions: {key of the scene: function or text}.
-        unknowns: {key: initial value} of all unknowns; those that are parameters of the scene stay so.
+        unknowns: {key: initial value} of all unknowns: a number, which becomes (1,), a list, an array or a .npy file. Parameters of the
+            scene are ignored.
 
     Raises:
         KeyedError: See `ExpressionRenderer`.
@@ -234,7 +235,7 @@ def are_storable(renderer: Any) -> bool:
 
 
 def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo:
-    """Return what a renderer says of an unknown on which these parameters depend."""
+    """Return the description of an unknown on which these parameters depend."""
     sensors = {info.sensor for info in targets}
     return ParameterInfo(
         shape,

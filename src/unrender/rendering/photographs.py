@@ -82,7 +82,8 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
         sensors: indices of the views' sensors.
 
     Raises:
-        InputError: the keys include the poses, and a sensor cannot be moved; or they include both response and exposure.
+        InputError: the keys include the poses, and a sensor cannot be moved or there are fewer than 3. Or they include both response and
+            exposure.
     """
     check_response(keys)
     camera_keys = [key for key in OF_PHOTOGRAPHS if key in keys]

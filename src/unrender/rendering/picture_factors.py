@@ -62,7 +62,7 @@ class PictureRenderer(WithParameter):
         return inner if len(own) == len(keys) else self.session(inner)
 
     def session(self, inner: RenderSession) -> RenderSession:
-        """Return a session for the parameter together with those of the inner session."""
+        """Return a session for this parameter and those of the inner session."""
         raise NotImplementedError
 
 

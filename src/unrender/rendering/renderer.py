@@ -124,7 +124,7 @@ class Rendering:
 
 
 def differentiated(keys: Iterable[str], derivatives: bool | AbstractSet[str]) -> frozenset[str]:
-    """Return the keys for which `Renderer.prepare` is asked for derivatives."""
+    """Return the keys among `keys` that the argument `derivatives` of `Renderer.prepare` selects."""
     known = frozenset(keys)
     return known & (derivatives if not isinstance(derivatives, bool) else known if derivatives else frozenset())
 
@@ -239,7 +239,7 @@ def drawing_emitters(session: RenderSession) -> EmitterSession:
 
 
 def counted_vertices(session: RenderSession, parameters: Tree, request: SampleRequest) -> Array:
-    """Return `CountingSession.vertices` of the session, or ones if it does not count."""
+    """Return `CountingSession.vertices` of the session. If it does not count, render an image and return ones of its shape."""
     if isinstance(session, CountingSession):
         return session.vertices(parameters, request)
     return session.image(parameters, replace(request, groups=1)).images[0] * 0.0 + 1.0

@@ -48,7 +48,7 @@ class World:
     values: Mapping[str, np.ndarray]
 
     def same(self, other: World) -> bool:
-        """Return whether both show the same."""
+        """Return whether both have the same sensor, scene and known values."""
         return self.renderer is other.renderer and self.sensor == other.sensor and self.same_state(other)
 
     def same_state(self, other: World) -> bool:
@@ -159,7 +159,7 @@ class WorldsRenderer(RendererWrapper):
         return WorldsSession(self, sessions, differentiable)
 
     def known_keys(self, renderer: Renderer) -> list[str]:
-        """Return the keys that some world of a renderer gives a value of its own."""
+        """Return the keys for which a world of this renderer has a known value."""
         held = (key for state in self.states if state.renderer is renderer for key in state.values)
         return list(dict.fromkeys(held))
 
@@ -196,7 +196,7 @@ class WorldsRenderer(RendererWrapper):
         return self._changed(lambda one: changed[id(one)])
 
     def around(self, inner: Renderer) -> Renderer:
-        """Return the same around another renderer of the first scene."""
+        """Return a renderer of the same worlds with another renderer of the first scene."""
         return self._changed(lambda one: inner if one is self.inner else one)
 
     def _changed(self, change: Callable[[Renderer], Renderer]) -> WorldsRenderer:
@@ -301,10 +301,10 @@ class WorldsSession:
         return _joined(counts, [_Part(n, chosen, count, None) for n, _, chosen in parts])
 
     def emitters(self) -> np.ndarray:
-        """Return the emitters.
+        """Return the probabilities of the emitters, see `EmitterSession.emitters`.
 
         Raises:
-            InputError: there are several scenes.
+            InputError: there are several scenes, or the session does not support other probabilities.
         """
         if len(self._sessions) > 1:
             raise InputError("views of several scenes do not support learned emitter sampling")

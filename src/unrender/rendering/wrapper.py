@@ -74,11 +74,11 @@ class RendererWrapper:
         return self.inner.cameras() if isinstance(self.inner, WithCameras) else {}
 
     def with_differential_bsdf(self) -> Renderer:
-        """Return the wrapped `with_differential_bsdf` of the inner renderer. Raises `InputError` where it has none."""
+        """Return this wrapper around the inner renderer's `with_differential_bsdf()`. Raises `InputError` if that is not supported."""
         return self.around(with_differential_bsdf(self.inner))
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> Renderer:
-        """Return the wrapped `with_meshes` of the inner renderer. Raise `InputError` if it does not support this."""
+        """Return this wrapper around the inner renderer's `with_meshes()`. Raises `InputError` if that is not supported."""
         if not isinstance(self.inner, Remeshable):
             raise InputError(f"{', '.join(meshes)}: this renderer cannot replace meshes; keep their triangles fixed")
         known = self.inner.parameters()

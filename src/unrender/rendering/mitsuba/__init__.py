@@ -1,1 +1,1 @@
-"""The renderer port answered by Mitsuba 3."""
+"""Implementation of the renderer protocol with Mitsuba 3."""

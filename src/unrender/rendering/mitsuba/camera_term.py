@@ -11,7 +11,7 @@ import mitsuba as mi
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.film_response import is_spectral
-from unrender.rendering.mitsuba.integrators.camera_motion import CameraMotion
+from unrender.rendering.mitsuba.integrators.camera_motion import CameraMotion, SilhouetteCurves
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import ParameterTraits
 from unrender.rendering.mitsuba.scene_graph import has_instances
@@ -64,6 +64,8 @@ def translation_obstacle(pair: ScenePair) -> str:
     """Return the reason why there is no derivative by a sensor's position; "" if there is one."""
     if has_instances(pair.current):
         return "boundary derivatives do not support scenes with instances"
+    if kinds := SilhouetteCurves.omitted(pair.current):
+        return f"boundary derivatives do not support the silhouettes of {', '.join(kinds)}"
     return ""
 
 

@@ -18,7 +18,7 @@ from unrender.rendering.renderer import EmitterMoments
 
 
 def own_probabilities(scene: mi.Scene) -> np.ndarray:
-    """Return Mitsuba's probabilities in the order of the scene's emitters, (E,), from their sampling weights."""
+    """Return Mitsuba's probabilities in the order of the scene's emitters, (E,), from their sampling weights; all 0 without weights."""
     weights = np.array([emitter.sampling_weight() for emitter in scene.emitters()], np.float64)
     return weights / weights.sum() if weights.sum() > 0 else weights
 
@@ -54,7 +54,8 @@ def emitter_tables(scene: mi.Scene, probabilities: np.ndarray) -> dict[str, mi.U
 def connection_moments(scene: mi.Scene, values: mi.Float, emitters: mi.UInt32) -> EmitterMoments:
     """Return the moments by emitter of the connections' values. Each has the registry id of its emitter, 0 for none.
 
-    The sums run on the host in a fixed order. Atomic sums on a device would differ in their last bits between runs.
+    A value that is not finite counts as 0. The sums run on the host in a fixed order. Atomic sums on a device would differ in their last
+    bits between runs.
     """
     ids = _ids(scene)
     index = np.full(int(ids.max(initial=0)) + 1, len(ids))

@@ -199,7 +199,10 @@ def camera_samples_of_many(
 
 
 def rays(samples: CameraSamples, hidden_in: Any = None) -> tuple[Any, Any]:
-    """Return `mi.RayDifferential3f` and its weight per lane. If `hiding` is a scene, its directly visible emitters are skipped."""
+    """Return `mi.RayDifferential3f` and its weight per lane.
+
+    If `hidden_in` is a scene, rays begin behind its directly visible emitters. A ray that hits nothing else has the weight 0.
+    """
     ray, weight = samples.sensor.sample_ray_differential(
         samples.time, samples.wavelength, samples.position, samples.aperture
     )

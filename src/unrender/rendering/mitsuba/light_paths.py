@@ -7,13 +7,12 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files, scene_files
+from unrender.rendering.mitsuba.description import parse
 
 DEFAULT_DEPTH = 6
 """Default maximum path length in segments, if neither the user nor the scene gives one."""
@@ -36,7 +35,6 @@ _SAME = (
 _DIRECT = ("DirectIntegrator", "DirectProjectiveIntegrator")
 _NESTING = ("AOVIntegrator", "MomentIntegrator")
 _UNLIMITED = 2**31
-_LONGEST = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class LightPaths:
         requested, own = max_depth, _depth(kind, text)
         if max_depth is None:
             max_depth = min(own or DEFAULT_DEPTH, LONGEST_DEPTH if own == _UNLIMITED else _UNLIMITED)
-        hidden = bool(getattr(integrator, "hide_emitters", False)) or any(map(_is_true, _hidden(source)))
+        hidden = bool(getattr(integrator, "hide_emitters", False)) or any(_hidden(source))
         if hidden and volumetric:
             raise InputError("hide_emitters is not supported with participating media; leave it out")
         notices = _notices(kind, own, requested, max_depth, volumetric)
@@ -158,13 +156,6 @@ def _hidden(source: Path | dict) -> Iterator[Any]:
             elif isinstance(value, Mapping):
                 yield from _hidden(dict(value))
         return
-    for path in scene_files.of(source):
-        if path.suffix.lower() != ".xml":
-            continue
-        for element in ElementTree.fromstring(bounded_files.read_bytes(path, _LONGEST)).iter("boolean"):
-            if element.get("name") == "hide_emitters":
-                yield element.get("value")
-
-
-def _is_true(value: Any) -> bool:
-    return value is True or (isinstance(value, str) and value.strip().lower() == "true")
+    for node in parse(source).state.nodes:  # with the values of the file's parameters
+        if "hide_emitters" in node.props:
+            yield node.props["hide_emitters"]

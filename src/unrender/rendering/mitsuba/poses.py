@@ -224,10 +224,9 @@ class PosedScene:
         """Return all scenes, which are inputs of frozen kernels."""
         return [self.static, *self.parts.values()]
 
-    def numbers(self, parameters: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the poses as one array, (7 per target, B), from {key: (B, *shape)} of all chosen keys."""
-        count = len(next(iter(parameters.values())))
-        columns = {key: np.reshape(parameters[key], (count, -1)).T for key in self._slots}
+    def numbers(self, parameters: Mapping[str, np.ndarray], count: int) -> np.ndarray:
+        """Return `count` poses as one array, (7 per target, count), from {key: (count, *shape)}. A missing key is as loaded."""
+        columns = {key: np.reshape(x, (count, -1)).T for key, x in parameters.items() if key in self._slots}
         ends = np.zeros(count, np.float32), np.ones(count, np.float32)
         poses = [numbers_of(target, self._slots, columns, *ends) for target in self._centres]
         return np.array(poses, np.float32).reshape(-1, count)
@@ -359,12 +358,12 @@ def numbers_of(
     Args:
         target: id of a shape, an emitter or a sensor.
         slots: `slots()` of all chosen keys.
-        values: {key: its numbers, one after the other}.
+        values: {key: its numbers, one after the other}; a missing key is as loaded.
         zero, one: the numbers of a pose as loaded.
     """
     numbers = [zero] * 6 + [one]
     for key, (owner, first, size) in slots.items():
-        if owner == target:
+        if owner == target and key in values:
             numbers[first : first + size] = values[key]
     return numbers
 

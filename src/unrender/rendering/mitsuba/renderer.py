@@ -102,7 +102,7 @@ class MitsubaRenderer:
         self._checked: set[tuple[tuple[str, ...], frozenset[str], Space | None]] = set()
 
     def parameters(self) -> Mapping[str, ParameterInfo]:
-        """Return every parameter of the scene by its `mitsuba.traverse` key."""
+        """Return every parameter of the scene by key: the keys of `mitsuba.traverse`, and those of poses (`poses.py`)."""
         return self._info
 
     def values(self, keys: list[str]) -> Tree:
@@ -173,7 +173,7 @@ class MitsubaRenderer:
         return MitsubaRenderer(self.pair.description, self._given_depth, keys, self.pair.replaced | dict(meshes))
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
-        """Return a renderer of the same loaded scenes with differential BSDF sampling."""
+        """Return a renderer of the same loaded scenes with differential BSDF sampling; this renderer if it renders an AOV."""
         if self._differential_bsdf or self.light_paths.aov:
             return self
         if self._differential is None:
@@ -182,7 +182,10 @@ class MitsubaRenderer:
         return self._differential
 
     def with_aov(self, name: str) -> MitsubaRenderer:
-        """Return a renderer of the same loaded scenes with an AOV in place of radiance. Raise `InputError` for scenes with media."""
+        """Return a renderer of the same loaded scenes with an AOV in place of radiance.
+
+        Raises `InputError` for scenes with media, and in spectral variants.
+        """
         if self.pair.volumetric:
             raise InputError(f"{name} is a property of surfaces, and the scene has media; leave it out")
         if is_spectral():

@@ -172,7 +172,8 @@ class MitsubaSession:
 
     def image(self, parameters: Tree, request: SampleRequest) -> Rendering:
         """Render an unbiased image of each group."""
-        if self._posed is not None and not self._attached and request.groups == 1 and request.pixels is None:
+        batched = parameters and self._posed is not None and not self._attached
+        if batched and request.groups == 1 and request.pixels is None:
             stacked = {key: np.array(value.numpy())[None] for key, value in parameters.items()}
             return Rendering(self.image_batch(stacked, request), None, None)
         self.set_parameters(parameters)
@@ -207,7 +208,7 @@ class MitsubaSession:
         else:
             detach_all()  # tangents that come and go would make Dr.Jit record kernels again
             self._pair.loaded().set_parameters({key: at[key] for key in self._keys if key in at})
-            numbers = self._posed.numbers({k: v for k, v in parameters.items() if k in self._poses})
+            numbers = self._posed.numbers(parameters, count)
             radiance = self.kernel(PosesPass(self._posed, count), request)(tensor(numbers).array)
         dr.eval(radiance)
         return self.dropped.develop(radiance, request.spp, 1, (count, self.count(request), 3)).array
@@ -341,9 +342,8 @@ class MitsubaSession:
         """Set the poses of the following passes in one of the two scenes."""
         if self._posed is None:
             return
-        loaded = {key: pose.loaded() for key, pose in self._poses.items()}
-        current = {key: parameters[key].numpy() for key in self._poses if key in parameters}
-        self._at[previous] = tensor(self._posed.numbers({k: x[None] for k, x in (loaded | current).items()})).array
+        current = {key: parameters[key].numpy()[None] for key in self._poses if key in parameters}
+        self._at[previous] = tensor(self._posed.numbers(current, 1)).array
 
     def _posed_scene(self, previous: bool) -> PosedScene | None:
         """Return one of the two scenes with posed shapes; None without poses."""

@@ -135,7 +135,7 @@ class SpectralColours:
         return self._joined(self._cell(value).coefficients(), value)
 
     def clipped(self, key: str, value: np.ndarray) -> np.ndarray:
-        """Return values whose coefficients are those that Mitsuba gives them."""
+        """Return linear sRGB clipped to [1e-4, 1 - 1e-4], where coefficients are finite; the values of other parameters unchanged."""
         return np.clip(value, _DARKEST, _BRIGHTEST) if key in self.keys else value
 
     def pull_back(self, key: str, value: mi.TensorXf, gradient: mi.TensorXf) -> mi.TensorXf:

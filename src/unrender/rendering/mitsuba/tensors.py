@@ -51,5 +51,8 @@ def from_tensor(tensor: mi.TensorXf, like: Any) -> Any:
 
 
 def is_broadcast(values: np.ndarray) -> bool:
-    """Return whether all states of a batch share a value, see `RenderSession.image_batch`."""
+    """Return whether an array has one state, or repeats one along its first axis without copies (`numpy.broadcast_to`).
+
+    Values are not compared. See `RenderSession.image_batch`.
+    """
     return len(values) == 1 or np.asarray(values).strides[0] == 0

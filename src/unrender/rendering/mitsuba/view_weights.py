@@ -21,7 +21,7 @@ class ViewWeights:
         sensor: index of the sensor.
         image: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image; 0 at pixels that were not requested.
         pixels: `mi.UInt32`, flat indices of the requested pixels; one may occur twice.
-        values: `mi.Float` (3 N,), weights of these pixels.
+        values: `mi.Float` (3 N,), weights of these pixels, mean over groups.
         rows: `mi.UInt32`, indices of these pixels in the request.
         spp: samples per pixel.
     """

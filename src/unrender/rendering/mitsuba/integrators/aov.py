@@ -72,6 +72,7 @@ class AovKernel:
         ray: mi.RayDifferential3f,
         geometry: Any = None,
     ) -> Float:
-        """Return the number of vertices per lane, see `PathKernel.vertices`: one, the surface."""
-        del scene, tables, sampler, geometry
-        return mi.Float(ray.d.x) * 0 + 1
+        """Return the number of vertices per lane, see `PathKernel.vertices`: 1 where the ray hits a surface, else 0."""
+        del tables, sampler
+        target: Any = scene if geometry is None else geometry
+        return dr.select(target.ray_test(mi.Ray3f(ray), mi.Bool(True)), mi.Float(1), 0)

@@ -17,4 +17,4 @@ UInt32: TypeAlias = Any
 Spectrum: TypeAlias = Any
 
 while_loop: Any = dr.while_loop
-"""Its stub knows loops of one variable alone."""
+"""`drjit.while_loop`, whose stub only accepts loops of one variable."""

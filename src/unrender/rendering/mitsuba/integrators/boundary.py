@@ -64,7 +64,9 @@ class BoundaryIntegrator:
         self._radiance: Any = mi.load_dict({"type": "prb_projective", "max_depth": max_depth, "rr_depth": max_depth})
 
     def weighted_image(self, scene: Any, sensor: Any, weights: Any, seed: int, samples: int) -> Any:
-        """Return a value whose derivative equals the boundary term of Σ weights · image, attached to the meshes' positions. Unbiased.
+        """Return a value whose derivative equals the boundary term of Σ weights · image, attached to the meshes' positions.
+
+        It is unbiased up to the edges that the module omits, silhouettes of shapes that are not meshes, and the offset `OFFSET`.
 
         Args:
             scene, sensor: Mitsuba's scene, and a perspective sensor.
@@ -76,7 +78,7 @@ class BoundaryIntegrator:
 
     def tangent_image(self, scene: Any, sensor: Any, seed: int, samples: int) -> Any:
         """Return the boundary term of the image's derivative, `mi.TensorXf` (H, W, 3), along the tangents of the meshes' positions. It
-        is detached and unbiased. For the arguments, see `weighted_image`."""
+        is detached. For bias and arguments, see `weighted_image`."""
         picture = TangentPicture(scene, sensor, samples)
         self._collected(picture, seed)
         return picture.image()

@@ -78,7 +78,17 @@ def coplanar(edge: EdgePoints) -> Any:
 
 
 class EmitterPoints:
-    """Points on emitters and directions to distant ones, the same number on each emitter, at a time, `mi.Float`."""
+    """Points on emitters and directions to distant ones, the same number on each emitter.
+
+    Args:
+        scene: the Mitsuba scene, which has emitters.
+        seed: seed of the points.
+        count: number of points of all emitters; each has at least one.
+        time: time of the picture, `mi.Float`.
+
+    Attributes:
+        count: actual number of points.
+    """
 
     def __init__(self, scene: Any, seed: int, count: int, time: Any):
         self._time = time
@@ -179,6 +189,7 @@ def _emitter_points(emitter: Any, seed: int, count: int, time: Any) -> tuple[Any
 
 
 def lane_sampler(seed: int, period: int, lanes: int) -> RepeatingSampler:
+    """Return a seeded sampler of `lanes` lanes; lanes `period` apart have equal numbers."""
     sampler = RepeatingSampler(period)
     sampler.seed(dr.opaque(mi.UInt32, seed & 0xFFFFFFFF), lanes)
     return sampler

@@ -24,7 +24,9 @@ _MARGIN = 1.01
 
 
 def bounding_ellipsoids(meshes: Sequence[Sequence[Any]]) -> Float:
-    """Return the centre and the inverse half axes of an ellipsoid around each bounding box, scaled to contain all points.
+    """Return the centre and the inverse half axes of an ellipsoid around each bounding box, 6 numbers each, `mi.Float`.
+
+    The ellipsoids contain all points.
 
     Args:
         meshes: for each ellipsoid, flat arrays of the positions that it contains.

@@ -38,7 +38,7 @@ _CURVES = {"Sphere": (_SPHERE,), "Disk": (_CIRCLE,), "Cylinder": (_CIRCLE, _TOP,
 
 
 class SilhouetteCurves:
-    """Silhouette curves of a scene that does not move, in pieces.
+    """Silhouette curves of a scene that does not move, in pieces: of meshes, spheres, disks and cylinders.
 
     Args:
         scene: the Mitsuba scene.
@@ -47,6 +47,12 @@ class SilhouetteCurves:
     Attributes:
         count: number of pieces.
     """
+
+    @staticmethod
+    def omitted(scene: Any) -> list[str]:
+        """Return the classes of the scene's shapes whose silhouettes are not included."""
+        shapes = [shape for shape in scene.shapes() if not shape.is_mesh()]
+        return sorted({shape.class_name() for shape in shapes} - _CURVES.keys())
 
     def __init__(self, scene: Any, table: EdgeTable):
         self._table = table

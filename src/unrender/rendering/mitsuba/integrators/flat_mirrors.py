@@ -53,7 +53,7 @@ class FlatMirrors:
         return mi.Vector3f(v[0:3]), v[3]
 
     def reflect(self, point: Any, number: Any, direction: bool = False) -> Any:
-        """Reflect points, or directions, in the mirror of this index."""
+        """Reflect points, or directions, in the mirror of this index; index 0 returns them unchanged."""
         n, height = self._plane(number)
         v = mi.Vector3f(point)
         v -= 2 * (dr.dot(n, v) - (0 if direction else height)) * n

@@ -230,7 +230,7 @@ def connect(
 ) -> tuple[list[Spectrum], ConnectionSample]:
     """Return the transmittance of each state from `vertex`, which light leaves into `medium`, to `target`.
 
-    With `noise`, independent random numbers, also return a point of the connection.
+    Also return a point of the connection, sampled with the independent random numbers `noise`; empty if `noise` is None.
     """
     ray = vertex.spawn_ray_to(target)
     T = [mi.Spectrum(1) for _ in range(context.state_count)]
