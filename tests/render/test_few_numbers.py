@@ -1,4 +1,4 @@
-"""`auto` recovers a few numbers with which the picture changes its form: lamps, lenses, indices of refraction, skies, poses."""
+"""`auto` recovers a few numbers with which the picture changes its form: lamps, lenses, indices of refraction, roughness, skies, poses."""
 
 from __future__ import annotations
 
@@ -91,6 +91,34 @@ def glass() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     return made, {"glass.bsdf.eta": 1.6}, {"glass.bsdf.eta": 1.3}, 0.02
 
 
+def polished(bsdf: Scene) -> Scene:
+    """Return a ball on a checkered floor, between a lamp and the sky."""
+    place = mi.ScalarTransform4f().look_at([-1.5, 3, 1.5], [0, 0, 0], [0, 1, 0]).scale(0.6)
+    lamp = {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": rgb(8.0)}}
+    view = camera("perspective", [0, 1.5, 4])
+    made = {
+        "type": "scene",
+        "cam": view,
+        "floor": floor(checkers(8), -0.7, 3),
+        "lamp": lamp,
+        "sky": {"type": "constant"},
+    }
+    return made | {"ball": {"type": "sphere", "radius": 0.7, "bsdf": bsdf}}
+
+
+def plastic() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
+    """A roughness without a path gradient."""
+    made = polished({"type": "roughplastic", "diffuse_reflectance": rgb(0.3, 0.1, 0.1), "alpha": 0.1})
+    return made, {"ball.bsdf.alpha": 0.1}, {"ball.bsdf.alpha": 0.4}, 0.01
+
+
+def metal() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
+    """A roughness and a colour with path gradients."""
+    made = polished({"type": "roughconductor", "specular_reflectance": rgb(0.9, 0.6, 0.3), "alpha": 0.2})
+    truth = {"ball.bsdf.alpha.value": 0.2, "ball.bsdf.specular_reflectance.value": [0.9, 0.6, 0.3]}
+    return made, truth, {"ball.bsdf.alpha.value": 0.5, "ball.bsdf.specular_reflectance.value": 0.5}, 0.01
+
+
 def sky() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     view = camera("perspective", [0, 1, 5])
     view["to_world"] = mi.ScalarTransform4f().look_at([0, -3, 1.5], [0, 0, 0.3], [0, 0, 1])  # the zenith is z
@@ -131,6 +159,8 @@ CASES: dict[str, Callable[[], tuple[Scene, dict[str, Any], dict[str, Any], float
     "lens": lens,
     "view": view,
     "glass": glass,
+    "plastic": plastic,
+    "metal": metal,
     "sky": sky,
     "sunlight": sunlight,
     "pose": pose,

@@ -84,6 +84,25 @@ def test_mesh_attributes_have_the_range_of_the_slot_that_reads_them() -> None:
     assert found["ball.vertex_idle"] == (None, None)
 
 
+def test_roughness_changes_the_form_of_a_bsdf_and_a_colour_does_not() -> None:
+    """By the slot that reads the values, directly, as a mesh attribute, or together with a colour."""
+    principled = scene(ball={"type": "sphere", "bsdf": {"type": "principled", "roughness": 0.3, "metallic": 0.2}})
+    plastic = scene(ball={"type": "sphere", "bsdf": {"type": "roughplastic", "alpha": 0.3}})
+    textures = {"base_color": attribute("vertex_color"), "roughness": attribute("vertex_rough")}
+    described = (principled, plastic, sheet(textures, {"vertex_color": 3, "vertex_rough": 1}))
+    known = {key: info for one in described for key, info in MitsubaRenderer(one, 3).parameters().items()}
+    expected = {
+        "ball.bsdf.base_color.value": False,
+        "ball.bsdf.roughness.value": True,
+        "ball.bsdf.metallic.value": True,
+        "ball.bsdf.diffuse_reflectance.value": False,
+        "ball.bsdf.alpha": True,
+        "ball.vertex_color": False,
+        "ball.vertex_rough": True,
+    }
+    assert {key: known[key].shapes_bsdf for key in expected} == expected
+
+
 def test_an_attribute_of_two_slots_has_the_range_of_both_and_another_mesh_its_own() -> None:
     textures = {"base_color": attribute("vertex_x"), "roughness": attribute("vertex_x")}
 

@@ -383,6 +383,33 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     assert all(error < 0.05 for error in made.parameter_error(result.parameters).values())
 
 
+@pytest.mark.parametrize(
+    ("small", "reached", "newton"), [(True, True, True), (False, True, False), (False, False, True)]
+)
+def test_numbers_of_bsdfs_take_gauss_newton_steps_on_small_films_or_without_path_gradients(
+    monkeypatch: pytest.MonkeyPatch, small: bool, reached: bool, newton: bool
+) -> None:
+    """The limit is the size of this film, or just below. Without a roughness there are path gradients."""
+    matrix = np.random.default_rng(1).uniform(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 4))
+    renderer = AnalyticRenderer({"rough": np.full(1, 0.4), "colour": np.full(3, 0.5)}, matrix, 0.1, 0.3, shape=SHAPE)
+    unknown = [Parameter(key, initial=0.2) for key in ("rough", "colour")]
+    made = Problem(renderer, unknown, [View(np.full((*SHAPE, 3), 0.5))])
+    constants(monkeypatch, bsdf_pixels=4 * SHAPE[0] * SHAPE[1] - (0 if small else 1))
+    if not reached:
+        monkeypatch.setattr("unrender.methods.rules.traits.refusal", lambda problem: "no path gradient of rough")
+    else:
+        assert isinstance(chosen(made)[0], PathGradient)
+    known = dict(renderer.parameters())
+    known["rough"] = dataclasses.replace(known["rough"], shapes_bsdf=True)
+    known["colour"] = dataclasses.replace(known["colour"], brightness="reflectance")
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
+    plan = method("auto").plan(made)
+    assert isinstance(plan.estimator, GaussNewton) == newton
+    assert ("with rough" in plan.reasons[0]) == newton
+    absolute = Problem(renderer, unknown, made.views, loss=losses.L1())
+    assert isinstance(chosen(absolute)[0], GaussNewton) != reached
+
+
 LIT = {
     "map": np.random.default_rng(2).uniform(0.2, 0.8, (3, 3, 1)),
     "sky": np.full((2, 2, 1), 3.0),

@@ -267,6 +267,36 @@ def test_standard_errors_cover_the_noise_of_the_references(
     assert abs(np.mean(np.abs(planted) < 1.0) - 0.683) > 0.10
 
 
+def ratio_of_variances(seeds: int) -> float:
+    """Return the stated variance over the true one, where one pixel of four has most of the derivative, and references have noise."""
+    shape = (6, 8)
+    matrix = 0.2 * np.random.default_rng(5).normal(size=(48, 3, 3))
+    matrix[::4] *= 6.0
+    matrix = matrix.reshape(-1, 3)
+    renderer = AnalyticRenderer(TRUTH, matrix, 0.1, 0.3, shape=shape)
+    unknown = [ur.Parameter(key, initial=value) for key, value in START.items()]
+    inverse = np.linalg.inv(matrix.T @ matrix)
+    grey = matrix.reshape(48, 3, 3).sum(axis=1)
+    true = 0.3**2 * np.diag(inverse @ grey.T @ grey @ inverse)
+    stated = []
+    for seed in range(seeds):
+        reference = renderer.exact(TRUTH) + noisy(shape, seed, True, False, 0.3)
+        made = ur.Problem(renderer, unknown, [ur.View(reference.astype(np.float32))], truth=TRUTH)
+        errors = ur.optimize(made, ur.GaussNewton(4, 4), AveragedNewton(), steps=24, seed=seed).standard_error
+        if errors:  # a run whose models are still of other places has none
+            stated.append(np.concatenate([np.ravel(errors[key]) for key in TRUTH]) ** 2 / true)
+    assert len(stated) > 0.7 * seeds
+    return float(np.mean(stated))
+
+
+def test_standard_errors_count_noise_that_the_fit_has_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """12 pixels decide three numbers. Their residuals are less than the noise, by 1 − h, which the planted fault takes as the noise."""
+    monkeypatch.setattr("unrender.runs.verify.Verify.on_result", lambda self, descent, result: result)
+    assert 0.85 < ratio_of_variances(16) < 1.4
+    monkeypatch.setattr(derivative_images, "_without_own_pixel", lambda residuals, *rest: residuals)
+    assert ratio_of_variances(16) < 0.8
+
+
 def test_exact_references_add_nothing_to_standard_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scores of exact references have mean 0, and their own noise is recognised."""
     monkeypatch.setattr("unrender.runs.verify.Verify.on_result", lambda self, descent, result: result)
@@ -291,13 +321,13 @@ class Residuals(Callback):
 
 
 def test_mean_residuals_are_kept_only_for_an_optimizer_that_states_errors() -> None:
-    """Of 20 pixels, 24 bytes each. A checkpoint of the others has the three parameters of the last step alone."""
+    """Of 20 pixels, 24 bytes each, and the Hessian. A checkpoint of the others has the three parameters of the last step alone."""
     seen = {}
     for optimizer in (AveragedNewton(), ur.optimizers.Newton()):
         one = seen[type(optimizer)] = Residuals()
         ur.optimize(problem(), ur.GaussNewton(2, 2), optimizer, steps=3, callbacks=[one])
     assert seen[AveragedNewton].kept == {20 * 24}
-    assert seen[AveragedNewton].stored == {20 * 24 + 3 * 8}
+    assert seen[AveragedNewton].stored == {20 * 24 + 9 * 8 + 3 * 8}
     assert seen[ur.optimizers.Newton].kept == {0}
     assert seen[ur.optimizers.Newton].stored == {3 * 8}
 

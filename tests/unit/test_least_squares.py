@@ -9,8 +9,9 @@ import pytest
 
 import unrender as ur
 from unrender.core.random import Key
+from unrender.estimators.gauss_newton import GaussNewtonState
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs.least_squares import NumbersCheck, _Fit, _judged, check_numbers
+from unrender.runs.least_squares import NumbersCheck, _Fit, _judged, check_numbers, pixel_weights
 from unrender.runs.numbers import Differences, Numbers
 
 SHAPE = (8, 8)
@@ -86,6 +87,34 @@ def test_the_noise_of_the_check_is_no_distance_and_no_number_is_known_better_tha
     np.testing.assert_allclose(check.standard_errors(values)["a"][:, 0], [5.0, 4.0, np.inf])
     own = check.standard_errors(values, {"a": np.full((3, 1), 3.5)})["a"][:, 0]  # the run knows its noise
     np.testing.assert_allclose(own, [np.sqrt(18.0), 3.5, np.inf])
+
+
+@pytest.mark.parametrize("planted", [False, True])
+def test_a_solution_with_weights_is_no_distance_from_the_fit(planted: bool):
+    """Half of the pixels have ten times the noise, and little weight in the run's steps. The planted fault is a fit with equal weights,
+    from whose solution the run's is far."""
+    size = np.where(np.arange(64).reshape(*SHAPE, 1) % 2, 0.2, 0.02)
+    weights, scores = 1.0 / (1.0 + np.square(size / 0.02)), []
+    for seed in range(8):
+        made = problem(MATRIX, reference_noise=0.0)
+        reference = np.asarray(made.views[0].reference) + size * np.random.default_rng(seed).normal(size=(*SHAPE, 3))
+        made = made.replaced(views=[ur.View(reference.astype(np.float32))])
+        roots = np.sqrt(np.repeat(weights.reshape(-1), 3))
+        target = np.asarray(made.views[0].reference, np.float64).reshape(-1) - 2.0
+        solution = np.linalg.lstsq(MATRIX * roots[:, None], target * roots, rcond=None)[0]
+        check = check_numbers(made, at(solution), made.initial_values(), FAR, weights=() if planted else (weights,))
+        errors = check.standard_errors(at(solution), {key: np.zeros(np.shape(x)) for key, x in TRUTH.items()})
+        scores += [np.ravel((at(solution)[key] - x) / errors[key]) for key, x in TRUTH.items()]
+    spread = float(np.concatenate(scores).std())
+    assert spread == pytest.approx(1.0, abs=0.35) if not planted else spread < 0.5
+
+
+def test_only_runs_with_weights_by_noise_have_them_in_the_test():
+    state = GaussNewtonState({}, variances=(np.array([[[1.0], [2.0], [9.0]]]),))
+    (weights,) = pixel_weights(ur.GaussNewton(noise_limit=3.0), state)
+    np.testing.assert_allclose(weights.ravel(), 1.0 / (1.0 + np.array([1.0, 2.0, 9.0]) / 6.0))
+    assert pixel_weights(ur.GaussNewton(), state) == ()
+    assert pixel_weights(ur.PathGradient(), None) == ()
 
 
 def test_a_run_that_arrived_is_told_nothing():

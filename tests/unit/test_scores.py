@@ -54,5 +54,42 @@ def test_a_pixel_that_a_fit_follows_counts_as_of_a_fit_without_it() -> None:
         sums = np.einsum("kpc,npc->nkp", slopes, of)
         return np.mean([np.diag(inverse @ s @ s.T @ inverse) for s in sums], axis=0) / true
 
-    assert (np.abs(claimed(scores.without_own_pixel(residuals, slopes, inverse)) - 1.15) < 0.25).all()
+    assert (np.abs(claimed(scores.without_own_pixel(residuals, slopes, slopes, inverse)) - 1.15) < 0.25).all()
     assert (claimed(residuals) < 0.85).all()
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_leverages_have_no_bias_by_the_noise_of_the_slopes(weighted: bool) -> None:
+    """Without the weights, or from one estimate of the slopes alone, the planted faults, residuals are divided by another 1 − h."""
+    rng = np.random.default_rng(0)
+    slopes, weights = rng.normal(size=(2, 40, 3)), rng.uniform(0.2, 2.0, (40, 1)) * np.ones(3) if weighted else None
+    roots = 1.0 if weights is None else np.sqrt(weights)
+    flat = (slopes * roots).reshape(2, -1)
+    inverse = np.linalg.inv(flat @ flat.T)
+    residuals, noise = rng.normal(size=(40, 3)), 0.5 * rng.normal(size=(400, 2, 2, 40, 3))
+    exact = scores.without_own_pixel(residuals, slopes, slopes, inverse, weights)
+    own = np.stack([np.einsum("kpc,kpd->pcd", np.tensordot(inverse, slopes * roots, axes=1), slopes * roots)])[0]
+    expected = np.linalg.solve(np.eye(3) - own, (residuals / roots)[..., None])[..., 0] * roots
+    np.testing.assert_allclose(exact, expected, rtol=1e-9)
+
+    def off(shared: bool) -> float:
+        sizes = []
+        for a, b in noise:
+            one, other = slopes + a, slopes + (a if shared else b)
+            sizes.append(scores.without_own_pixel(residuals, one, other, inverse, weights) - exact)
+        mean, error = np.mean(sizes, axis=0), np.std(sizes, axis=0) / np.sqrt(len(sizes))
+        return float(np.mean(mean * np.sign(residuals)) / np.sqrt(np.mean(error**2)))
+
+    assert abs(off(shared=False)) < 0.5 * off(shared=True)
+    if weighted:
+        plain = scores.without_own_pixel(residuals, slopes, slopes, inverse)
+        assert np.abs(plain - exact).max() > 0.01
+
+
+def test_small_and_negative_eigenvalues_are_left_out_of_the_inverse() -> None:
+    rng = np.random.default_rng(0)
+    units, turn = np.array([1.0, 1e3, 1e-3]), np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    whole = turn @ np.diag([1.0, 0.5, 0.2]) @ turn.T * np.outer(units, units)
+    np.testing.assert_allclose(scores.positive_inverse(whole) @ whole, np.eye(3), atol=1e-6)
+    flat = np.array([[1.0, 1.0 + 1e-6], [1.0 + 1e-6, 1.0]])
+    np.testing.assert_allclose(scores.positive_inverse(flat), np.full((2, 2), 0.25), rtol=1e-5)

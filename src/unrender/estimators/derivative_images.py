@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from unrender.core.arrays import Array
 from unrender.statistics import scores
 
 __all__ = [
     "REMEMBERED",
+    "HalvedImage",
     "HalvesMean",
     "LossWeights",
     "Products",
@@ -34,6 +36,16 @@ _MEMORY = 0.3
 """Weight of the latest image in the running mean of the variance."""
 _GROWTH = 1.0
 """Weights of derivative images in their mean grow as this power of their number."""
+
+
+@dataclass(frozen=True)
+class HalvedImage:
+    """The image of a view, the variance of its noise, and its two independent halves, (H, W, 3) each."""
+
+    mean: Array
+    variance: Array
+    one: Array
+    other: Array
 
 
 @dataclass(frozen=True)
@@ -208,6 +220,7 @@ def products(
     residuals: HalvesMean | None = None,
     block: int = 1,
     remembered: bool = False,
+    inverse: np.ndarray | None = None,
 ) -> Products:
     """Return the products of two independent halves of J, (m, H, W, 3) each.
 
@@ -218,6 +231,8 @@ def products(
         block: side of the blocks of pixels over which all but `squares` are summed.
         remembered: whether all steps share the derivative images. Their noise times that of the references then moves the solution, and
             `scores` include it.
+        inverse: of the Hessian, (m, m). `scores` then count the residuals that each pixel would have in a fit without it. A fit follows
+            the noise of the pixels that decide it, which hides there otherwise.
     """
     m = len(halves[0])
     total = Products.zero(m)
@@ -233,6 +248,8 @@ def products(
         if block > 1:
             one, other, first, *at = (_pooled(x, block) for x in (one, other, first, *at))
             second = _pooled(second, block) / _pooled(np.ones_like(second), block)
+        if residuals is not None and inverse is not None:
+            at[2:] = _without_own_pixel(at[2:], one, other, inverse, second)
         both = [0.5 * (one + other)] * 2 if remembered else [one, other]
         of_halves = [(part * of).sum(axis=3) for part, of in zip((one, other, *both), at, strict=False)]
         if residuals is not None:
@@ -245,6 +262,15 @@ def products(
         total.noise += (noise_of_halves * second).reshape(m, -1) @ noise_of_halves.reshape(m, -1).T
     total.hessian = 0.5 * (total.hessian + total.hessian.T)
     return total
+
+
+def _without_own_pixel(
+    residuals: list[np.ndarray], one: np.ndarray, other: np.ndarray, inverse: np.ndarray, second: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Yield two residuals (H, W, 3) as fits without each pixel would leave them, see `scores.without_own_pixel`."""
+    flat = [x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (np.stack(residuals), one, other, second)]
+    left = scores.without_own_pixel(flat[0], flat[1], flat[2], inverse, flat[3])
+    yield from left.reshape(2, *second.shape)
 
 
 def _pooled(images: np.ndarray, block: int) -> np.ndarray:

@@ -27,6 +27,7 @@ from unrender.estimators.capabilities import (
 )
 from unrender.estimators.derivative_images import (
     REMEMBERED,
+    HalvedImage,
     HalvesMean,
     LossWeights,
     Products,
@@ -42,6 +43,7 @@ from unrender.estimators.gradient_sum import damping, smoothed_variance
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
+from unrender.statistics.scores import positive_inverse
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
@@ -66,6 +68,7 @@ class GaussNewtonState:
         variances: running mean of the variance of each view's image, (H, W, 1); () without `noise_limit` and before the first estimate.
         derivatives: mean derivative images of each view; () without `remember` and before the first estimate.
         residuals: mean derivatives of the loss of each view, moved along to `point`; () without scores and before the first estimate.
+        hessian: last Hessian, (n, n); None without scores and before the first estimate.
     """
 
     widths: dict[str, float]
@@ -74,6 +77,7 @@ class GaussNewtonState:
     variances: tuple[np.ndarray, ...] = ()
     derivatives: tuple[HalvesMean, ...] = ()
     residuals: tuple[HalvesMean, ...] = ()
+    hessian: np.ndarray | None = None
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
         """Return an empty state: widths are estimated again."""
@@ -219,6 +223,7 @@ class GaussNewton:
             variances=tuple(system.variances) or state.variances,
             derivatives=tuple(system.derivatives) or state.derivatives,
             residuals=tuple(system.residuals),
+            hessian=system.products.hessian if system.residuals else None,
         )
 
 
@@ -273,16 +278,6 @@ class _System:
     residuals: list[HalvesMean] = field(default_factory=list)
 
 
-@dataclass(frozen=True)
-class _Images:
-    """The image of a view, the variance of its noise, and its two independent halves, (H, W, 3) each."""
-
-    mean: Array
-    variance: Array
-    one: Array
-    other: Array
-
-
 class _Point:
     """Images and derivative images of a problem at its parameters.
 
@@ -315,10 +310,11 @@ class _Point:
         only compute the quantities that the next widths need."""
         total = _System(Products.zero(self.theta.size), np.zeros(self.theta.size))
         steps = trees.repeat_per_element(state.widths, self.parameters)
+        inverse = None if state.hessian is None else positive_inverse(state.hessian)
         for view, sensor_view in enumerate(self.problem.views):
             elements = np.flatnonzero((self._sensors == -1) | (self._sensors == sensor_view.sensor))
-            own = key.fold(view)
-            images = self._images(view, own) if step is not None else None
+            seed = key.fold(view)
+            images = self._images(view, seed) if step is not None else None
             if images:
                 total.images[view] = images.mean
                 total.loss += arrays.number(self.problem.loss_value(view, images.mean))
@@ -326,7 +322,7 @@ class _Point:
             if not elements.size:
                 continue
             points, distances = self._points(elements, steps)
-            halves = [self._states(points, view, own.fold(half), self.options.derivative_spp) for half in (0, 1)]
+            halves = [self._states(points, view, seed.fold(half), self.options.derivative_spp) for half in (0, 1)]
             mean = HalvesMean(differences(halves[0], distances), differences(halves[1], distances))
             if images and self.options.remember:
                 if state.derivatives:
@@ -337,12 +333,13 @@ class _Point:
                 before = state.residuals[len(total.residuals)] if state.residuals else None
                 residuals = mean_residuals(before, weights, mean, step[elements], moved)
                 total.residuals.append(residuals)
-            own_products = products([mean.one, mean.other], weights, residuals, int(state.shift), self.options.remember)
-            total.products.add(own_products, elements)
+            own = None if inverse is None else inverse[np.ix_(elements, elements)]
+            parts = [mean.one, mean.other], weights, residuals, int(state.shift), self.options.remember, own
+            total.products.add(products(*parts), elements)
             total.slopes[elements] += squared_slope(halves)
         return total
 
-    def _noise_weighted(self, view: int, images: _Images, state: GaussNewtonState, total: _System) -> LossWeights:
+    def _noise_weighted(self, view: int, images: HalvedImage, state: GaussNewtonState, total: _System) -> LossWeights:
         """Return the derivatives of the loss with the weights of the noise, and add the image's variance to `total`.
 
         The weights are of earlier images only. A bright outlier has a large residual and a large variance, so weights by this image's
@@ -378,14 +375,14 @@ class _Point:
         self.samples += images.shape[0] * images.shape[1] * images.shape[2] * request.spp
         return images
 
-    def _images(self, view: int, key: Key) -> _Images:
+    def _images(self, view: int, key: Key) -> HalvedImage:
         """Return the image and its two halves."""
         halves = [self._states(self.theta[None], view, key.fold(_IMAGE + half), self.options.spp)[0] for half in (0, 1)]
         array = self.problem.renderer.array
         mean, variance = 0.5 * (halves[0] + halves[1]), 0.25 * np.square(halves[0] - halves[1])
-        return _Images(array(mean), array(variance), array(halves[0]), array(halves[1]))
+        return HalvedImage(array(mean), array(variance), array(halves[0]), array(halves[1]))
 
-    def _weights(self, view: int, images: _Images) -> LossWeights:
+    def _weights(self, view: int, images: HalvedImage) -> LossWeights:
         """Return ℓ' and ℓ'' at the image, and ℓ' at its halves, (H, W, 3) each."""
         problem, image = self.problem, images.mean
         derivative = problem.loss_derivative(view, image)

@@ -247,6 +247,7 @@ def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo
         viewpoint=any(info.viewpoint for info in targets),
         sensor=sensors.pop() if len(sensors) == 1 else None,
         nonlinear=any(info.nonlinear for info in targets),
+        shapes_bsdf=any(info.shapes_bsdf for info in targets),
     )
 
 

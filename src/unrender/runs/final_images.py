@@ -94,6 +94,7 @@ def render_final_images(
     spp: int | None = None,
     left: Callable[[], float] = lambda: math.inf,
     tested: bool = True,
+    weights: Sequence[np.ndarray] = (),
 ) -> FinalImages:
     """Render the reference, initial and final image of each view, and collect control weights, pixel probabilities and sensitivities.
 
@@ -108,6 +109,7 @@ def render_final_images(
         left: function that returns the remaining seconds. If few remain, images have fewer samples, and tests of undetermined parameters
             take about half a second.
         tested: whether to estimate sensitivities and to test what the images determine.
+        weights: weights of each view's pixels in the run's steps, see `least_squares.pixel_weights`.
     """
     with phases.phase("final pictures") as advance:
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
@@ -127,7 +129,7 @@ def render_final_images(
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
             lines, deviations = late.missing(), _without(deviations, late.unchecked)
         if everything:
-            lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests)
+            lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests, weights)
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
@@ -175,7 +177,11 @@ def _maps(result: Result, view: int, shape: tuple[int, ...]) -> dict[str, np.nda
 
 
 def _undetermined(
-    problem: Problem, result: Result, sensitivities: Mapping[str, np.ndarray], most: float
+    problem: Problem,
+    result: Result,
+    sensitivities: Mapping[str, np.ndarray],
+    most: float,
+    weights: Sequence[np.ndarray],
 ) -> tuple[list[str], tuple[str, ...], dict[str, np.ndarray]]:
     """Return lines about what the images do not determine and about numbers that have not settled, and standard errors; none without steps.
 
@@ -190,7 +196,7 @@ def _undetermined(
     lines += undetermined(problem, result.parameters, spp, seconds, per_pass)
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
-    numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities)
+    numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities, weights)
     text, deviations = "\n".join(lines), _without(result.standard_error, numbers.unchecked)
     lines += [line for key, line in numbers.undetermined.items() if key not in text] + numbers.missing(
         numbers.undetermined

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +17,15 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.display import formatting
+from unrender.estimators.base import Estimator
+from unrender.estimators.derivative_images import noise_weights
+from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.runs.field_directions import beside_fields, fields_of
 from unrender.runs.numbers import Differences, Numbers
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
 
-__all__ = ["NumbersCheck", "check_numbers", "checked_keys", "compile_check"]
+__all__ = ["NumbersCheck", "check_numbers", "checked_keys", "compile_check", "pixel_weights"]
 
 _STREAM, _FIELDS = 4, 1 << 16
 """Stream of all random numbers, and index of those of textures and grids."""
@@ -120,6 +124,7 @@ def check_numbers(
     start: Mapping[str, np.ndarray],
     seconds: float,
     sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
+    weights: Sequence[np.ndarray] = (),
 ) -> NumbersCheck:
     """Test the problem's numbers by least squares at `values`.
 
@@ -140,10 +145,13 @@ def check_numbers(
         start: {key: array} at the start.
         seconds: time after which nothing further is started; the numbers are `unchecked` then.
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
+        weights: weights of each view's pixels in the steps of the run, beside those of the loss, see `pixel_weights`; () for equal ones.
+            A fit with other weights has another solution, and the distance from it would count as an error of the run.
     """
     numbers = Numbers.of(problem, values, start)
     if numbers is None:
         return NumbersCheck()
+    numbers = replace(numbers, weights=weights)
     until = time.perf_counter() + seconds
     try:
         return _check(numbers, sensitivities, until)
@@ -152,6 +160,13 @@ def check_numbers(
         np.linalg.LinAlgError,
     ):  # a value that the renderer rejects, or matrices without eigenvalues in double precision
         return NumbersCheck()
+
+
+def pixel_weights(estimator: Estimator, state: Any) -> tuple[np.ndarray, ...]:
+    """Return the weights of each view's pixels in the next step, (H, W, 1), by the noise of earlier images; () for equal ones."""
+    if not (isinstance(estimator, GaussNewton) and isinstance(state, GaussNewtonState) and estimator.noise_limit):
+        return ()
+    return tuple(noise_weights(variance, estimator.noise_limit) for variance in state.variances)
 
 
 def checked_keys(
@@ -276,7 +291,7 @@ class _Fit:
         residual, noise = (0.5 * (residuals[0] + sign * residuals[1]) for sign in (1.0, -1.0))
         along = -inverse @ np.where(hidden, 0.0, np.tensordot(slopes, residual, axes=2))
         after = residuals + np.tensordot(along, slopes, axes=1)  # a run that ended early leaves more
-        whole = covariance(*scores.without_own_pixel(after, slopes, inverse))
+        whole = covariance(*scores.without_own_pixel(after, slopes, slopes, inverse))
         whole *= 1.0 if residual.size > len(whole) else math.inf
         error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (whole, covariance(noise, noise)))
         step = numbers.inside((numbers.point + changes @ along)[None])[0] - numbers.point

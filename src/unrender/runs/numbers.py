@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -87,6 +87,7 @@ class Numbers:
         rigid: whether a number is of a pose, (n,).
         spp: samples per pixel of a picture.
         fields: {key: (k, *shape)}, directions of textures and grids.
+        weights: weights of each view's pixels beside those of the loss, (H, W, 1); () for equal ones.
     """
 
     problem: Problem
@@ -99,6 +100,7 @@ class Numbers:
     rigid: np.ndarray
     spp: int
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
+    weights: Sequence[np.ndarray] = ()
 
     @classmethod
     def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> Numbers | None:
@@ -225,7 +227,8 @@ class Numbers:
 
     def roots(self, view: int) -> np.ndarray:
         """Return the roots of the weights of a view's pixels, (P, 1)."""
-        return mask_roots(self.problem, view).reshape(-1, 1) * math.sqrt(self.problem.views[view].weight)
+        roots = mask_roots(self.problem, view).reshape(-1, 1) * math.sqrt(self.problem.views[view].weight)
+        return roots * np.sqrt(self.weights[view]).reshape(-1, 1) if self.weights else roots
 
     def differences(self, directions: np.ndarray, key: Key) -> Differences:
         """Return the differences of `point` ± each column of directions (n + k, K), within the bounds."""

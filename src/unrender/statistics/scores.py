@@ -6,6 +6,8 @@ import numpy as np
 
 _MOST_LEVERAGE = 0.9
 """Largest leverage of a pixel; noise of the slopes may make it larger."""
+_LEAST_CURVATURE = 1e-3
+"""Smallest eigenvalue of a Hessian, relative to the largest, along which pixels have leverage."""
 _AGREE_ERRORS = 3.0
 """Standard errors from which on neighbours share their noise."""
 _FEWEST_PIXELS = 256
@@ -49,22 +51,36 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def without_own_pixel(residuals: np.ndarray, slopes: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+def without_own_pixel(
+    residuals: np.ndarray, one: np.ndarray, other: np.ndarray, inverse: np.ndarray, weights: np.ndarray | None = None
+) -> np.ndarray:
     """Return the residuals that each pixel would have if the fit had left it out, (1 − h)⁻¹ r, (..., P, C).
 
     A fit follows the noise of its pixels, so its residuals r are smaller than the noise. h = J_p (JᵀJ)⁻¹ J_pᵀ (C, C) is the leverage of a
     pixel, with eigenvalues clamped to [0, 0.9] (Efron's jackknife; HC3 of MacKinnon and White 1985).
 
     Args:
-        residuals: residuals of the fit, (..., P, C).
-        slopes: J, (n, P, C).
-        inverse: (JᵀJ)⁻¹, (n, n).
+        residuals: residuals of the fit, (..., P, C), times the weights if there are any.
+        one, other: two estimates of J with independent noise, (n, P, C). Equal arrays include the noise in the leverages.
+        inverse: (JᵀJ)⁻¹, with weights (JᵀWJ)⁻¹, (n, n).
+        weights: diagonal of W, (P, C), >= 0; None for 1.
     """
-    leverages = np.einsum("kpc,kpd->pcd", np.tensordot(inverse, slopes, axes=1), slopes)
-    values, vectors = np.linalg.eigh(leverages)
-    left = 1.0 - np.clip(values, 0.0, _MOST_LEVERAGE)
-    along = np.einsum("pcd,...pc->...pd", vectors, residuals)
-    return np.einsum("pcd,...pd->...pc", vectors, along / left)
+    roots = np.ones(one.shape[1:]) if weights is None else np.sqrt(np.maximum(weights, 0.0))
+    leverages = np.einsum("kpc,kpd->pcd", np.tensordot(inverse, one * roots, axes=1), other * roots)
+    values, vectors = np.linalg.eigh(0.5 * (leverages + leverages.swapaxes(1, 2)))
+    left, units = 1.0 - np.clip(values, 0.0, _MOST_LEVERAGE), np.where(roots > 0.0, roots, 1.0)
+    along = np.einsum("pcd,...pc->...pd", vectors, residuals / units)
+    return np.einsum("pcd,...pd->...pc", vectors, along / left) * units
+
+
+def positive_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inverse of a symmetric matrix (n, n) from eigenvalues above 0.001 of the largest, scaled to unit diagonal."""
+    units = np.sqrt(np.abs(np.diag(matrix)))
+    units = np.where(units > 0.0, units, 1.0)
+    eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
+    used = eigenvalues > _LEAST_CURVATURE * eigenvalues[-1]
+    inverse = np.divide(1.0, eigenvalues, out=np.zeros_like(eigenvalues), where=used)
+    return (vectors * inverse) @ vectors.T / np.outer(units, units)
 
 
 def positive_part(matrix: np.ndarray) -> np.ndarray:

@@ -112,6 +112,11 @@ class Constants:
 
     few_numbers: int = 24
     """Number of elements of all numbers up to which they take Gauss-Newton steps. Source: their cost, by hand (7adae11)."""
+    bsdf_pixels: int = 1 << 13
+    """Elements times pixels up to which numbers of BSDFs with path gradients take such steps.
+
+    Source: `limit`, `numbers` at 16²; on 32² as good at the end and earlier, on 48² with seven numbers and 96² as good and later.
+    """
     number_paths: int = 1 << 16
     """Path budget of the images of such a step. Source: lamps, lens and frosted glass in 12 s (7adae11)."""
     number_spp: tuple[int, int] = (4, 256)

@@ -64,11 +64,12 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
 def few_numbers(traits: Traits) -> Plan | None:
     """Return Gauss-Newton steps if few numbers are unknown, and one is a light's or changes the form of the image; else None.
 
-    Poses take them if derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be
-    combined with other numbers, such as intensities.
+    Numbers of a BSDF, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses take these steps if
+    derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be combined with other
+    numbers, such as intensities.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
-    nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear]
+    nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_bsdfs(traits)
     shapes = any(not traits.infos[key].light for key in traits.poses)
     mixed = shapes and len(traits.poses) < len(keys)
     if not (nonlinear or traits.lights) or mixed or not traits.newton_suits or not _few(traits, keys):
@@ -115,6 +116,14 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
         reasons=(reason, *plan.reasons),
     )
     return best_start(traits, keys, made)
+
+
+def _of_bsdfs(traits: Traits) -> list[str]:
+    """Return the keys of numbers that change the form of a BSDF; none where path gradients are as good at lower cost, or may be."""
+    keys = [key for key, info in traits.infos.items() if info.shapes_bsdf]
+    small = traits.elements * traits.problem.pixels <= traits.constants.bsdf_pixels
+    measured = traits.problem.loss.linear and all(x.shapes_bsdf or x.brightness for x in traits.infos.values())
+    return keys if keys and ((small and measured) or traits.unreachable) else []
 
 
 def _few(traits: Traits, keys: tuple[str, ...]) -> bool:

@@ -82,7 +82,7 @@ def _dimensions(traits: Traits, key: str) -> int:
         return 0
     if info.role == "direction":
         return 2 if unknown.shape() == (3,) else 0
-    formed = info.light if info.rigid else info.nonlinear
+    formed = info.light if info.rigid else info.nonlinear or info.shapes_bsdf
     return unknown.initial.size if formed and None not in _range(traits, key) else 0
 
 

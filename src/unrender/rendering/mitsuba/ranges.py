@@ -25,6 +25,7 @@ class Range:
         above: another parameter of the same object whose value in the scene is a lower limit; "" for none.
         below: another parameter of the same object whose value in the scene is an upper limit; "" for none.
         lobe: whether the value decides the probability with which a lobe is sampled. At an end that probability is 0.
+        shapes_bsdf: whether the value changes the form of a BSDF, such as a roughness, and not its colour.
     """
 
     low: float | None = None
@@ -34,6 +35,7 @@ class Range:
     above: str = ""
     below: str = ""
     lobe: bool = False
+    shapes_bsdf: bool = False
 
     def scaled(self, factor: float) -> Range:
         """Return the range of x such that factor · x is in this range."""
@@ -53,7 +55,8 @@ class Range:
         if low is not None and high is not None and low >= high:
             return self
         singular = other.singular if self.singular is None else self.singular
-        return replace(self, low=low, high=high, singular=singular, lobe=self.lobe or other.lobe)
+        lobe, shapes_bsdf = self.lobe or other.lobe, self.shapes_bsdf or other.shapes_bsdf
+        return replace(self, low=low, high=high, singular=singular, lobe=lobe, shapes_bsdf=shapes_bsdf)
 
 
 UNKNOWN = Range(unit="")
@@ -61,7 +64,8 @@ UNKNOWN = Range(unit="")
 
 _SHARE = Range(0.0, 1.0)
 _LOBE = Range(0.0, 1.0, lobe=True)
-_ROUGHNESS = Range(0.02, 1.0)
+_FORM = Range(0.0, 1.0, shapes_bsdf=True)
+_ROUGHNESS = Range(0.02, 1.0, shapes_bsdf=True)
 _IOR = Range(0.2, 5.0, "ratio of indices", singular=1.0)
 _COMPLEX_IOR = Range(0.0, None, "index")
 _LENGTH = Range(unit="scene units")
@@ -75,12 +79,15 @@ KINDS: dict[str, dict[str, Range]] = {
         **dict.fromkeys(
             (
                 "reflectance", "diffuse_reflectance", "specular_reflectance", "specular_transmittance",
-                "diffuse_transmittance", "transmittance", "base_color", "metallic", "specular", "anisotropic",
-                "spec_tint", "sheen", "sheen_tint", "clearcoat", "clearcoat_gloss", "flatness",
+                "diffuse_transmittance", "transmittance", "base_color", "spec_tint", "sheen_tint",
             ),
             _SHARE,
         ),
-        **dict.fromkeys(("spec_trans", "opacity", "weight"), _LOBE),
+        **dict.fromkeys(
+            ("metallic", "specular", "anisotropic", "sheen", "clearcoat", "clearcoat_gloss", "flatness"), _FORM
+        ),
+        **dict.fromkeys(("opacity", "weight"), _LOBE),
+        "spec_trans": replace(_LOBE, shapes_bsdf=True),
         **dict.fromkeys(("alpha", "alpha_u", "alpha_v", "roughness"), _ROUGHNESS),
         "eta": _IOR,
         "normalmap": Range(0.0, 1.0, "(direction + 1) / 2"),

@@ -330,10 +330,10 @@ class ScenePair:
 
     def _with_meaning(self, key: str, info: ParameterInfo) -> ParameterInfo:
         """Return `info` with the role, brightness, linearity and file conversion of the parameter."""
-        conversion = scene_loading.conversion(self.current_parameters, key, self.description)
-        kinds = role(self.current_parameters, key, info.shape), brightness(self.current_parameters, key)
-        form, lobe = is_nonlinear(self.current_parameters, key, info.singular), self.physical_range(key).lobe
-        return replace(info, conversion=conversion, role=kinds[0], brightness=kinds[1], nonlinear=form, lobe=lobe)
+        known, limits, described = self.current_parameters, self.physical_range(key), self.description
+        form, conversion = is_nonlinear(known, key, info.singular), scene_loading.conversion(known, key, described)
+        info = replace(info, nonlinear=form, lobe=limits.lobe, shapes_bsdf=limits.shapes_bsdf, conversion=conversion)
+        return replace(info, role=role(known, key, info.shape), brightness=brightness(known, key))
 
     def _info(self, key: str) -> ParameterInfo:
         flags = self.current_parameters.flags(key)

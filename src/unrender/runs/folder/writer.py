@@ -48,6 +48,7 @@ from unrender.runs.folder.schema import (
     TRUTH,
 )
 from unrender.runs.folder.state import not_finite, pack
+from unrender.runs.least_squares import pixel_weights
 from unrender.runs.result import PRUNED, TERMINATED, Result
 from unrender.scene import serialization
 
@@ -178,7 +179,8 @@ class RunWriter(Callback):
                 # Save the long computation and its outcome before the final images take more time.
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
-            images = render_final_images(run.problem, result, self.final_spp, run.time_left, self._tested)
+            weights = pixel_weights(run.estimator, run.state.estimator)
+            images = render_final_images(run.problem, result, self.final_spp, run.time_left, self._tested, weights)
             result = replace(
                 result,
                 pictures=images.pictures,
