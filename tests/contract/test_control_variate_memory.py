@@ -90,3 +90,12 @@ def test_where_nothing_moves_images_are_averaged() -> None:
     np.testing.assert_allclose(memory.relative_variance, 1 / 20, rtol=1e-4)
     moved, _ = along(0.05)
     assert np.abs(np.asarray(moved.relative_variance) * 20 - 1).max() > 0.01
+
+
+@pytest.mark.parametrize("name", ["alpha", "beta"])
+def test_a_decay_outside_its_range_is_refused(name: str) -> None:
+    for decay in (-0.1, 1.0, float("nan"), "0.5"):
+        with pytest.raises(
+            ur.InputError, match=f"RecursiveControlVariate: {name} must be a finite number >= 0 and < 1"
+        ):
+            ur.images.RecursiveControlVariate(**{name: decay})  # type: ignore

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import importlib.metadata
 import inspect
@@ -374,3 +375,18 @@ def test_a_component_that_is_not_registered_is_resumed_where_it_is_handed_in(tmp
     again = ur.resume(tmp_path / "run", optimizer=Halved())
     assert again.resumed == [4]
     assert again.parameters == whole.parameters
+
+
+FLAGS = [
+    (of, each.name) for of in TABLES.values() for each in dataclasses.fields(of) if each.init and each.type == "bool"
+]
+
+
+@pytest.mark.parametrize(("of", "flag"), FLAGS, ids=lambda each: getattr(each, "__name__", each))
+def test_a_flag_that_is_not_true_or_false_is_refused(of: Any, flag: str) -> None:
+    """The text "false" would count as true."""
+    required = {"count": 4, "sigma": 0.1}
+    arguments = {each.name: required[each.name] for each in dataclasses.fields(of) if each.name in required}
+    with pytest.raises(InputError, match=f"^{of.__name__}: {flag} must be true or false, got 'false'"):
+        of(**arguments | {flag: "false"})
+    assert of(**arguments | {flag: np.bool_(getattr(of(**arguments), flag))}) == of(**arguments)

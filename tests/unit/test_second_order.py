@@ -636,7 +636,7 @@ def test_a_whole_run(optimizer, order):
         (lambda: CMAES(sigma0=0.0), "CMAES: sigma0 must be a finite number > 0, got 0.0"),
         (lambda: CMAES(population=3), "CMAES: population must be a whole number of at least 4, got 3"),
         (lambda: CMAES(seed=-1), "CMAES: seed must be a whole number of at least 0, got -1"),
-        (lambda: CMAES(diagonal=1), "CMAES: diagonal must be True or False, got 1"),  # type: ignore
+        (lambda: CMAES(diagonal=1), "CMAES: diagonal must be true or false, got 1"),  # type: ignore
         (lambda: CMAES(learning_rate=-1), "CMAES: learning_rate must be a finite number > 0, got -1"),
         (
             lambda: CMAES().init(LIKE, {"c": 1.0}),

@@ -30,6 +30,7 @@ from unrender.optimizers.transforms import (
     WienerShrinkage,
 )
 from unrender.optimizers.transforms.agreement_rate import Agreement
+from unrender.optimizers.transforms.base import checked_keys
 from unrender.optimizers.transforms.lasting_agreement import GradientBlocks
 from unrender.preconditioners import Sobolev
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack
@@ -259,3 +260,10 @@ def test_what_a_transform_requires_the_chain_requires() -> None:
     }
     with pytest.raises(InputError, match="variance"):
         take(Chain((ScaleByDeviation(),)), [replace(estimates(1)[0], capabilities=())])
+
+
+def test_keys_are_read_once_and_nothing_else_is_accepted() -> None:
+    assert checked_keys("A: keys", (key for key in "ab")) == ("a", "b")
+    for keys in (5, None, "ab", ["a", 1]):
+        with pytest.raises(InputError, match=r"^A: keys must be keys of parameters"):
+            checked_keys("A: keys", keys)

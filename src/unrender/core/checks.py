@@ -1,10 +1,13 @@
-"""Checks of numbers and text from the user. Each failure is one line with the field's name and the expected value."""
+"""Checks of numbers, flags and text from the user. Each failure is one line with the field's name and the expected value."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from numbers import Integral, Real
 from typing import Any
+
+import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import printable
@@ -35,6 +38,13 @@ def integer(owner: str, name: str, value: Any, at_least: int) -> int:
     if isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= at_least:
         return int(value)
     raise InputError(f"{owner}: {name} must be a whole number of at least {at_least}, got {value!r}")
+
+
+def flags(part: Any) -> None:
+    """Raise `InputError` unless each field of a dataclass instance whose annotation is `bool` is true or false."""
+    for field in dataclasses.fields(part):
+        if field.type in ("bool", bool) and not isinstance(value := getattr(part, field.name), (bool, np.bool_)):
+            raise InputError(f"{type(part).__name__}: {field.name} must be true or false, got {value!r}")
 
 
 def encode_text(text: str, where: str) -> bytes:

@@ -138,6 +138,7 @@ class GaussNewton:
     scores: bool = True
 
     def __post_init__(self):
+        checks.flags(self)
         for key, width in self.largest.items():
             checks.number("GaussNewton", f"largest of {key}", width, above=0.0)
         for name in ("spp", "derivative_spp"):

@@ -125,6 +125,7 @@ class HybridGradient:
     every: int = 1
 
     def __post_init__(self):
+        checks.flags(self)
         if isinstance(self.path, type) or not hasattr(self.path, "provides"):
             raise InputError(
                 f"HybridGradient: path must be an estimator, such as PathGradient(), got {self.path!r:.80}"

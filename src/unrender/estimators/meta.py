@@ -155,6 +155,7 @@ class MetaEstimator:
     difference_images: Literal["own", "proportional"] = "own"
 
     def __post_init__(self):
+        checks.flags(self)
         for name, coupled, default in (
             ("proportional_spp", False, _PROPORTIONAL_SPP),
             ("difference_spp", False, _DIFFERENCE_SPP),

@@ -115,6 +115,7 @@ class PathGradient:
     differential_bsdf: bool = False
 
     def __post_init__(self):
+        checks.flags(self)
         checks.number("PathGradient", "tolerance", self.tolerance, above=0.0, inclusive=True)
         for name, value in (("spp", self.spp), ("adjoint_spp", self.adjoint_spp)):
             if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):

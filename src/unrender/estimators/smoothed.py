@@ -145,6 +145,7 @@ class SmoothedDerivatives:
     orthogonal: bool = False
 
     def __post_init__(self):
+        checks.flags(self)
         if self.order not in ("gradient", "hessian", "hvp"):
             raise InputError(f'SmoothedDerivatives: order must be "gradient", "hessian" or "hvp", got {self.order!r}')
         if self.product and self.order != "gradient":

@@ -139,12 +139,12 @@ class RecursiveControlVariate:
     max_weight: float = 1.0
 
     def __post_init__(self):
+        checks.flags(self)
         checks.integer("RecursiveControlVariate", "whole_views", self.whole_views, at_least=1)
         if self.space not in ("path", "primary"):
             raise InputError(f'RecursiveControlVariate: space must be "path" or "primary", got {self.space!r}')
         for name in ("alpha", "beta"):
-            if not 0 <= getattr(self, name) < 1:
-                raise InputError(f"RecursiveControlVariate: {name} must be in [0, 1), got {getattr(self, name)!r}")
+            checks.number("RecursiveControlVariate", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
         if not checks.number("RecursiveControlVariate", "max_weight", self.max_weight, above=0.0) <= 1:
             raise InputError(f"RecursiveControlVariate: max_weight must be in (0, 1], got {self.max_weight!r}")
 

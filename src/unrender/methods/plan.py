@@ -87,12 +87,12 @@ class Plan:
         for name, method in zip(_COMPONENTS, ("estimate", "update"), strict=True):
             if not callable(getattr(made[name], method, None)):
                 raise InputError(f"{where}: {name}: {type(made[name]).__name__} is not an {name}")
-        given = table.get("settings", {})
-        if not isinstance(given, Mapping):
-            raise InputError(f"{where}: settings: expected a table of settings by key, got {given!r:.60}")
-        if other := next((key for key in given if key not in problem.unknowns), None):
+        entries = table.get("settings", {})
+        if not isinstance(entries, Mapping):
+            raise InputError(f"{where}: settings: expected a table of settings by key, got {entries!r:.60}")
+        if other := next((key for key in entries if key not in problem.unknowns), None):
             raise InputError(f"{where}: settings: {other} is not an unknown{did_you_mean(other, problem.unknowns)}")
-        settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in given.items()}
+        settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in entries.items()}
         return cls(problem, made["estimator"], made["optimizer"], settings)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from unrender.core import checks
-from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.optimizers import rates
 from unrender.optimizers.chain import Recipe
@@ -46,8 +45,7 @@ class Adam(Recipe):
         checks.number("Adam", "beta_1", self.beta_1, above=0.0, below=1.0, inclusive=True)
         checks.number("Adam", "beta_2", self.beta_2, above=0.0, below=1.0, inclusive=True)
         checks.number("Adam", "epsilon", self.epsilon, above=0.0)
-        if not isinstance(self.uniform, bool):
-            raise InputError(f"Adam: uniform must be true or false, got {self.uniform!r}")
+        checks.flags(self)
 
     def compose(self) -> tuple[StepTransform, ...]:
         return GradientMean(self.beta_1), ScaleByRms(self.beta_2, self.epsilon, self.uniform)

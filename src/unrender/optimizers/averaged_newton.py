@@ -25,6 +25,7 @@ from unrender.estimators.capabilities import (
 from unrender.optimizers import rates
 from unrender.optimizers.directions import coordinate_scales
 from unrender.optimizers.newton import trust_region_step
+from unrender.optimizers.transforms.base import checked_keys
 from unrender.statistics.scores import positive_part
 
 _FEWEST_MODELS = 8.0
@@ -126,9 +127,7 @@ class AveragedNewton:
     linear: tuple[str, ...] = ()
 
     def __post_init__(self):
-        if isinstance(self.linear, str):
-            raise InputError(f"AveragedNewton: linear: expected a list of keys, got {self.linear!r}")
-        object.__setattr__(self, "linear", tuple(self.linear))  # files hold lists
+        object.__setattr__(self, "linear", checked_keys("AveragedNewton: linear", self.linear))
         rates.check("AveragedNewton", self.learning_rate, None)
         checks.number("AveragedNewton", "averaging", self.averaging, above=0.0, inclusive=True)
         checks.number("AveragedNewton", "damping", self.damping, above=0.0, below=1.0)

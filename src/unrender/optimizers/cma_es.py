@@ -90,8 +90,7 @@ class CMAES:
         checks.integer("CMAES", "seed", self.seed, at_least=0)
         if self.population is not None:
             checks.integer("CMAES", "population", self.population, at_least=4)
-        if not isinstance(self.diagonal, bool):
-            raise InputError(f"CMAES: diagonal must be True or False, got {self.diagonal!r}")
+        checks.flags(self)
 
     @property
     def requires(self) -> Capabilities:

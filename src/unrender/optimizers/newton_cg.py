@@ -72,6 +72,7 @@ class NewtonCG:
     line: bool = False
 
     def __post_init__(self):
+        checks.flags(self)
         check_options("NewtonCG", self)
         checks.number("NewtonCG", "trust_radius", self.trust_radius, above=0.0)
         checks.integer("NewtonCG", "iterations", self.iterations, at_least=1)

@@ -15,6 +15,7 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate, Capabilities, FreshGradient, Gradient
 from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Choosing, Optimizer, averaged_by
+from unrender.optimizers.transforms.base import checked_keys
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 
 
@@ -55,9 +56,7 @@ class Partitioned:
     others: Optimizer = field(default_factory=Adam)
 
     def __post_init__(self):
-        if isinstance(self.keys, str) or not all(isinstance(key, str) for key in self.keys):
-            raise InputError(f"Partitioned: keys must be keys of parameters, got {self.keys!r}")
-        object.__setattr__(self, "keys", tuple(self.keys))
+        object.__setattr__(self, "keys", checked_keys("Partitioned: keys", self.keys))
         if self.others.requires != Capabilities(Gradient):
             kind = type(self.others).__name__
             raise InputError(
@@ -106,9 +105,9 @@ class Partitioned:
 
     def averages(self, keys: Iterable[str]) -> frozenset[str]:
         """Return the keys that one of the two optimizers averages."""
-        given = frozenset(keys)
-        return averaged_by(self.optimizer, given.intersection(self.keys)) | averaged_by(
-            self.others, given.difference(self.keys)
+        all_keys = frozenset(keys)
+        return averaged_by(self.optimizer, all_keys.intersection(self.keys)) | averaged_by(
+            self.others, all_keys.difference(self.keys)
         )
 
     def choices(self, state: PartitionedState) -> tuple[str, ...]:

@@ -83,6 +83,7 @@ class ScheduleFree(Recipe):
     _smoothing: FittedSobolev = field(default_factory=FittedSobolev, init=False, repr=False, compare=False)
 
     def __post_init__(self):
+        checks.flags(self)
         rates.check("ScheduleFree", self.learning_rate, self.schedule)
         for name in ("beta", "beta_2"):
             checks.number("ScheduleFree", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unrender.core import checks
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -96,6 +97,7 @@ class Adaptive:
     by_cost: bool = True
 
     def __post_init__(self):
+        checks.flags(self)
         self._sampler(_FEWEST if self.count is None else self.count).check()
 
     def _sampler(self, count: int) -> GuidedSampler:

@@ -107,6 +107,7 @@ class AdaptiveCounts:
     by_cost: bool = True
 
     def __post_init__(self):
+        checks.flags(self)
         checks.integer("AdaptiveCounts", "least", self.least, at_least=2)
         checks.integer("AdaptiveCounts", "refresh", self.refresh, at_least=1)
         share = self.uniform

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unrender.core import checks
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
@@ -36,6 +37,7 @@ class LossProportional:
     denoiser: MapDenoiser = "auto"
 
     def __post_init__(self):
+        checks.flags(self)
         self._sampler.check()
 
     @property

@@ -40,6 +40,7 @@ class Uniform:
     stratified: bool = True
 
     def __post_init__(self):
+        checks.flags(self)
         checks.integer("Uniform", "count", self.count, at_least=1)
 
     def init(self, problem: Problem, parameters: Tree) -> UniformState:

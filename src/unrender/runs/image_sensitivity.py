@@ -241,8 +241,8 @@ def _projections(
     """Return {key: Jᵀs, and Jᵀ√Σ s with noise} for the signs s of a probe, on one of its two sets of paths."""
     signs, pictures = np.random.default_rng(key.uint32()), []
     for view in range(len(problem.views))[:views]:
-        drawn = signs.choice(np.array([-1, 1], np.float32), size=(*problem.sizes[view], 3)) * mask_roots(problem, view)
-        pictures.append(np.stack([drawn, drawn * np.sqrt(noise[view])] if noise else [drawn]))
+        image = signs.choice(np.array([-1, 1], np.float32), size=(*problem.sizes[view], 3)) * mask_roots(problem, view)
+        pictures.append(np.stack([image, image * np.sqrt(noise[view])] if noise else [image]))
     seeds = {view: key.fold(2 * view + half) for view in range(len(pictures))}
     return adjoints(problem, session, parameters, keys, spp, seeds, pictures)
 

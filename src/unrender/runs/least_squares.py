@@ -82,19 +82,19 @@ class NumbersCheck:
     unchecked: tuple[str, ...] = ()
     fixed: Mapping[str, str] = field(default_factory=dict)
 
-    def missing(self, told: Collection[str] = ()) -> list[str]:
+    def missing(self, reported: Collection[str] = ()) -> list[str]:
         """Return at most one line: why the standard errors of the unchecked numbers are unknown.
 
         Args:
-            told: keys to leave out, since other lines are about them.
+            reported: keys to leave out, since other lines are about them.
         """
-        keys = [key for key in self.unchecked if key not in told]
+        keys = [key for key in self.unchecked if key not in reported]
         if not keys:
             return []
         if not self.fixed:
             return [f"whether {listed(keys)} converged: no time was left to test it; use more seconds or fewer pixels"]
-        beside = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
-        return [f"standard errors of {listed(keys)}: they are unknown beside {beside}"]
+        others = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
+        return [f"standard errors of {listed(keys)}: they are unknown beside {others}"]
 
     def standard_errors(
         self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] = MappingProxyType({})
@@ -208,10 +208,10 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
     if moved:
         now = time.perf_counter()
         half = now + 0.5 * (until - now) if math.isfinite(until) else until
-        beside = beside_fields(numbers, differences, moved, sensitivities, change, key.fold(_FIELDS), half)
-        if beside is None:
+        extended = beside_fields(numbers, differences, moved, sensitivities, change, key.fold(_FIELDS), half)
+        if extended is None:
             return NumbersCheck(unchecked=numbers.keys)
-        numbers, differences, missing = beside
+        numbers, differences, missing = extended
         fixed |= dict.fromkeys(moved, missing) if missing else {}
     directions, repeats = _directions(differences, numbers.limits, change), 0
     weights = np.zeros(directions.shape[1])
@@ -291,9 +291,9 @@ class _Fit:
         residual, noise = (0.5 * (residuals[0] + sign * residuals[1]) for sign in (1.0, -1.0))
         along = -inverse @ np.where(hidden, 0.0, np.tensordot(slopes, residual, axes=2))
         after = residuals + np.tensordot(along, slopes, axes=1)  # a run that ended early leaves more
-        whole = covariance(*scores.without_own_pixel(after, slopes, slopes, inverse))
-        whole *= 1.0 if residual.size > len(whole) else math.inf
-        error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (whole, covariance(noise, noise)))
+        total = covariance(*scores.without_own_pixel(after, slopes, slopes, inverse))
+        total *= 1.0 if residual.size > len(total) else math.inf
+        error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (total, covariance(noise, noise)))
         step = numbers.inside((numbers.point + changes @ along)[None])[0] - numbers.point
         flat = squares + _ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size
         # The noise of this check says nothing about references that have much less of it.
@@ -301,7 +301,7 @@ class _Fit:
         # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
         open_ = flat[None] | (~numbers.rigid[:, None] & comparable)
         unseen = np.abs(changes[:n]) * (hidden[None] & open_)
-        return cls(whole, error, own, step[:n], unseen[:, hidden])
+        return cls(total, error, own, step[:n], unseen[:, hidden])
 
 
 def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
@@ -323,9 +323,9 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
         if open_[of].any():
             others = [k for k, x in numbers.places().items() if k != key and together[of][open_[of]][:, x].any()]
             others += [*numbers.fields] if shared[of].any() else []
-            beside = f", together with {listed(others)}" if others else ""
+            together_with = f", together with {listed(others)}" if others else ""
             undetermined[key] = (
-                f"{key}: the references leave it open by ± {_numbers(shown[of])}{max(more[of])}{beside} (standard error with their "
+                f"{key}: the references leave it open by ± {_numbers(shown[of])}{max(more[of])}{together_with} (standard error with their "
                 "noise); fix one of these, add views, or narrow the bounds"
             )
         elif further[of].any() and numbers.problem.loss.linear:

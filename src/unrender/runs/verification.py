@@ -97,7 +97,7 @@ def misfit_of_numbers(
 
     Args:
         problem: problem with the unknowns.
-        residuals: differences of K independent images from the references, (K, N, 3); one image tells nothing.
+        residuals: differences of K independent images from the references, (K, N, 3); K < 2 gives "".
         references: references, (N, 3).
         weights: weight of each pixel, (N,), in [0, 1].
         known: warnings of the run; one that says so already is returned.
@@ -105,8 +105,8 @@ def misfit_of_numbers(
     elements = sum(math.prod(shape) for shape in problem.shapes().values())
     if elements > _FEW_NUMBERS or len(residuals) < 2:
         return ""
-    if told := next((line for line in known if DIFFERS in line), ""):
-        return told
+    if line := next((warning for warning in known if DIFFERS in warning), ""):
+        return line
     difference = misfit(residuals[0::2], residuals[1::2], references, weights, _OF_PICTURE)
     if difference is None:
         return ""

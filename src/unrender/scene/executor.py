@@ -56,10 +56,10 @@ class LocalExecutor:
         """Accept every estimator."""
 
     def estimate_gradient(self, problem: Any, request: Any) -> Any:
-        gathered = request.begin(problem)
-        for index, frame in enumerate(gathered.frames):
-            gathered.add(request.estimate_frame(problem, frame, request.key.fold(index)))
-        return gathered.result(problem)
+        sums = request.begin(problem)
+        for index, frame in enumerate(sums.frames):
+            sums.add(request.estimate_frame(problem, frame, request.key.fold(index)))
+        return sums.result(problem)
 
     def trace_pilot(self, problem: Any, request: Any) -> list[np.ndarray]:
         return request.carry_out(problem)

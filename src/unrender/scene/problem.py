@@ -331,9 +331,9 @@ def _opened(
     )
     sensors = [view.sensor for view in located if isinstance(view.sensor, int)]
     for index, view in enumerate(views):
-        if view.aov is not None and (beside := next((key for key in keys if key in OF_PHOTOGRAPHS), None)):
+        if view.aov is not None and (conflict := next((key for key in keys if key in OF_PHOTOGRAPHS), None)):
             raise FieldError(
-                ("views", index, "aov"), f"not supported together with the unknown {beside}; leave out one of them"
+                ("views", index, "aov"), f"not supported together with the unknown {conflict}; leave out one of them"
             )
     try:
         return with_photographs(renderer, keys, sensors), located

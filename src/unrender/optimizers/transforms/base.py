@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -142,9 +142,10 @@ class TransformState:
 
 def checked_keys(owner: str, keys: Any) -> tuple[str, ...]:
     """Return keys of parameters as a tuple. Raise `InputError` for anything else."""
-    if isinstance(keys, str) or not all(isinstance(key, str) for key in keys):
+    names: tuple[Any, ...] = tuple(keys) if isinstance(keys, Iterable) and not isinstance(keys, str) else (None,)
+    if not all(isinstance(name, str) for name in names):
         raise InputError(f"{owner} must be keys of parameters, got {keys!r}")
-    return tuple(keys)
+    return names
 
 
 def checked_transforms(owner: str, parts: Any) -> tuple[StepTransform, ...]:

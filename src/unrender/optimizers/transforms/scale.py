@@ -53,6 +53,7 @@ class ScaleByRms(StepTransform):
     long_memory: bool = False
 
     def __post_init__(self):
+        checks.flags(self)
         checks.number("ScaleByRms", "decay", self.decay, above=0.0, below=1.0, inclusive=True)
         checks.number("ScaleByRms", "epsilon", self.epsilon, above=0.0)
 
