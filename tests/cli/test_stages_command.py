@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -189,6 +190,23 @@ def test_options_that_stand_in_the_file_are_refused(unrender: Unrender, staged: 
     assert "--set spp: not supported with stages" in unrender(*RUN, "--set", "spp=2").error
     assert "--method: not supported with stages" in unrender(*RUN, "--method", "rcv").error
     assert not (staged / "result").exists()
+
+
+@pytest.mark.parametrize(("words", "seed"), [((), 7), (("--seed", 0), 0), (("--seed", 3), 3)])
+def test_a_typed_seed_replaces_that_of_the_file(
+    unrender: Unrender, staged: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[Any, ...], seed: int
+) -> None:
+    """Also a seed of 0, the option's default."""
+    (staged / "stages.toml").write_text("seed = 7\n" + STAGES)
+    seeds: list[int] = []
+
+    def stop(run: stages.StagesRun, *_: object) -> None:
+        seeds.append(run.stages.seed)
+        run.lock.release()
+
+    monkeypatch.setattr(stages, "run_remaining", stop)
+    answer = unrender(*RUN, *words)
+    assert (answer.status, seeds) == (0, [seed]), answer.error
 
 
 def test_folders_in_use_are_left_alone(unrender: Unrender, staged: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from report_folders import KEY, Page, write_run
 
 from unrender.app import report
-from unrender.app.report import groups
+from unrender.app.report import groups, image_metrics
 from unrender.core.errors import InputError
 from unrender.losses import metrics
 from unrender.runs.folder.reader import read
@@ -197,6 +197,17 @@ def test_pictures_are_measured(tmp_path):
     assert "PSNR ↑" in page
     assert "SSIM ↑" in page
     assert ("FLIP ↓" in page) == metrics.has_flip()
+
+
+def test_metrics_of_some_views_only_are_said(tmp_path, monkeypatch):
+    views = {
+        f"view{view}/{kind}": np.full((8, 8, 3), 0.5 + view) for view in range(3) for kind in ("reference", "result")
+    }
+    runs = [write_run(tmp_path / m, m, views=views) for m in ("x", "y")]
+    said = "Metrics of the last pictures are means over the first 2 of 3 views."
+    assert said not in compared(tmp_path, runs)["notices"]
+    monkeypatch.setattr(image_metrics, "MOST_PIXELS", 128)
+    assert said in compared(tmp_path, runs)["notices"]
 
 
 def test_equal_pictures_are_infinitely_good_and_still_a_page(tmp_path):

@@ -105,17 +105,10 @@ def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
     if array is None:
         return Pixels(_turn(_by_mitsuba(path).values, orientation), None)
     array = _turn(array, orientation)
-    if array.dtype in (np.uint8, np.uint16):
-        largest = np.iinfo(array.dtype).max
-        curve = decode(np.arange(largest + 1) / largest, response).astype(np.float32)
-        values = curve[array[..., :3]]
-        alpha = array[..., 3].astype(np.float32) / largest if array.shape[2] == 4 else None
-    else:
-        values = array[..., :3].astype(np.float32)
-        alpha = array[..., 3].astype(np.float32) if array.shape[2] == 4 else None
-    if not np.isfinite(values).all():
-        raise InputError(f"{path}: {int((~np.isfinite(values)).any(-1).sum())} pixels are NaN or infinite")
-    return Pixels(values, None if alpha is None or alpha.min() >= 1 else alpha)
+    largest = np.iinfo(array.dtype).max
+    curve = decode(np.arange(largest + 1) / largest, response).astype(np.float32)
+    alpha = array[..., 3].astype(np.float32) / largest if array.shape[2] == 4 else None
+    return Pixels(curve[array[..., :3]], None if alpha is None or alpha.min() >= 1 else alpha)
 
 
 def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
@@ -124,8 +117,7 @@ def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
     array = _decode(path)
     if array is not None:
         array = _turn(array, orientation)
-        scale = np.iinfo(array.dtype).max if array.dtype.kind == "u" else 1.0
-        values = array.astype(np.float32) / scale
+        values = array.astype(np.float32) / np.iinfo(array.dtype).max
         if values.shape[2] == 4 and values[..., 3].min() < 1:
             return values[..., 3]
         return values[..., :3].mean(2)
@@ -165,7 +157,7 @@ def _turn(values: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def _decode(path: Path) -> np.ndarray | None:
-    """Return the pixels as stored; None for kinds that Mitsuba reads."""
+    """Return the pixels as stored, uint8 or uint16; None for kinds that Mitsuba reads."""
     header = _header(path)
     if header.kind == "TIFF" or _is_16_bit(header):
         return _decode_opencv(path, header)

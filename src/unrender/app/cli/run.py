@@ -80,7 +80,7 @@ def run(
     arguments.check_file(problem)
     values, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     steps, seconds = _budget_settings(values, steps, seconds)
-    arguments.budget(steps, seconds)
+    budget = arguments.budget(steps, seconds)
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
@@ -93,9 +93,9 @@ def run(
             chosen, processes = _method(method_name), distribution.check(workers, compress, insecure)
             if stages.is_stages(problem):
                 stages.refuse_settings(method_name, values, options, workers)
-                plan = (steps, seconds), seed, out, overwrite, variant, threads, command, checkpoint_every, final_spp
+                first = seed if "--seed" in arguments.typed_options(context) else None
+                plan = (steps, seconds), first, out, overwrite, variant, threads, command, checkpoint_every, final_spp
                 return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
-            steps, seconds = arguments.budget(steps, seconds)
             chosen.start(values)
             arguments.check_problem(problem, options)
         folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
@@ -104,7 +104,7 @@ def run(
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
             with distribution.distributed(opened, processes, compress, variant, threads, console) as shared:
-                task = RunOrder(chosen, values, steps, seconds, seed, final_spp, command, options, checkpoint_every)
+                task = RunOrder(chosen, values, *budget, seed, final_spp, command, options, checkpoint_every)
                 with execution(shared, task, folder, console, progress) as order:
                     result = optimize(**order)
         finally:

@@ -86,7 +86,7 @@ def refuse_settings(method: str, settings: Mapping[str, str], options: Mapping[s
 def begin(
     file: Path,
     budget: tuple[int | None, float | None],
-    seed: int,
+    seed: int | None,
     out: Path | None,
     overwrite: bool,
     variant: str,
@@ -100,7 +100,7 @@ def begin(
     Args:
         file: an existing file.
         budget: steps and seconds instead of the file's; both None for the file's.
-        seed: seed of the first stage, if it is not 0.
+        seed: seed of the first stage; None for the file's.
         out: the folder; None for a new one.
         overwrite: whether it may contain earlier results.
         variant, threads, command, checkpoint_every, final_spp: options of all stages.
@@ -112,7 +112,7 @@ def begin(
     if budget != (None, None):
         stages = replace(stages, steps=budget[0], seconds=budget[1])
     steps, seconds = arguments.budget(stages.steps, stages.seconds)
-    stages = replace(stages, steps=steps, seconds=seconds, seed=seed or stages.seed)
+    stages = replace(stages, steps=steps, seconds=seconds, seed=stages.seed if seed is None else seed)
     check_seed("seed", stages.seed, len(stages.stages))
     for stage in stages.stages:
         try:

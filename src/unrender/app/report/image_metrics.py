@@ -46,19 +46,25 @@ def available() -> list[ImageMetric]:
     )
 
 
-def measure_views(run: RunFolder) -> dict[int, dict[str, float | None]]:
-    """Return {view: {name: value}} of the last pictures.
-
-    The first view is always measured, and further views until the pixels exceed `MOST_PIXELS`.
-    """
-    values: dict[int, dict[str, float | None]] = {}
+def measured_views(run: RunFolder) -> list[int]:
+    """Return the views that are measured: the first one, and further ones until the pixels exceed `MOST_PIXELS`."""
+    measured: list[int] = []
     pixels = 0
     for index, view in run.views.items():
         pixels += view.reference.size // 3
-        if values and pixels > MOST_PIXELS:
+        if measured and pixels > MOST_PIXELS:
             break
-        values[index] = {metric.name: metric.compute(view.result, view.reference) for metric in available()}
-    return values
+        measured.append(index)
+    return measured
+
+
+def measure_views(run: RunFolder) -> dict[int, dict[str, float | None]]:
+    """Return {view: {name: value}} of the last pictures of `measured_views`."""
+    views = {index: run.views[index] for index in measured_views(run)}
+    return {
+        index: {metric.name: metric.compute(view.result, view.reference) for metric in available()}
+        for index, view in views.items()
+    }
 
 
 def measure_run(run: RunFolder) -> dict[str, float | None]:

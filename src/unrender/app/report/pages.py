@@ -95,6 +95,9 @@ def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list
     runs = [read(directory) for directory in directories]
     with np.errstate(over="ignore", invalid="ignore"):  # runs that diverged are compared, too
         notices = grouping.check_comparable(runs)
+        count, measured = len(runs[0].views), len(image_metrics.measured_views(runs[0]))
+        if measured < count:
+            notices.append(f"Metrics of the last pictures are means over the first {measured} of {count} views.")
         return compare_groups(grouping.group(runs)), notices
 
 
