@@ -105,7 +105,9 @@ def test_reconstruction_filters_and_hidden_emitters_are_used(tmp_path: Path) -> 
 
 def test_a_parameter_of_the_file_hides_emitters(tmp_path: Path) -> None:
     for value in ("true", "false"):
-        hidden = f'<default name="hide" value="{value}"/><integrator type="path"><boolean name="hide_emitters" value="$hide"/></integrator>'
+        path = '<integrator type="path"><boolean name="hide_emitters" value="$hide"/></integrator>'
+        nested = f'<integrator type="aov"><string name="aovs" value="d:depth"/>{path}</integrator>'
+        hidden = f'<default name="hide" value="{value}"/>{nested}'
         assert ur.render(problem(xml(tmp_path, hidden)), spp=4).any() == (value == "false")
 
 

@@ -41,7 +41,7 @@ MOST_VALUES = 200_000
 """Largest number of values of a JSON text: a million names take seconds to read."""
 
 _MEMBERS = 10_000
-_MOST_BESIDE = 1000  # names in a folder to which a missing name is compared
+_MOST_NEIGHBOURS = 1000  # names in a folder to which a missing name is compared
 _BYTES_PER_BYTE = 100  # largest compression ratio; zeros reach a thousand
 _LARGEST_DIRECTORY = 1 << 20  # largest directory of an archive in bytes, which contains its members' names
 _UNREADABLE = (
@@ -87,7 +87,9 @@ def no_file(path: Path) -> str:
         if path.exists():
             return "not a file"
         neighbours = [
-            visible(entry.name) for entry in itertools.islice(path.parent.iterdir(), _MOST_BESIDE) if entry.is_file()
+            visible(entry.name)
+            for entry in itertools.islice(path.parent.iterdir(), _MOST_NEIGHBOURS)
+            if entry.is_file()
         ]
     except (OSError, ValueError):  # ValueError: a name with a zero byte
         neighbours = []

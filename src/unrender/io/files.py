@@ -202,7 +202,7 @@ def _exchange(one: Path, other: Path) -> bool:
     raise OSError(number, os.strerror(number), str(one))
 
 
-# ---------------------------------------------------------------------- what processes left that died
+# ---------------------------------------------------------------------- leftovers of dead processes
 
 
 def check_replaceable(place: Path, own: Collection[str], record: str, overwrite: bool, label: str, what: str) -> None:
@@ -264,7 +264,7 @@ def remove_leftovers(folder: Path, names: Collection[str] | None = None) -> None
     with contextlib.suppress(OSError):
         for path in sorted(folder.iterdir()):
             match = _TEMPORARY.fullmatch(path.name)
-            if match is None or (names is not None and match[1] not in names) or _is_another_that_lives(int(match[2])):
+            if match is None or (names is not None and match[1] not in names) or _is_alive_elsewhere(int(match[2])):
                 continue
             place = path.with_name(match[1])
             if match[3] == PARTIAL:
@@ -286,7 +286,7 @@ def remove(path: Path) -> None:
             path.unlink()
 
 
-def _is_another_that_lives(pid: int) -> bool:
+def _is_alive_elsewhere(pid: int) -> bool:
     if pid in (0, os.getpid()):
         return False
     try:

@@ -152,9 +152,9 @@ def _check_splats(header: _Header, path: Path) -> None:
 def _check_binary(file: IO[bytes], header: _Header, vertices: int, path: Path) -> None:
     rows = [np.dtype([(name, header.order + kind) for name, kind in each.properties]) for each in header.elements]
     declared = sum(each.count * row.itemsize for each, row in zip(header.elements, rows, strict=True))
-    there = os.fstat(file.fileno()).st_size - header.length
-    if declared != there:
-        raise InputError(f"{path}: its header declares {declared} bytes of numbers, there are {there}")
+    actual = os.fstat(file.fileno()).st_size - header.length
+    if declared != actual:
+        raise InputError(f"{path}: its header declares {declared} bytes of numbers, there are {actual}")
     for element, row in zip(header.elements, rows, strict=True):
         if element.name != "face":
             file.seek(element.count * row.itemsize, os.SEEK_CUR)

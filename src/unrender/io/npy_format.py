@@ -34,9 +34,9 @@ def read_npy(file: IO[bytes], size: int, where: str, check: Callable[[Shape], No
     kind, columns_first, shape = _read_header(file, where)
     if any(side < 0 for side in shape) or len(shape) > _AXES:
         raise InputError(f"{where}: an array cannot have the shape {printable(str(shape))}")
-    declared, there = math.prod(shape) * kind.itemsize, size - file.tell()
-    if declared > largest or declared != there:
-        raise InputError(f"{where}: declares the shape {printable(str(shape))}, {declared} bytes; {there} follow")
+    declared, actual = math.prod(shape) * kind.itemsize, size - file.tell()
+    if declared > largest or declared != actual:
+        raise InputError(f"{where}: declares the shape {printable(str(shape))}, {declared} bytes; {actual} follow")
     if check is not None:
         check(shape)
     data = bytearray(declared)

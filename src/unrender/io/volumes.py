@@ -195,9 +195,9 @@ def _vol_header(file: IO[bytes], path: Path, check: Callable[[Shape], None]) -> 
             raise InputError("its box is not finite")
         shape = (z, y, x, channels)
         check(shape)
-        there, declared = os.fstat(file.fileno()).st_size - _HEADER.size, 4 * math.prod(shape)
-        if there != declared:
-            raise InputError(f"its header declares {declared} bytes of numbers, there are {there}")
+        actual, declared = os.fstat(file.fileno()).st_size - _HEADER.size, 4 * math.prod(shape)
+        if actual != declared:
+            raise InputError(f"its header declares {declared} bytes of numbers, there are {actual}")
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     return shape, tuple(box)

@@ -207,8 +207,8 @@ class PosedCamerasSession(SessionWrapper):
     def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: PosedPaths) -> Tree:
         renderer = self._renderer
         cameras = list(renderer.corrections.cameras.values())
-        seen = [cameras[renderer.rows[sensor]] for sensor in paths.sensors if sensor in renderer.rows]
-        keys = [key for camera in seen for key in (camera.rotation, camera.translation)]
+        rendered = [cameras[renderer.rows[sensor]] for sensor in paths.sensors if sensor in renderer.rows]
+        keys = [key for camera in rendered for key in (camera.rotation, camera.translation)]
         rows = renderer.corrections.gradient({key: arrays.numpy(inner_gradient[key]) for key in keys})
         return {key: renderer.array(rows) if key == POSES else inner_gradient[key] for key in parameters}
 

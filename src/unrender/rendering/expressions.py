@@ -205,8 +205,8 @@ def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknown
         if name in known:
             continue
         try:
-            given_value = bounded_files.read_array(Path(value)) if isinstance(value, (str, Path)) else value
-            starts[name] = np.atleast_1d(np.asarray(given_value, np.float32))
+            loaded = bounded_files.read_array(Path(value)) if isinstance(value, (str, Path)) else value
+            starts[name] = np.atleast_1d(np.asarray(loaded, np.float32))
         except (TypeError, ValueError):
             starts[name] = np.full(1, np.nan, np.float32)
         if value is None or not np.isfinite(starts[name]).all():

@@ -86,9 +86,9 @@ class RendererWrapper:
 
     def around(self, inner: Renderer) -> Renderer:
         """Return the same wrapper around another renderer."""
-        made = copy.copy(self)
-        made.inner = inner
-        return made
+        copied = copy.copy(self)
+        copied.inner = inner
+        return copied
 
 
 class SessionWrapper:

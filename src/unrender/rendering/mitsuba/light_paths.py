@@ -148,7 +148,7 @@ def _number(name: str, text: str) -> int | None:
 
 
 def _hidden(source: Path | dict) -> Iterator[Any]:
-    """Yield the values of `hide_emitters` in a description. Mitsuba's integrators do not expose theirs."""
+    """Yield the values of `hide_emitters` in a description: an integrator does not expose that of one nested in it."""
     if isinstance(source, Mapping):
         for key, value in source.items():
             if key == "hide_emitters":

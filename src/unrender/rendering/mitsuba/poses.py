@@ -212,11 +212,14 @@ class PosedScene:
         posed = {shape.id(): shape for shape in shapes if shape.id() in targets}
         rest = [shape for shape in shapes if shape.id() not in posed]
         rest += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
-        carried = {sensor.id(): sensor.get_shape() for sensor in scene.sensors()}
-        carriers = [shape.id() for shape in carried.values() if shape is not None]
+        shape_of_sensor = {sensor.id(): sensor.get_shape() for sensor in scene.sensors()}
+        sensor_shapes = [shape.id() for shape in shape_of_sensor.values() if shape is not None]
         # Keep the order of the sensors, since a request selects one by its index. A sensor of a shape is added by its shape.
-        sensors = [sensor if carried[sensor.id()] is None else carried[sensor.id()] for sensor in scene.sensors()]
-        self.static = _scene([*(item for item in rest if item.id() not in carriers), *sensors])
+        sensors = [
+            sensor if shape_of_sensor[sensor.id()] is None else shape_of_sensor[sensor.id()]
+            for sensor in scene.sensors()
+        ]
+        self.static = _scene([*(item for item in rest if item.id() not in sensor_shapes), *sensors])
         self.parts = {name: _scene([shape]) for name, shape in posed.items()}
         self._centres = centres(scene, targets)
 

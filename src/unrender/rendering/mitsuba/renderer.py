@@ -65,7 +65,7 @@ class MitsubaRenderer:
         keys: Iterable[str] = (),
         replaced: Mapping[str, ReplacedMesh] | None = None,
     ):
-        self._given_depth, keys = max_depth, tuple(keys)
+        self._requested_depth, keys = max_depth, tuple(keys)
         self.pair = ScenePair(description, moving_targets(keys), replaced)
         source, volumetric = self.pair.loaded().source, self.pair.volumetric
         self.light_paths = LightPaths.of(self.pair.current, source, volumetric, max_depth)
@@ -170,7 +170,7 @@ class MitsubaRenderer:
             return session
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
-        return MitsubaRenderer(self.pair.description, self._given_depth, keys, self.pair.replaced | dict(meshes))
+        return MitsubaRenderer(self.pair.description, self._requested_depth, keys, self.pair.replaced | dict(meshes))
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
         """Return a renderer of the same loaded scenes with differential BSDF sampling; this renderer if it renders an AOV."""
@@ -191,13 +191,13 @@ class MitsubaRenderer:
         if is_spectral():
             raise InputError(f"{name}: spectral variants render radiance only; leave it out, or use an RGB variant")
         if name not in self._aovs:
-            made = self._aovs[name] = copy.copy(self)
-            made.light_paths = LightPaths(1, hide_emitters=self.light_paths.hide_emitters, aov=name)
-            made._formats, made._sessions = [PictureFormat(signed=True, aov=name)] * len(self._formats), {}
-            made._checked, made._differential = set(), None
+            renderer = self._aovs[name] = copy.copy(self)
+            renderer.light_paths = LightPaths(1, hide_emitters=self.light_paths.hide_emitters, aov=name)
+            renderer._formats, renderer._sessions = [PictureFormat(signed=True, aov=name)] * len(self._formats), {}
+            renderer._checked, renderer._differential = set(), None
             reason = f"path gradients of moving sensors do not support {name}"
             moving = {key: info for key, info in self._info.items() if info.viewpoint}
-            made._info = self._info | {
+            renderer._info = self._info | {
                 key: replace(x, differentiable=False, reason=reason) for key, x in moving.items()
             }
         return self._aovs[name]

@@ -121,7 +121,7 @@ _POINTS = 5
 """Points per sample: two per coordinate where the pixel's filter increases and decreases (opposite borders of a box), and one inside."""
 
 
-class _Seen:
+class _ViewSample:
     """Radiance of a lane's view ray, and its visible point in homogeneous coordinates with derivatives along the surface by both film
     coordinates. Detached."""
 
@@ -166,12 +166,12 @@ class _FilmMap:
             dr.dot(self._rows[0], point) / w - self._shift[0], dr.dot(self._rows[1], point) / w - self._shift[1]
         )
 
-    def stretch(self, seen: _Seen) -> Any:
+    def stretch(self, sample: _ViewSample) -> Any:
         """Return the Jacobian determinant of the map from the current film to the moved film, along the visible surface: 1, with
         derivative div v."""
-        w, (x, y) = dr.dot(self._rows[3], seen.point), (dr.dot(row, seen.point) for row in self._rows[:2])
+        w, (x, y) = dr.dot(self._rows[3], sample.point), (dr.dot(row, sample.point) for row in self._rows[:2])
         columns = []
-        for across in seen.across:
+        for across in sample.across:
             change = dr.dot(self._rows[3], across)
             columns.append(tuple((dr.dot(self._rows[k], across) - v * change / w) / w for k, v in ((0, x), (1, y))))
         (a, b), (c, d) = columns
@@ -231,15 +231,15 @@ class CameraMotion:
             corner = mi.Point2u(pixel - row * picture.width, row)
             points = self._points(picture, corner, kind, lane_sampler(seed, count, _POINTS * count).next_2d())
             uv = (mi.Vector2f(corner) + points.at) / picture.size
-            seen = self._look(picture, film, uv, mi.Bool(True), seed ^ 0x9E3779B9, count)
+            sample = self._sample_view(picture, film, uv, mi.Bool(True), seed ^ 0x9E3779B9, count)
             weighted = mi.Float(0)
             for c in range(3):
-                weighted += seen.L[c] * dr.gather(mi.Float, view.values, index * 3 + c)
+                weighted += sample.L[c] * dr.gather(mi.Float, view.values, index * 3 + c)
             dr.eval(weighted)
             border: Any = mi.Vector2f(*(weighted * points.slope[axis] * picture.size[axis] for axis in range(2)))
             within = weighted * points.within
         with dr.resume_grad():
-            total = dr.sum(dr.dot(border, film.place(seen.point)) + within * film.stretch(seen))
+            total = dr.sum(dr.dot(border, film.place(sample.point)) + within * film.stretch(sample))
             return total * dr.opaque(mi.Float, 1 / view.spp)
 
     def _points(self, picture: WeightedPicture, pixel: Any, kind: Any, u: Any) -> _Points:
@@ -262,7 +262,9 @@ class CameraMotion:
         slope = [signs[axis] * masses[axis] * weights[1 - axis] for axis in range(2)]
         return _Points(mi.Vector2f(*places), mi.Vector2f(*slope), one * weights[0] * weights[1])
 
-    def _look(self, picture: WeightedPicture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int) -> _Seen:
+    def _sample_view(
+        self, picture: WeightedPicture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int
+    ) -> _ViewSample:
         """Return the view through `uv`. Lanes `period` apart share random numbers."""
         sensor, scene = picture.sensor, picture.scene
         ray, weight = sensor.sample_ray(picture.time, 0.5, mi.Point2f(uv), mi.Point2f(0.5), active)
@@ -280,7 +282,7 @@ class CameraMotion:
         slopes = [dr.select(tilted, inverse * dr.dot(n, v) / height, 0) for v in (across, down)]
         origin = mi.Vector3f(film.origin)
         tangents = [_homogeneous(origin * slope + v, slope) for v, slope in zip((across, down), slopes, strict=True)]
-        return _Seen(
+        return _ViewSample(
             dr.select(active, L, 0), _homogeneous(origin * inverse + towards, inverse), (tangents[0], tangents[1])
         )
 
@@ -346,12 +348,12 @@ class CameraMotion:
             active, normal, point = (dr.gather(type(v), v, lane) for v in (active, normal, mi.Point3f(point)))
             uv = dr.gather(mi.Vector2f, mi.Vector2f(uv), lane)
             shifted = uv + mi.Vector2f(normal) * (OFFSET * sign)
-            seen = self._look(picture, film, shifted, active, seed ^ 0x9E3779B9, count)
-            weighted = picture.weighted(seen.L, uv * picture.size, active)
+            sample = self._sample_view(picture, film, shifted, active, seed ^ 0x9E3779B9, count)
+            weighted = picture.weighted(sample.L, uv * picture.size, active)
             scale = dr.gather(mi.Float, factor, lane) * weighted * sign
             dr.eval(scale, normal, point)
         with dr.resume_grad():
-            relative = film.place(seen.point) - film.place(_homogeneous(point, 1.0))
+            relative = film.place(sample.point) - film.place(_homogeneous(point, 1.0))
             return dr.sum(scale * dr.dot(normal, relative))
 
 

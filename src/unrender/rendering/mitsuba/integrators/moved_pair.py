@@ -139,7 +139,7 @@ class MovedPair:
         diffuse = is_diffuse(out.bsdf) & is_diffuse(outₚ.bsdf)
         able = out.active & outₚ.active & diffuse & (path.depth < self.rr_depth) & (path.depth + 2 < self.max_depth)
         share = dr.select(able, mi.Float(self.share), 0)
-        carried = choices.next_1d() < share if self._reconnects else mi.Bool(False)
+        reconnected = choices.next_1d() < share if self._reconnects else mi.Bool(False)
 
         # -------------------- Roulette, as in `prb` --------------------
         number = sampler.next_1d()
@@ -149,13 +149,13 @@ class MovedPair:
 
         # ----------------- The current path's next vertex -----------------
         # A terminated path may still give the point of a reconnection.
-        following = continues | (carried & (out.bs.pdf > 0))
+        following = continues | (reconnected & (out.bs.pdf > 0))
         pi = scene.ray_intersect_preliminary(
             out.ray, coherent=False, active=following & self._may_add(tables, path, out.ray)
         )
 
         # ----------------- The previous path's next vertex -----------------
-        step = self._continue(scenes, tables, (out, outₚ), pi, share, carried, path, following)
+        step = self._continue(scenes, tables, (out, outₚ), pi, share, reconnected, path, following)
         beforeβ = before.β * step.weight
         survivesₚ, beforeβ = self._roulette(path.depth, beforeβ, before.η * step.η, number)
 
@@ -229,7 +229,7 @@ class MovedPair:
         out: tuple[Direction, Direction],
         pi: Any,
         share: Float,
-        carried: Bool,
+        reconnected: Bool,
         path: PairState,
         followed: Bool,
     ) -> Continuation:
@@ -240,12 +240,12 @@ class MovedPair:
             scenes, tables: of `sample`.
             out: sampled directions of both paths.
             pi: the current path's next vertex, of the lanes `followed`.
-            share, carried: probability of a reconnection, and lanes that chose it.
+            share, reconnected: probability of a reconnection, and lanes that chose it.
             path: state before the segment.
             followed: lanes whose current path has a next vertex.
         """
         (scene, sceneₚ), ctx, (now, before) = scenes, mi.BSDFContext(), out
-        same, own = path.same, before.active & ~carried
+        same, own = path.same, before.active & ~reconnected
         traced = own & self._may_add(tables, path, before.ray)
         clear = same & followed & is_clear(tables, now.ray, pi)
         piₚ, coincides = follow(sceneₚ, tables, (now.ray, before.ray), pi, clear, traced, same & followed)
@@ -253,33 +253,33 @@ class MovedPair:
             bs = before.bs
             return Continuation(before.ray, piₚ, before.weight, bs.pdf, before.delta, bs.eta, coincides)
         weighed = own & (share > 0)
-        mixed = carried | weighed
+        mixed = reconnected | weighed
 
-        link = Link(tables, (now, before), (pi, piₚ), carried, mixed)
+        link = Link(tables, (now, before), (pi, piₚ), reconnected, mixed)
 
         # ------------- Densities of both techniques at the chosen point -------------
-        wo = dr.select(carried, now.bs.wo, now.si.to_local(link.direction))
-        woₚ = dr.select(carried, before.si.to_local(link.direction), before.bs.wo)
+        wo = dr.select(reconnected, now.bs.wo, now.si.to_local(link.direction))
+        woₚ = dr.select(reconnected, before.si.to_local(link.direction), before.bs.wo)
         forward = now.bsdf.pdf(ctx, now.si, wo, mixed)
         value, pdf = before.bsdf.eval_pdf(ctx, before.si, woₚ, mixed)
-        free = carried & (forward > 0) & (dr.max(value) > 0)
+        free = reconnected & (forward > 0) & (dr.max(value) > 0)
         free &= clear | ~sceneₚ.ray_test(link.ray(before.si), free & ~clear)
         visible = weighed & (forward > 0)
         visible &= coincides | ~scene.ray_test(link.ray(now.si), visible & ~coincides)
         change = link.density_ratio() * (link.area_ratio(tables) if self.areas else 1)
-        forward = dr.select(carried | visible, forward * dr.select(link.valid, change, 1), 0)
+        forward = dr.select(reconnected | visible, forward * dr.select(link.valid, change, 1), 0)
 
         # ------------------------------ Mixture ------------------------------
         weight = value / (share * forward + (1 - share) * pdf)
-        weight = dr.select((carried & ~free) | ~dr.isfinite(dr.sum(weight)), 0, weight)
+        weight = dr.select((reconnected & ~free) | ~dr.isfinite(dr.sum(weight)), 0, weight)
         return Continuation(
-            dr.select(carried, before.si.spawn_ray(link.direction), before.ray),
-            dr.select(carried, link.image, piₚ),
+            dr.select(reconnected, before.si.spawn_ray(link.direction), before.ray),
+            dr.select(reconnected, link.image, piₚ),
             dr.select(mixed, weight, before.weight),
             dr.select(mixed, pdf, before.bs.pdf),
-            before.delta & ~carried,
-            dr.select(carried, 1, before.bs.eta),
-            dr.select(carried, self.shared & ~moves(tables, pi.shape), coincides),
+            before.delta & ~reconnected,
+            dr.select(reconnected, 1, before.bs.eta),
+            dr.select(reconnected, self.shared & ~moves(tables, pi.shape), coincides),
         )
 
     @property

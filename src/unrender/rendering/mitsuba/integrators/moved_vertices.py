@@ -140,20 +140,24 @@ class Link:
         tables: Mapping[str, Any],
         out: tuple[Direction, Direction],
         hits: tuple[Any, Any],
-        carried: Bool,
+        reconnected: Bool,
         active: Bool,
     ):
         (now, before), (pi, piₚ) = out, hits
-        hit = dr.select(carried, pi, piₚ)
-        self._carried, self._triangle, self._from = carried, hit.prim_index, dr.select(carried, now.ray, before.ray)
+        hit = dr.select(reconnected, pi, piₚ)
+        self._reconnected, self._triangle, self._from = (
+            reconnected,
+            hit.prim_index,
+            dr.select(reconnected, now.ray, before.ray),
+        )
         back = remap(tables["shape_back"], piₚ.shape)
-        self._shape = dr.select(carried, pi.shape, back)
+        self._shape = dr.select(reconnected, pi.shape, back)
         self.valid = active & hit.is_valid()
         self.image = mi.PreliminaryIntersection3f(hit)
-        self.image.shape = dr.select(carried, remap(tables["shape"], pi.shape), back)
+        self.image.shape = dr.select(reconnected, remap(tables["shape"], pi.shape), back)
         self._si = hit.compute_surface_interaction(self._from, mi.RayFlags.Minimal, self.valid)
         self._there: Any = self.image.compute_surface_interaction(self._from, mi.RayFlags.Minimal, self.valid)  # pyright: ignore[reportArgumentType]
-        to = self._there.p - dr.select(carried, before.si.p, now.si.p)
+        to = self._there.p - dr.select(reconnected, before.si.p, now.si.p)
         self._distance: Any = dr.norm(to)
         self.direction = dr.select(self.valid, to / self._distance, self._from.d)
         self.image.t = dr.select(self.valid, self._distance, hit.t)
@@ -167,7 +171,7 @@ class Link:
         point."""
         here = dr.abs_dot(self._si.n, self._from.d) / dr.square(self._si.t)
         there = dr.abs_dot(self._there.n, self.direction) / dr.square(self._distance)
-        return dr.select(self._carried, here / there, there / here)
+        return dr.select(self._reconnected, here / there, there / here)
 
     def area_ratio(self, tables: Mapping[str, Any]) -> Float:
         """Return the area of the triangle in the current over that in the previous state."""
