@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageCms
 
 from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.io import parameter_values as values
+from unrender.losses import L2
+from unrender.scene.view import View
+from unrender.scene.view_checks import check_views
 
 COLOURS = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
 
@@ -54,6 +59,29 @@ def test_reads_jpeg_and_upper_case_endings(tmp_path: Path):
     picture = images.read(str(tmp_path / "A.JPG"))
     assert picture.notice == "A.JPG: 8-bit sRGB, linearised"
     np.testing.assert_allclose(picture.values, 0.5029, atol=5e-3)
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png"])
+def test_a_picture_that_viewers_turn_is_refused_as_reference_and_mask(tmp_path: Path, name: str):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    picture = Image.fromarray(np.full((8, 8, 3), 188, np.uint8))
+    picture.save(tmp_path / name, exif=exif)
+    picture.save(tmp_path / f"upright-{name}")
+    films: Any = SimpleNamespace(resolutions=lambda: [(8, 8)])
+    for view in (View(tmp_path / name), View(np.ones((8, 8, 3)), mask=tmp_path / name)):
+        with pytest.raises(InputError, match=r"EXIF orientation is 6.*save the pixels upright"):
+            check_views([view], films, L2())
+    assert images.check_metadata(tmp_path / f"upright-{name}") == ""
+
+
+def test_a_colour_profile_other_than_srgb_is_reported(tmp_path: Path):
+    picture = Image.fromarray(np.full((6, 8, 3), 188, np.uint8))
+    for name in ("sRGB", "LAB"):
+        profile = ImageCms.ImageCmsProfile(ImageCms.createProfile(name)).tobytes()
+        picture.save(tmp_path / f"{name}.png", icc_profile=profile)
+    assert images.check_metadata(tmp_path / "sRGB.png") == ""
+    assert "LAB.png: its colour profile is not sRGB" in images.check_metadata(tmp_path / "LAB.png")
 
 
 def test_drops_alpha_and_keeps_grey_as_one_channel(tmp_path: Path):

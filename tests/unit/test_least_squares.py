@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import zlib
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import unrender as ur
 from unrender.core.random import Key
 from unrender.estimators.gauss_newton import GaussNewtonState
 from unrender.rendering.numpy.linear import AnalyticRenderer
+from unrender.runs import least_squares
 from unrender.runs.least_squares import NumbersCheck, _Fit, _judged, check_numbers, pixel_weights
 from unrender.runs.numbers import Differences, Numbers
 
@@ -316,3 +318,46 @@ def test_errors_of_squares_of_noise_alone():
     one, other = generator.normal(size=(2, 400, 60, 3))
     squares, errors = Differences(np.zeros((1, 400)), one, other).squares()
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(squares.std(), rel=0.15)
+
+
+def test_an_end_whose_pictures_are_no_better_than_the_starts_has_no_standard_error():
+    made, away = problem(MATRIX), np.array([0.1, 0.0, 0.0, 0.0])
+    solution = best(made, MATRIX)
+    found = check_numbers(made, at(solution + away), at(solution), FAR)
+    assert "a: the pictures are no better than with its initial value" in found.undetermined["a"]
+    assert np.isinf(found.errors["a"]).any()
+    assert "b" not in found.undetermined
+    better = check_numbers(made, at(solution + away), at(solution + 2.0 * away), FAR)
+    assert not better.undetermined
+    assert list(better.unfinished) == ["a"]
+
+
+def errors_of_a_turned_cylinder(monkeypatch: pytest.MonkeyPatch, rounds: int) -> np.ndarray:
+    """Return the standard errors of a rotation, (3,), that pictures show except about an axis, with noise that depends on the rotation."""
+    made, axis = problem(MATRIX, noise=0.0), np.array([0.0, 0.94, 0.34])
+    known = dict(made.renderer.parameters())
+    known["a"] = dataclasses.replace(known["a"], rigid=True, length=1.0)
+    inner = Numbers.pictures
+
+    def pictures(self: Numbers, points: np.ndarray, key: Key) -> np.ndarray:
+        seen = points.copy()
+        seen[:, :3] -= np.outer(points[:, :3] @ axis, axis) / float(axis @ axis)
+        added = [
+            np.random.default_rng([key.uint32(), zlib.crc32(x.tobytes())]).normal(0.0, 1.0, (64, 3)) for x in points
+        ]
+        return inner(self, seen, key) + np.stack(added)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(AnalyticRenderer, "parameters", lambda self: known)
+        patched.setattr(Numbers, "pictures", pictures)
+        patched.setattr(least_squares, "_ROUNDS", rounds)
+        return check_numbers(made, TRUTH, made.initial_values(), FAR).errors["a"]
+
+
+def test_the_error_along_an_axis_of_symmetry_is_not_that_of_its_noisy_sum_with_other_directions(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    first, again = (errors_of_a_turned_cylinder(monkeypatch, rounds) for rounds in (0, least_squares._ROUNDS))
+    assert first.max() < 0.1  # the planted fault: without measuring weak directions again
+    assert again[0] < 0.1
+    assert again[1] > 0.3

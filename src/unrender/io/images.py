@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from unrender.backend import variant
 from unrender.core.errors import InputError
@@ -15,6 +17,8 @@ from unrender.io import bounded_files, image_size
 
 READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".npy")
 """File name extensions that `read` supports."""
+
+_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,41 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
     picture = _from_array(array, linearise, alpha, channels)
     _check_finite(picture.values)
     return picture
+
+
+def check_metadata(source: Any) -> str:
+    """Return one line about a JPEG or PNG file's colour profile if it is not sRGB; "" for none, and for other sources.
+
+    Mitsuba ignores profiles and EXIF. `source` is one that `read` has read, so that its size is within the limits.
+
+    Raises `InputError` for a file whose EXIF orientation turns or mirrors its pixels.
+    """
+    if not isinstance(source, (str, Path)) or Path(source).suffix.lower() not in (".jpg", ".jpeg", ".png"):
+        return ""
+    path = Path(source)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with bounded_files.open_regular(path) as file, Image.open(file, formats=["JPEG", "PNG"]) as picture:
+                if picture.format == "PNG":
+                    picture.load()  # EXIF may follow the pixels
+                profile, turned = picture.info.get("icc_profile") or b"", orientation(picture)
+    except Exception:  # Pillow raises many types of exceptions, and Mitsuba has read the pixels
+        return ""
+    if turned != 1:
+        raise InputError(
+            f"{path}: its EXIF orientation is {turned}, which viewers apply and Mitsuba ignores; save the pixels upright, without it"
+        )
+    known = not profile or any(name in profile for name in (b"sRGB", "sRGB".encode("utf-16-be")))
+    return "" if known else f"{path.name}: its colour profile is not sRGB and is ignored; convert the file to sRGB"
+
+
+def orientation(picture: Image.Image) -> int:
+    """Return EXIF's orientation, 1 if it is absent or unreadable."""
+    try:
+        return int(picture.getexif().get(_ORIENTATION, 1))
+    except Exception:  # EXIF data is often malformed, and Pillow raises many types of exceptions
+        return 1
 
 
 def resize(values: np.ndarray, height: int, width: int, around: bool = False) -> np.ndarray:

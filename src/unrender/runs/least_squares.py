@@ -57,6 +57,11 @@ _OF_WIDTHS = 10.0
 """Size of a pose, in widths of its differences: it may be 0 at the end."""
 _TOGETHER = 0.9
 """Correlation from which on two numbers count as determined together."""
+_ROUNDS, _WEAK = 3, 0.3
+"""Most rounds that measure weak directions again; length relative to the wanted one below which a direction is weak."""
+_FAR, _BETTER, _NOISY = 6.0, 1.0, 0.05
+"""Standard errors that a number moved from which on the picture must be better than with its start; by how many standard errors; share of
+the noisiest pixels that may hide it."""
 
 
 @dataclass(frozen=True)
@@ -213,34 +218,52 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
             return NumbersCheck(unchecked=numbers.keys)
         numbers, differences, missing = extended
         fixed |= dict.fromkeys(moved, missing) if missing else {}
-    directions, repeats = _directions(differences, numbers.limits, change), 0
-    weights = np.zeros(directions.shape[1])
-    residuals = np.zeros((2, *numbers.references().shape))
-    while repeats < _REPEATS and (not repeats or time.perf_counter() + 2.0 * longest < until):
+    directions, length = _directions(differences, numbers.limits, change)
+    for index in range(_ROUNDS):  # short differences hardly tell weak directions from their sums with others
+        if length > _WEAK or time.perf_counter() + 4.0 * longest > until:
+            break
+        again = numbers.differences(directions, key.fold(_PASSES + 1 + _REPEATS + index))
+        directions, length = _directions(again, numbers.limits, change)
+    check = _judged(numbers, _Fit.of(numbers, *_repeated(numbers, directions, key, until - 2.0 * longest)), widths)
+    return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed) if fixed else check
+
+
+def _repeated(
+    numbers: Numbers, directions: np.ndarray, key: Key, until: float
+) -> tuple[Differences, np.ndarray, np.ndarray]:
+    """Return the differences along directions and the residuals (2, P, 3) at the end and with the start's numbers, as means of repeats."""
+    weights, repeats, count = np.zeros(directions.shape[1]), 0, directions.shape[1]
+    references = numbers.references()
+    residuals, before = np.zeros((2, *references.shape)), np.zeros((2, *references.shape))
+    began = np.append(numbers.start, numbers.point[numbers.count :])[None]
+    differences = None
+    while differences is None or (repeats < _REPEATS and time.perf_counter() < until):
         own = key.fold(_PASSES + 1 + repeats)
         more = numbers.differences(directions, own)
         # The end of a long difference may have rare bright samples, such as at a low roughness; repeats that have them count less.
         weights += more.weights()
-        differences = more if repeats == 0 else differences.moved(more, more.weights() / weights)
+        differences = more if differences is None else differences.moved(more, more.weights() / weights)
         for half in (0, 1):  # as many pictures as for the differences
-            for index in range(directions.shape[1]):
+            for index in range(count):
                 picture = numbers.pictures(numbers.point[None], own.fold(2 + 2 * index + half))[0]
-                residuals[half] += picture - numbers.references()
+                residuals[half] += picture - references
+            before[half] += numbers.pictures(began, own.fold(2 + half))[0] - references
         repeats += 1
-    check = _judged(numbers, _Fit.of(numbers, differences, residuals / (repeats * directions.shape[1])), widths)
-    return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed) if fixed else check
+    return differences, residuals / (repeats * count), before / repeats
 
 
-def _directions(differences: Differences, limits: np.ndarray, change: float) -> np.ndarray:
-    """Return directions (n, n) along which the pictures change independently and by `change`, within the limits."""
-    matrix = differences.matrix()
-    units = np.sqrt(np.maximum(np.diag(matrix), 1e-12 * np.abs(matrix).max())) + 1e-300
+def _directions(differences: Differences, limits: np.ndarray, change: float) -> tuple[np.ndarray, float]:
+    """Return directions (n, n) along which the pictures change independently and by `change`, within the limits, and the least length that
+    these leave, relative to that wanted."""
+    matrix, (_, errors) = differences.matrix(), differences.squares()
+    units = np.sqrt(np.maximum(np.maximum(np.diag(matrix), errors), 1e-12 * np.abs(matrix).max())) + 1e-300
     eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
     lengths = (
         change * math.sqrt(differences.one[0].size) / np.sqrt(np.maximum(eigenvalues, _WEAKEST * eigenvalues.max()))
     )
     columns = differences.directions @ (vectors * lengths / units[:, None])
-    return columns / np.maximum(np.max(np.abs(columns) / limits[:, None], axis=0), 1.0)
+    longer = np.maximum(np.max(np.abs(columns) / limits[:, None], axis=0), 1.0)
+    return columns / longer, 1.0 / float(longer.max())
 
 
 @dataclass(frozen=True)
@@ -253,6 +276,7 @@ class _Fit:
         own: the same from the noise of this check, (n,).
         step: step of the numbers, (n,).
         unseen: largest changes of the numbers along each hidden direction, (n, number of hidden directions).
+        better: standard errors by which the picture is better than with the start's numbers.
     """
 
     covariance: np.ndarray
@@ -260,10 +284,13 @@ class _Fit:
     own: np.ndarray
     step: np.ndarray
     unseen: np.ndarray
+    better: float = math.inf
 
     @classmethod
-    def of(cls, numbers: Numbers, differences: Differences, residuals: np.ndarray) -> _Fit:
-        """Fit differences along directions to two independent residuals (2, P, 3)."""
+    def of(
+        cls, numbers: Numbers, differences: Differences, residuals: np.ndarray, before: np.ndarray | None = None
+    ) -> _Fit:
+        """Fit differences along directions to two independent residuals (2, P, 3). `before` are those with the start's numbers."""
         matrix, (squares, errors) = differences.matrix(), differences.squares()
         # Along these no change is seen: the variance is at least that of the largest change that noise may hide.
         hidden = squares <= _ERRORS * errors + _ROUNDING * float(np.abs(squares).max())
@@ -301,14 +328,24 @@ class _Fit:
         # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
         open_ = flat[None] | (~numbers.rigid[:, None] & comparable)
         unseen = np.abs(changes[:n]) * (hidden[None] & open_)
-        return cls(total, error, own, step[:n], unseen[:, hidden])
+        better = math.inf if before is None else _better(residuals, before)
+        return cls(total, error, own, step[:n], unseen[:, hidden], better)
+
+
+def _better(residuals: np.ndarray, before: np.ndarray) -> float:
+    """Return by how many standard errors residuals (2, P, 3) are smaller than those `before`, with or without the noisiest pixels."""
+    changes = (before[0] * before[1] - residuals[0] * residuals[1]).sum(axis=1)
+    noise = np.square(np.stack([residuals[0] - residuals[1], before[0] - before[1]])).sum(axis=(0, 2))
+    calm = changes[noise <= np.quantile(noise, 1.0 - _NOISY)]
+    return max(float(x.sum()) / max(math.sqrt(float(np.square(x).sum())), 1e-300) for x in (changes, calm))
 
 
 def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     """Return the lines."""
     posed = numbers.rigid | (numbers.sizes <= 0.0)
-    sizes = np.where(posed, np.maximum(numbers.sizes, _OF_WIDTHS * widths), numbers.sizes)
-    unseen = fit.unseen > _DOUBTFUL * np.where(posed, 2.0 * numbers.limits[: numbers.count], sizes)[:, None]
+    longest = 2.0 * numbers.limits[: numbers.count]
+    sizes = np.where(posed, np.maximum(numbers.sizes, np.minimum(_OF_WIDTHS * widths, longest)), numbers.sizes)
+    unseen = fit.unseen > _DOUBTFUL * np.where(posed, longest, sizes)[:, None]
     hidden = np.sqrt(np.square(fit.unseen).sum(axis=1))  # uncertainty shared with undetermined numbers
     error = np.where(unseen.any(axis=1), np.inf, np.hypot(fit.error, hidden))
     open_ = error > _DOUBTFUL * sizes
@@ -318,9 +355,17 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     of_step = np.maximum(error, fit.own)  # references without noise leave the noise of this check
     further = np.abs(fit.step) > np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes)
     shown, more = np.minimum(error, sizes), np.where(error > sizes, " or more", "")
+    # Least squares is linear: a picture that is no better than with the start, many standard errors away, refutes these errors.
+    moved = np.abs(numbers.tangents()[:n, :n] @ (numbers.point[:n] - numbers.start))
+    refuted = (moved > _FAR * of_step) & (fit.better < _BETTER)
     undetermined, unfinished = {}, {}
     for key, of in numbers.places().items():
-        if open_[of].any():
+        if refuted[of].any():
+            undetermined[key] = (
+                f"{key}: the pictures are no better than with its initial value, beyond noise, so it may be in a local minimum; give more "
+                "samples, bounds, or another start"
+            )
+        elif open_[of].any():
             others = [k for k, x in numbers.places().items() if k != key and together[of][open_[of]][:, x].any()]
             others += [*numbers.fields] if shared[of].any() else []
             together_with = f", together with {listed(others)}" if others else ""
@@ -333,7 +378,7 @@ def _judged(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
                 f"{key}: the run ended before it settled: a least-squares step from its end moves it by {_numbers(fit.step[of])}, with the "
                 f"standard error {_numbers(of_step[of])}; give more seconds, or resume the run"
             )
-    known = np.where(error > sizes, np.inf, error)  # beyond its own size an error is not linear
+    known = np.where((error > sizes) | refuted, np.inf, error)  # beyond its own size an error is not linear
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, fit.own))
     return NumbersCheck(undetermined, unfinished, errors, steps, noise)
 

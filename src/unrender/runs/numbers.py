@@ -82,6 +82,7 @@ class Numbers:
         keys: keys of the numbers.
         views: indices of the rendered views.
         point: numbers, then the factors, which are 0, (n + k,).
+        start: numbers at the start of the run, (n,).
         sizes: sizes of the numbers, to which changes are relative, (n,); 0 if a number is 0 at the start and at the end.
         limits: largest change of each in one direction, (n + k,).
         rigid: whether a number is of a pose, (n,).
@@ -95,6 +96,7 @@ class Numbers:
     keys: tuple[str, ...]
     views: tuple[int, ...]
     point: np.ndarray
+    start: np.ndarray
     sizes: np.ndarray
     limits: np.ndarray
     rigid: np.ndarray
@@ -146,9 +148,9 @@ class Numbers:
             limits += [limit] * values[key].size
         rigid = np.concatenate([np.full(values[key].size, known[key].rigid) for key in keys])
         spp = min(max(_PATHS // (2 * elements * pixels), _SPP[0]), _SPP[1])
-        point = np.concatenate([np.ravel(values[key]).astype(np.float64) for key in keys])
+        point, began = (np.concatenate([np.ravel(x[key]).astype(np.float64) for key in keys]) for x in (values, start))
         return cls(
-            problem, values, tuple(keys), tuple(views), point, np.array(sizes), np.array(limits), rigid,
+            problem, values, tuple(keys), tuple(views), point, began, np.array(sizes), np.array(limits), rigid,
             power_of_two(spp),
         )  # fmt: skip
 

@@ -72,6 +72,7 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
     channels = {"luminance": (1, 2), "xyz": (3, 4), "rgb": (1, 3, 4)}[form.colour]
     try:
         image = images.read(source, alpha=True, channels=channels)
+        profile = images.check_metadata(source)
     except InputError as error:
         if form.colour == "rgb" or "expected an array of shape" not in str(error):
             raise
@@ -89,7 +90,7 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
         )
     if not form.signed:
         _check_not_negative(values)
-    notices = [image.notice] if image.notice else []
+    notices = [notice for notice in (image.notice, profile) if notice]
     if xyz and _is_of_film(source):
         values = images.xyz_to_rgb(values)
         notices.append("is in XYZ, as the film stores it, and is converted to RGB")
@@ -104,6 +105,7 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
 def _of_aov(source: Any, name: str) -> Reference:
     """Read the reference of an AOV. The alpha of a mask in 8 or 16 bits is the mask; other integer values are sRGB albedos."""
     image = images.read(source, alpha=True)
+    images.check_metadata(source)
     values, notices = image.values, []
     if name == "mask" and image.notice:
         values = images.read(source, linearise=False).values if image.alpha is None else image.alpha[..., None]
@@ -209,6 +211,7 @@ def _check_view(
     if view.mask is not None and not isinstance(view.mask, StoredPicture):
         try:
             mask = images.read(view.mask, linearise=False).values
+            images.check_metadata(view.mask)
             _check_size(mask, height, width, view.sensor)
             mask = mask.mean(axis=2)
             if mask.min() < 0 or mask.max() > 1:

@@ -31,7 +31,6 @@ _PILLOW_KINDS = {
 """{kind of file: Pillow's name of the format} for files that Pillow decodes. Other Pillow plugins are not used."""
 _PILLOW_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr")
 """Pillow modes of at most 8 bits per channel. Pillow clips others."""
-_ORIENTATION = 0x0112
 _QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 3}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 """{EXIF orientation: counter-clockwise quarter turns}; orientations 2, 4, 5 and 7 are also mirrored."""
@@ -69,20 +68,12 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
         with _opened(path, header) as picture:
             if picture.format == "PNG":
                 picture.load()  # EXIF may follow the pixels
-            return picture.width, picture.height, _orientation(picture)
+            return picture.width, picture.height, images.orientation(picture)
     if header.kind == "TIFF":
         width, height, _ = header.sizes[0]
         return width, height, header.orientation
     height, width = _by_mitsuba(path).values.shape[:2]
     return width, height, 1
-
-
-def _orientation(picture: Image.Image) -> int:
-    """Return EXIF's orientation, 1 if it is absent or unreadable."""
-    try:
-        return int(picture.getexif().get(_ORIENTATION, 1))
-    except Exception:  # EXIF data is often malformed, and Pillow raises many types of exceptions
-        return 1
 
 
 def _oriented_size(width: int, height: int, orientation: int) -> tuple[int, int]:
