@@ -13,10 +13,11 @@ import pytest
 import unrender as ur
 from kernels import recorded
 from tiers import quick
+from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.tensors import from_tensor, to_tensor
-from unrender.rendering.renderer import SampleRequest
+from unrender.rendering.renderer import SampleRequest, Space
 
 
 def box(**more: Any) -> dict[str, Any]:
@@ -168,6 +169,50 @@ def test_moving_geometry_runs_in_primary_space() -> None:
     assert np.abs(np.array(gradient[key])).max() > 0
 
 
+@pytest.mark.parametrize("space", ["path", "primary"])
+def test_both_states_of_texture_coordinates_have_the_same_random_numbers(tmp_path: Path, space: Space) -> None:
+    """Texture coordinates and normals are a shape's, but move no point."""
+    points = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    sheet = mesh_layout.build(
+        "sheet",
+        points,
+        np.array([[0, 1, 2], [0, 2, 3]], np.uint32),
+        None,
+        points[:, :2],
+        mi.load_dict({"type": "diffuse"}),
+    )
+    sheet.write_ply(str(tmp_path / "sheet.ply"))
+    texture = {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(np.random.default_rng(0).random((4, 4, 3)).astype(np.float32)),
+        "raw": True,
+    }
+    scene = {
+        "type": "scene",
+        "camera": {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
+        },
+        "sheet": {
+            "type": "ply",
+            "filename": str(tmp_path / "sheet.ply"),
+            "bsdf": {"type": "diffuse", "reflectance": texture},
+        },
+        "sky": {"type": "constant"},
+    }
+    key, renderer = "sheet.vertex_texcoords", MitsubaRenderer(scene, 2)
+    session = renderer.prepare([key], "primary")
+    current = renderer.values([key])
+    previous = {key: current[key] + 0.05}
+    pair = session.image_pair(current, previous, SampleRequest(0, 4, 1), space)
+    assert pair.previous is not None
+    for images, values in ((pair.images, current), (pair.previous, previous)):
+        alone = session.image(values, SampleRequest(0, 4, 1))
+        assert np.array_equal(np.array(images), np.array(alone.images))
+    assert not np.array_equal(np.array(pair.previous), np.array(pair.images))
+
+
 @pytest.mark.slow
 def test_gradients_of_two_states_of_moving_geometry_are_each_its_own() -> None:
     """In primary space: the previous scene's adjoint on the same random numbers, to the rounding of sums."""
@@ -194,6 +239,22 @@ def test_meta_estimation_of_moving_geometry_says_that_it_is_in_primary_space() -
     assert found.skipped == 0
     related = ur.optimize(asked, ur.MetaEstimator(space="path"), ur.optimizers.MetaAdam(1e-3), steps=3)
     assert related.skipped == 0
+
+
+def test_textures_of_which_pictures_are_no_linear_function_are_known() -> None:
+    bitmaps = {
+        name: {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 1), 0.5, np.float32)), "raw": True}
+        for name in "abc"
+    }
+    scene = box(
+        metal={"type": "sphere", "bsdf": {"type": "roughconductor", "alpha": bitmaps["a"]}},
+        leaf={"type": "sphere", "bsdf": {"type": "mask", "opacity": bitmaps["b"], "leaf": {"type": "diffuse"}}},
+        paint={"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": bitmaps["c"]}},
+    )
+    known = MitsubaRenderer(scene, 2).parameters()
+    assert known["metal.bsdf.alpha.data"].curved
+    assert known["leaf.bsdf.opacity.data"].curved
+    assert not known["paint.bsdf.reflectance.data"].curved
 
 
 def test_chosen_pixels_are_the_pixels_of_the_film() -> None:

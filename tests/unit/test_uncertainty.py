@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -189,6 +190,14 @@ def test_runs_state_errors_of_the_right_size(
         record = json.loads((exported.folder / "parameters.json").read_text())[key]
         written = np.array(mi.Bitmap(str(exported.folder / record["standard_error"])))
         np.testing.assert_allclose(written, run.standard_error[key], rtol=1e-6)
+
+
+def test_a_texture_of_which_the_picture_is_no_linear_function_has_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = problem()
+    curved = {key: dataclasses.replace(info, resizable=True) for key, info in made.renderer.parameters().items()}
+    assert "wall" in uncertainty(made, estimate(made)).standard_error
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: curved)
+    assert not uncertainty(made, estimate(made)).standard_error
 
 
 def test_volumes_have_no_map() -> None:

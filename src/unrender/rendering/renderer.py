@@ -77,6 +77,11 @@ class ParameterInfo:
     length: float = 1.0
 
     @property
+    def curved(self) -> bool:
+        """Whether it is a texture or grid of which the picture is no linear function, such as of roughness, a normal map or a weight."""
+        return self.resizable and not self.brightness
+
+    @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:
         """`mesh` if the values are its vertex positions; else None."""
         return self.mesh if self.welded else None

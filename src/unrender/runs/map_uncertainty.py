@@ -88,7 +88,8 @@ def uncertainty(
     Standard errors are too large where noise of the references remains in m: after few steps, and with strong smoothing.
 
     Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels,
-    and a diagonal does not bound their errors; nor have textures with κ ≥ 2, such as those with more texels than pixels that see them.
+    and a diagonal does not bound their errors; nor have textures with κ ≥ 2, such as those with more texels than pixels that see them, and
+    textures of which the picture is no linear function, such as of a roughness, a normal map or a weight.
     There is none either if time or samples are too few.
 
     Args:
@@ -148,10 +149,12 @@ def of_residuals(
         known: curvature at the values, with `pixel_noise`.
         seed: seed of all random numbers.
     """
+    infos = problem.renderer.parameters()
     keys = [
         key
         for key, square in known.squares.items()
         if square.ndim == MAP_AXES and square.any() and known.overlap.get(key, 1.0) < _MOST_OVERLAP
+        if not infos[key].curved
     ]
     if not keys or known.probes < _FEWEST:
         return Uncertainty()

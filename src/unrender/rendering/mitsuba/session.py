@@ -97,9 +97,8 @@ class MitsubaSession:
         self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
         moved = {key: moved_shape(scene, key) for key in (*keys, *poses) if key not in cameras}
         moved |= {key: "" for key in keys if key in scene.poses and key not in derivatives}
-        # Moving shapes and fixed sensors of a pair.
         self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
-        self._related = not (gpu.is_gpu() or has_instances(pair.current))
+        self._related = bool(self._moving) and not (gpu.is_gpu() or has_instances(pair.current))
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
@@ -218,7 +217,7 @@ class MitsubaSession:
         self.set_parameters(current)
         # A virtual call reaches both scenes' objects, and its adjoint accumulates gradients in all that are attached.
         self.set_parameters(previous, previous=True, attach=request.both_gradients)
-        space = "primary" if self._light.aov or (self._geometric and gpu.is_gpu()) else space
+        space = "primary" if self._light.aov or (self._geometric and not self._related) else space
         if space == "primary" and (self._light.aov or not (self._geometric and self._related)):
             radiance = self.kernel(ImagePass(), request)()
             radiance_previous = self.kernel(ImagePass(previous=True), request)()
