@@ -99,3 +99,14 @@ def test_charts_tell_what_they_show():
     assert parameter_errors.title([]) == "Parameter error (RMSE)"
     assert parameter_errors.title([NORMAL]) == "Parameter error (mean angle in °)"
     assert parameter_errors.title([NORMAL, PLAIN]) == "Parameter error (RMSE, or mean angle in °)"
+
+
+def test_cells_of_vectors_are_selected_vector_by_vector():
+    truth = np.stack([tilted(0.0)] * 3)
+    values = np.stack([tilted(0.0), tilted(30.0), tilted(60.0)])
+    where = np.array([True, True, False])
+    for shape in ((3, 3), (9,)):
+        error = DIRECTION.error(values.reshape(shape), truth.reshape(shape), where)
+        assert error == pytest.approx(15.0, abs=1e-4)
+    for misfit in (np.ones((3, 3), bool), np.ones(9, bool), np.array(True)):
+        assert DIRECTION.error(values, truth, misfit) is None

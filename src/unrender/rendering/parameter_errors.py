@@ -51,21 +51,22 @@ class ErrorMeasure:
     def error(self, values: np.ndarray, truth: np.ndarray, where: np.ndarray | None = None) -> float | None:
         """Return the error over all elements, or over the cells that `where` selects.
 
-        Return None if the shapes differ or no element remains.
+        Return None if the shapes differ, `where` does not fit, or no element remains.
 
         Args:
             values: values of the parameter.
             truth: ground truth, of the same shape.
-            where: (...) booleans over the leading axes of `values`; None for all cells.
+            where: booleans over leading axes of `values`; None for all cells. A cell of normals or directions is a vector.
         """
         if values.shape != truth.shape or values.size == 0:
             return None
         with np.errstate(over="ignore", invalid="ignore"):
             errors = self._squares(values, truth) if self.role == "value" else self._angles(values, truth)
         if where is not None:
-            if where.ndim < 1 or values.shape[: where.ndim] != where.shape:
+            cells = self._unknown(where)
+            if cells.ndim < 1 or errors.shape[: cells.ndim] != cells.shape:
                 return None
-            errors = errors[self._unknown(where)]
+            errors = errors[cells]
         if errors.size == 0:
             return None
         mean = float(np.mean(errors, dtype=np.float64))
