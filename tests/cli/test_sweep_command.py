@@ -38,7 +38,8 @@ def test_a_grid_in_this_process(unrender, mitsuba_variant: str) -> None:
     assert (answer.status, answer.error) == (0, "")
     record = sweep_json()
     assert (record["status"], record["best"], record["best_line"]) == ("finished", 1, "-s learning_rate=0.3")
-    assert "best: -s learning_rate=0.3\nto run it: unrender run quad --method plain --steps 20 -s" in answer.out
+    line = f"to run it: unrender run quad --method plain --steps 20 --final-spp 1 --variant {mitsuba_variant} -s"
+    assert f"best: -s learning_rate=0.3\n{line}" in answer.out
     assert Path("s/compare.html").exists()
     runs = [run for trial in record["trials"] for run in trial["runs"]]
     assert [run["folder"] for run in runs] == [f"trial-{i:03d}-seed{k}" for i in range(2) for k in range(2)]

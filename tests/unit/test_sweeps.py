@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 import random
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from unrender.app.cli.sweep_driver import equally_good
+from unrender.app.cli.sweep_driver import equally_good, run_command
 from unrender.app.sweeps import folders, pruning
 from unrender.app.sweeps.axes import Axis, parse_axes
 from unrender.app.sweeps.record import RunOutcome, SweepPlan, SweepRecord, TrialRecord, read_sweep, write_sweep
@@ -286,3 +287,26 @@ def test_trials_within_two_standard_errors_of_the_best_are_named() -> None:
     exact = [trial(0, 0.9, None), trial(1, 0.5, None)]
     assert equally_good(SweepRecord(plan=plan, trials=exact, best=1)) == []
     assert equally_good(SweepRecord(plan=plan, trials=exact)) == []
+
+
+def test_the_command_of_the_best_trial_repeats_its_first_run() -> None:
+    """All that a run depends on is named, unless it is the command's default."""
+    plan = SweepPlan(problem="quad", method="plain", over=["spp=2,4"], search="grid", trials=2, steps=20)
+    record = SweepRecord(plan=plan, best_line="-s spp=4")
+    assert run_command(record) == "unrender run quad --method plain --steps 20 -s spp=4"
+    other = plan.model_copy(update={"seed": 5, "final_spp": 8, "variant": "llvm_ad_rgb", "settings": {"loss": "L1 x"}})
+    words = shlex.split(run_command(record.model_copy(update={"plan": other})))
+    assert words[5:] == [
+        "-s",
+        "loss=L1 x",
+        "--steps",
+        "20",
+        "--seed",
+        "5",
+        "--final-spp",
+        "8",
+        "--variant",
+        "llvm_ad_rgb",
+        "-s",
+        "spp=4",
+    ]

@@ -102,13 +102,16 @@ def equally_good(record: SweepRecord) -> list[int]:
 
 
 def run_command(record: SweepRecord) -> str:
-    """Return the command of a run with the best settings."""
+    """Return the command of the first run of the best trial."""
     plan = record.plan
     words = ["unrender", "run", plan.problem, "--method", plan.method]
     words += [w for name, value in plan.problem_settings.items() for w in ("-p", f"{name}={value}")]
     words += [w for name, value in plan.settings.items() for w in ("-s", f"{name}={value}")]
     words += ["--steps", str(plan.steps)] if plan.steps is not None else []
     words += ["--seconds", f"{plan.seconds:g}"] if plan.seconds is not None else []
+    words += ["--seed", str(plan.seed)] if plan.seed else []
+    words += ["--final-spp", str(plan.final_spp)] if plan.final_spp is not None else []
+    words += ["--variant", plan.variant] if plan.variant != "auto" else []
     return f"{shlex.join(words)} {record.best_line}"
 
 
