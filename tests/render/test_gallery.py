@@ -75,7 +75,8 @@ MESHES = [
     "shadow-art",
     "statue",
     "relief",
-]  # test_shapes.py, test_mesh_runs.py, test_relief.py
+    "lenses",
+]  # test_shapes.py, test_mesh_runs.py, test_relief.py, test_lenses.py
 VOLUMES = ["three-bodies", "tea", "smoke", "nerf-volume"]  # see test_gallery_volumes.py
 
 

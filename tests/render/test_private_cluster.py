@@ -51,6 +51,27 @@ with connect(Workers(1), "llvm_ad_rgb", store_bytes=80 << 20):
 print(*same, action() == before)
 """
 
+RAISES = """
+import os, signal, sys, threading, time
+from unrender.app.distributed.cluster import Workers, connect
+class Mine(Exception): pass
+def handler(number, frame):
+    raise SystemExit(7) if sys.argv[1] == "exit" else Mine
+with connect(Workers(1), "llvm_ad_rgb", store_bytes=80 << 20) as cluster:
+    ray = cluster.ray
+    wait = cluster.wait if sys.argv[2] == "here" else lambda of, count, seconds: ray.wait(of, num_returns=count, timeout=seconds)
+    signal.signal(signal.SIGTERM, handler)
+    task = ray.remote(lambda: time.sleep(30)).remote()
+    threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    try:
+        wait([task], 1, 5.0)
+        print("ignored")
+    except Mine:
+        print("raised")
+    finally:
+        print(cluster.get(ray.put("connected")), flush=True)
+"""
+
 
 def below(root: int) -> list[int]:
     """A process and all that descend from it."""
@@ -179,6 +200,25 @@ def test_no_compiled_handler_of_sigterm_is_installed_while_ray_starts(setting: s
     words = [sys.executable, "-c", ACTION]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stdout.split()) == (0, [str(setting == "1"), "True", "True"]), done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "wait", "code", "lines"),
+    [
+        ("exit", "here", 7, ["connected"]),
+        ("exception", "here", 0, ["raised", "connected"]),
+        ("exit", "ray", 1, ["connected"]),  # the planted faults: Ray's own wait
+        ("exception", "ray", 1, ["connected"]),
+    ],
+)
+def test_a_handler_of_a_signal_may_raise_anything_while_workers_are_awaited(
+    kind: str, wait: str, code: int, lines: list[str], home: Path
+) -> None:
+    words = [sys.executable, "-c", RAISES, kind, wait]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout.split()) == (code, lines), done.stderr
+    assert ("SystemError" in done.stderr) is (wait == "ray"), done.stderr
 
 
 def test_a_killed_driver_leaves_no_folder() -> None:

@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from unrender.core.errors import InputError
 from unrender.gallery import meshes
 from unrender.rendering.mitsuba.integrators.boundary_sampling import EmitterPoints
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -223,3 +224,16 @@ def test_a_planted_fault_of_three_per_cent() -> None:
     expected = differences(block, "moving.translation.z", 2, 8192, 0.02)
     assert np.abs(scores(found, expected)).max() < LIMIT
     assert np.abs(scores(1.03 * found, expected)).max() > LIMIT
+
+
+@pytest.mark.parametrize("kind", ["conductor", "dielectric", "plastic", "twosided"])
+@pytest.mark.parametrize("key", ["moving.translation", "moving.vertex_positions"])
+def test_moving_mirrors_and_glass_have_no_path_gradient(kind: str, key: str) -> None:
+    """Measured against differences, theirs have even the wrong sign. Perturbed renders support them."""
+    bsdf = {"type": kind, "inner": {"type": "conductor"}} if kind == "twosided" else {"type": kind}
+    renderer = MitsubaRenderer(lambda: block() | {"moving": {**block()["moving"], "bsdf": bsdf}}, 3)
+    with pytest.raises(InputError, match="path gradients do not follow the directions that a moving perfect mirror"):
+        renderer.prepare([key], None)
+    assert not renderer.parameters()[key].differentiable
+    renderer.prepare([key], None, derivatives=False)
+    assert MitsubaRenderer(block, 3).parameters()[key].differentiable

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import pickletools
+import signal
 import subprocess
 import sys
 import textwrap
+import threading
+import time
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -25,6 +29,7 @@ from unrender.app.distributed.cluster import (
     workers,
 )
 from unrender.app.distributed.cluster.connection import HeadNode
+from unrender.app.distributed.cluster.waiting import Waiter
 from unrender.backend import limits
 from unrender.core.errors import InputError
 
@@ -239,6 +244,30 @@ def test_after_an_interrupt_only_tasks_that_ended_in_good_order_are_told() -> No
     assert workers.saved() == [Ended("fine", "fine done")]
     assert (workers.pending, workers.saved()) == (0, [])
     assert ray.begun == ["fine", "late"]  # none is begun again
+
+
+def test_an_exception_of_a_signals_handler_is_raised_once_the_call_has_ended() -> None:
+    ended: list[bool] = []
+
+    def handler(number: int, frame: object) -> None:
+        raise SystemExit(7)
+
+    def slow() -> None:
+        time.sleep(0.3)
+        ended.append(True)
+
+    before = signal.signal(signal.SIGUSR1, handler)
+    try:
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGUSR1)).start()
+        waiter = Waiter()
+        with pytest.raises(SystemExit, match="7"):
+            waiter.call(slow)
+        assert ended
+        assert waiter.call(lambda: 3) == 3
+        with pytest.raises(ZeroDivisionError):
+            waiter.call(lambda: 1 / 0)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
 
 
 def test_in_this_process_a_failure_is_a_line_and_an_interrupt_passes() -> None:

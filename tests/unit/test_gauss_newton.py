@@ -126,6 +126,25 @@ def test_widths_are_those_of_a_shift_of_the_picture() -> None:
         assert state.widths[key] == pytest.approx(0.5 * np.sqrt(slope / part.mean()), rel=0.1)
 
 
+@pytest.mark.parametrize("grows", [True, False])
+def test_widths_grow_while_differences_change_no_picture(grows: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where few paths hit a lamp behind glass, so that small differences change no sample. The planted fault is a width that stays."""
+    own, step = module._Point._states, 0.05
+
+    def rounded(self: Any, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
+        return own(self, step * np.round(points / step), view, key, spp)
+
+    monkeypatch.setattr(module._Point, "_states", rounded)
+    if not grows:
+        monkeypatch.setattr(module, "_BLIND", 0.0)
+    made, estimator = problem_of(MATRIX), ur.GaussNewton(spp=2, derivative_spp=2, width=0.01)
+    start = {key: x + 0.2 * step for key, x in START.items()}
+    estimate = estimator.estimate(made, start, estimator.init(made, start), Key(0))[0]
+    widths = estimate.require("test", Smoothing).sigma
+    assert all((float(width) > 0.5 * step) is grows for width in widths.values())
+    assert bool(np.diag(estimate.require("test", Hessian).matrix).any()) is grows
+
+
 def test_views_that_a_parameter_does_not_change_are_not_rendered() -> None:
     renderer = AnalyticRenderer(TRUTH, MATRIX, 0.1, 0.0, shape=(4, 5), sensors=2)
     found = renderer.parameters()

@@ -158,7 +158,11 @@ def test_elements_that_share_pixels_have_an_overlap_and_no_standard_error() -> N
     renderer = AnalyticRenderer(truth, a.reshape(3 * SIZE**2, -1), 0.0, 0.0, shape=(SIZE, SIZE), sensors=1)
     made = Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(renderer.exact(truth))])
     assert curvature(made).overlap["wall"] == pytest.approx(4.0, rel=0.3)
-    assert not uncertainty(made, made.initial_values()).standard_error
+    found = uncertainty(made, made.initial_values())
+    assert not found.standard_error
+    assert found.missing == (
+        "wall: no map of standard errors: pixels see several texels, so errors of texels depend on each other",
+    )
     assert curvature(problem()).overlap["wall"] == pytest.approx(1.0, abs=0.2)
 
 
@@ -205,15 +209,20 @@ def test_volumes_have_no_map() -> None:
     truth = {"fog": np.random.default_rng(0).uniform(0.2, 0.8, (1, TEXELS, TEXELS, 3))}
     renderer = AnalyticRenderer(truth, matrix(), 0.0, 0.0, shape=(SIZE, SIZE), sensors=1)
     made = Problem(renderer, [Parameter("fog", initial=0.4, bounds=(0, 1))], [View(renderer.exact(truth))])
-    assert not uncertainty(made, made.initial_values()).standard_error
+    found = uncertainty(made, made.initial_values())
+    assert not found.standard_error
+    assert found.missing == (
+        "fog: no map of standard errors: rays pass many voxels, so errors of voxels depend on each other",
+    )
 
 
 def test_too_few_probes_or_samples_give_no_map() -> None:
     made = problem()
     values = estimate(made)
     picture = np.asarray(made.views[0].reference)
-    few = curvature(made, values, probes=4)
-    assert not of_residuals(made, values, [[picture], [picture]], few).standard_error
+    few = of_residuals(made, values, [[picture], [picture]], curvature(made, values, probes=4))
+    assert (not few.standard_error, "no time was left" in few.missing[0]) == (True, True)
     noisy = [[picture + np.random.default_rng(seed).normal(size=picture.shape)] for seed in range(2)]
     enough = curvature(made, values, noise=pixel_noise(made, noisy))
-    assert not of_residuals(made, values, noisy, enough).standard_error
+    found = of_residuals(made, values, noisy, enough)
+    assert (not found.standard_error, "too few samples" in found.missing[0]) == (True, True)

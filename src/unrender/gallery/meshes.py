@@ -111,6 +111,19 @@ def triangles(
     return mesh_layout.build(name, positions, faces, None, coordinates, load_described(bsdf))
 
 
+def height_grid(count: int) -> np.ndarray:
+    """Return the vertices (n, n, 3) of a flat height field, x and y in [-1, 1] at z = 0."""
+    y, x = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count), indexing="ij")
+    return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+def height_faces(count: int) -> np.ndarray:
+    """Return its triangles, (2 (n - 1)², 3), whose front faces +z."""
+    number = np.arange(count * count).reshape(count, count)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+
+
 def surface(mesh: Any) -> Surface:
     """Return the vertices and faces of a loaded `mitsuba.Mesh`."""
     points, faces = np.array(mesh_layout.positions(mesh)), np.array(mesh_layout.faces(mesh))

@@ -59,7 +59,7 @@ class Relief:
             picture = reference(load(partial(self._stage, truth, lit)), 0, self.reference_spp, self.max_depth)
             off = {f"lamp_{n}.intensity.value": [0.0, 0.0, 0.0] for n in range(len(_LAMPS)) if n != lit}
             views.append(View(picture, known=off))
-        grid = _grid(self.height_resolution)
+        grid = meshes.height_grid(self.height_resolution)
         unknown = Parameter(
             "height", initial=np.zeros_like(grid[..., :1]), bounds=(-_LARGEST, _LARGEST), preconditioner=LargeSteps(1.0)
         )
@@ -76,9 +76,9 @@ class Relief:
 
     def _stage(self, heights: np.ndarray, lit: int | None = None) -> dict[str, Any]:
         """Return the scene with a height map (n, n), under one lamp or all."""
-        positions = _grid(self.height_resolution)
+        positions = meshes.height_grid(self.height_resolution)
         positions[..., 2] = heights
-        corners = _corners(self.height_resolution)
+        corners = meshes.height_faces(self.height_resolution)
         lamps = {
             f"lamp_{n}": {
                 "type": "point",
@@ -95,19 +95,6 @@ class Relief:
         }
 
 
-def _grid(count: int) -> np.ndarray:
-    """Return the vertices of the flat plaque, (n, n, 3)."""
-    y, x = np.meshgrid(np.linspace(-1, 1, count), np.linspace(-1, 1, count), indexing="ij")
-    return np.stack([x, y, np.zeros_like(x)], axis=-1)
-
-
-def _corners(count: int) -> np.ndarray:
-    """Return the triangles of the grid, (2 (n - 1)², 3), whose front faces the camera."""
-    number = np.arange(count * count).reshape(count, count)
-    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-    return np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
-
-
 def _displaced(grid: np.ndarray, values: Any) -> Any:
     """Return the positions (3 n²,) of the vertices of a flat plaque, moved along its normal by `values["height"]`, (n, n, 1)."""
     normal = mi.TensorXf(np.array([[[0.0, 0.0, 1.0]]], np.float32))
@@ -116,7 +103,7 @@ def _displaced(grid: np.ndarray, values: Any) -> Any:
 
 def _heights(count: int) -> np.ndarray:
     """Return a ring with a dome in its middle and a groove across, flat at the border: (n, n)."""
-    grid = _grid(count)
+    grid = meshes.height_grid(count)
     x, y = grid[..., 0], grid[..., 1]
     radius = np.hypot(x, y)
     ring = 0.12 * np.exp(-(((radius - 0.6) / 0.12) ** 2))

@@ -246,7 +246,7 @@ def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo
         rigid=any(info.rigid for info in targets),
         viewpoint=any(info.viewpoint for info in targets),
         sensor=sensors.pop() if len(sensors) == 1 else None,
-        nonlinear=any(info.nonlinear for info in targets),
+        nonlinear=any(info.nonlinear or info.welded for info in targets),
         shapes_bsdf=any(info.shapes_bsdf for info in targets),
     )
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
+from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.image_sensitivity import (
     MAP_AXES,
     Curvature,
@@ -54,7 +55,7 @@ class Uncertainty:
             numbers that the references do not determine.
         data_share: {key: array} of the textures' shapes, in [0, 1]: weight of the references in each element. The rest of its value was
             decided by the start, by smoothing, or by a prior.
-        missing: one line for each reason why numbers have no standard error.
+        missing: one line for each reason why an unknown has no standard error.
     """
 
     standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -71,8 +72,8 @@ def uncertainty(
     Numbers, 24 elements at most, are tested by least squares at `values`, together with directions of textures and grids that trade off
     against them. Their standard errors contain the references' noise, and the distance from the least-squares solution. Numbers have none
     if another unknown is a mesh, has a prior, or is a texture that is too large or has no path gradient, nor if time runs out. `missing`
-    contains the reason. No unknown has any if the problem has few numbers and its pictures differ from the references by more than
-    noise, in up to four views.
+    contains the reason for each unknown without errors. No unknown has any if the problem has few numbers and its pictures differ from
+    the references by more than noise, in up to four views.
 
     For textures, r is the pictures' residual, J their derivative with respect to the parameters, and H a diagonal element of the
     Gauss-Newton matrix JᵀJ. The variance of an element is that of a posterior with independent elements:
@@ -120,7 +121,26 @@ def uncertainty(
     left = until - time.perf_counter()
     numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity())
     errors = {**numbers.standard_errors(values), **maps.standard_error}
-    return Uncertainty(errors, maps.data_share, tuple(numbers.missing()))
+    told = {key for key, shape in problem.shapes().items() if len(shape) >= MAP_AXES}
+    others = _others(problem, keys, told.union(errors, numbers.unchecked, numbers.fixed))
+    return Uncertainty(errors, maps.data_share, (*maps.missing, *numbers.missing(), *others))
+
+
+def _others(problem: Problem, tested: Sequence[str], told: Collection[str]) -> list[str]:
+    """Return a line for each unknown that has no standard errors and is not among those `told`."""
+    infos, result = problem.renderer.parameters(), []
+    for key, unknown in problem.unknowns.items():
+        if key in told:
+            continue
+        reason = "least squares test few numbers only"
+        if infos[key].welded:
+            reason = "the vertices of a mesh have none"
+        elif unknown.prior is not None:
+            reason = "it has a prior"
+        elif key in tested:
+            reason = "the test's pictures are not finite, or do not depend on the numbers"
+        result.append(f"{key}: no standard error: {reason}")
+    return result
 
 
 def _halves(
@@ -140,7 +160,7 @@ def of_residuals(
     known: Curvature,
     seed: int = 0,
 ) -> Uncertainty:
-    """Return `uncertainty` from known pictures and a known curvature.
+    """Return the maps of `uncertainty` from known pictures and a known curvature.
 
     Args:
         problem: problem with views and scene.
@@ -150,14 +170,11 @@ def of_residuals(
         seed: seed of all random numbers.
     """
     infos = problem.renderer.parameters()
-    keys = [
-        key
-        for key, square in known.squares.items()
-        if square.ndim == MAP_AXES and square.any() and known.overlap.get(key, 1.0) < _MOST_OVERLAP
-        if not infos[key].curved
-    ]
-    if not keys or known.probes < _FEWEST:
-        return Uncertainty()
+    shapes = problem.shapes()
+    reasons = {key: _refusal(infos[key], known, key) for key, shape in shapes.items() if len(shape) >= MAP_AXES}
+    keys = [key for key, reason in reasons.items() if not reason]
+    if not keys:
+        return Uncertainty(missing=_lines(reasons))
     roots = [mask_roots(problem, view) for view in range(len(problem.views))]
     residuals = _residuals(problem, halves)
     noise = _Mean.of(np.concatenate([products[seen] for products, seen in _unshared(residuals)]))
@@ -170,10 +187,32 @@ def of_residuals(
         own = _Cells.of(values[key], problem.unknowns[key].initial, known.squares[key], known.noise[key], known.probes)
         prior = 0.0 if (of := problem.unknowns[key].prior) is None else of.diagonal(values[key])
         posterior = own.posterior(one[key] * other[key], known.overlap.get(key, 1.0), noise.is_known, prior)
-        if posterior is not None:
-            variance, share = posterior
-            errors[key], shares[key] = np.sqrt(variance).astype(np.float32), share.astype(np.float32)
-    return Uncertainty(errors, shares)
+        if posterior is None:
+            reasons[key] = "the pictures have too few samples to tell their differences from the references from noise"
+            continue
+        variance, share = posterior
+        errors[key], shares[key] = np.sqrt(variance).astype(np.float32), share.astype(np.float32)
+    return Uncertainty(errors, shares, _lines(reasons))
+
+
+def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
+    """Return why a texture or grid has no map; "" if it has one."""
+    square = known.squares.get(key)
+    if square is None:
+        return "it has no path gradient"
+    if square.ndim > MAP_AXES:
+        return "rays pass many voxels, so errors of voxels depend on each other"
+    if not square.any():
+        return "no picture depends on it"
+    if info.curved:
+        return "pictures do not change in proportion to it"
+    if known.overlap.get(key, 1.0) >= _MOST_OVERLAP:
+        return "pixels see several texels, so errors of texels depend on each other"
+    return "" if known.probes >= _FEWEST else "no time was left; use more seconds or fewer pixels"
+
+
+def _lines(reasons: Mapping[str, str]) -> tuple[str, ...]:
+    return tuple(f"{key}: no map of standard errors: {reason}" for key, reason in reasons.items() if reason)
 
 
 @dataclass(frozen=True)

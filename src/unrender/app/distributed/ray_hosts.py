@@ -217,13 +217,13 @@ class RayHosts:
         while open_:
             self._cluster.head.check()
             waiting = list(open_.values())
-            done = self._ray.wait(waiting, num_returns=1, timeout=_POLL)[0]
+            done = self._cluster.wait(waiting, 1, _POLL)
             if done:  # fetch all available results, since one at a time would take quadratic time
-                done = set(self._ray.wait(waiting, num_returns=len(waiting), timeout=0)[0])
+                done = self._cluster.wait(waiting, len(waiting))
             for share in [share for share, reference in open_.items() if reference in done]:
                 last = time.monotonic()
                 try:
-                    results[share] = self._ray.get(open_.pop(share), timeout=_ANSWER)
+                    results[share] = self._cluster.get(open_.pop(share), _ANSWER)
                 except Exception as error:
                     self._classify_error(share, error, lost)
             now = time.monotonic()
@@ -245,7 +245,7 @@ class RayHosts:
     def _silent(self, shares: Mapping[int, Any]) -> list[int]:
         """Return the shares whose worker does not answer a ping."""
         calls = {share: self._of[share].handle.alive.options(concurrency_group="answers").remote() for share in shares}
-        done, _ = self._ray.wait(list(calls.values()), num_returns=len(calls), timeout=_ANSWER)
+        done = self._cluster.wait(list(calls.values()), len(calls), _ANSWER)
         return [share for share, reference in calls.items() if reference not in done]
 
     def _classify_error(self, share: int, error: Exception, lost: list[_Worker]) -> None:
@@ -272,12 +272,11 @@ class RayHosts:
 
     def _is_done(self, worker: _Worker, timeout: float = 0.0) -> bool:
         """Return whether a worker is ready or has failed, which its `place` distinguishes."""
-        done, _ = self._ray.wait([worker.first], timeout=timeout)
-        if not done:
+        if not self._cluster.wait([worker.first], seconds=timeout):
             return False
         with contextlib.suppress(self._ray.exceptions.RayActorError, self._ray.exceptions.GetTimeoutError):
             try:
-                worker.place = self._ray.get(worker.first, timeout=_ANSWER)
+                worker.place = self._cluster.get(worker.first, _ANSWER)
             except self._ray.exceptions.RayTaskError as error:
                 raise InputError(f"workers: {_reason(error)}") from error
         return True
@@ -289,7 +288,7 @@ class RayHosts:
 
     def _await_all(self) -> None:
         """Wait for all workers at once; those that are not ready by then may come later, and get shares from those that are."""
-        self._ray.wait([worker.first for worker in self._workers], num_returns=len(self._workers), timeout=_START)
+        self._cluster.wait([worker.first for worker in self._workers], len(self._workers), _START)
         started, self._workers = self._workers, []
         for worker in started:
             if not self._is_done(worker):

@@ -19,6 +19,7 @@ from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.mesh_layout import POSITIONS
+from unrender.rendering.mitsuba.parameters import MOVED_MIRROR, is_mirror_or_glass
 from unrender.rendering.mitsuba.pixel_filter import is_box
 from unrender.rendering.mitsuba.poses import is_bare
 from unrender.rendering.mitsuba.scene_graph import has_instances
@@ -63,6 +64,8 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
         return f"{target} is not a mesh ({shape.class_name()}); boundary derivatives are limited to meshes"
     if shape.is_emitter():
         return "path gradients do not support moving emitters"
+    if is_mirror_or_glass(shape.bsdf()):
+        return MOVED_MIRROR
     kinds = [sensor.class_name() for sensor in pair.current.sensors()]
     if "PerspectiveCamera" not in kinds:
         return f"boundary derivatives are limited to perspective sensors; the scene has none ({', '.join(kinds)})"

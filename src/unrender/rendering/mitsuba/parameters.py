@@ -35,6 +35,9 @@ __all__ = [
 _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "SmoothPlastic"}
 _WRAPPERS = {"TwoSidedBRDF"}
 _NORMAL_PERTURBATIONS = {"BumpMap", "NormalMap"}
+MOVED_MIRROR = (
+    "path gradients do not follow the directions that a moving perfect mirror or smooth glass reflects and refracts"
+)
 _MIXED = "its BSDF mixes perfectly specular lobes with others"
 _COMPUTED_OR_FIXED = (NORMALS, TEXCOORDS)
 _REFUTED = {
@@ -164,6 +167,8 @@ def _traits_of(chain: list[Any], key: str) -> ParameterTraits:
     if shapes:
         if shapes[-1].is_sensor():
             return ParameterTraits(True, "it moves a shape that carries a sensor", replayable=False)
+        if any(is_mirror_or_glass(shape.bsdf()) for shape in shapes):
+            return ParameterTraits(True, f"it moves a shape, and {MOVED_MIRROR}", replayable=False)
         return ParameterTraits(True, "it moves a shape")
     return ParameterTraits(True, "it is neither a material's nor an emitter's")
 
@@ -174,7 +179,7 @@ def _bsdf_traits(bsdfs: list[Any], chain: list[Any]) -> ParameterTraits:
     if not mi.has_flag(bsdfs[0].flags(), mi.BSDFFlags.Delta):
         return ParameterTraits(False, "")  # mirrors elsewhere in the nest do not change
     names = [b.class_name() for b in bsdfs if b.class_name() not in _WRAPPERS]
-    if names == ["MaskBSDF"] and not _masks_delta(outer):
+    if names == ["MaskBSDF"] and not is_mirror_or_glass(outer):
         return ParameterTraits(False, "", delta_lobes=((outer, DELTA_MASK),))
     inner = names[0]
     if inner in _SIMPLE_DELTA and all(name in _NORMAL_PERTURBATIONS for name in names[1:]):
@@ -187,9 +192,9 @@ def _bsdf_traits(bsdfs: list[Any], chain: list[Any]) -> ParameterTraits:
     return ParameterTraits(False, _MIXED, replayable=False)
 
 
-def _masks_delta(bsdf: Any) -> bool:
-    """Return whether the BSDF inside a mask (the outermost BSDF) has perfectly specular lobes."""
-    return any(
+def is_mirror_or_glass(bsdf: Any) -> bool:
+    """Return whether a BSDF, or the one inside a mask, has lobes with a single direction other than straight on."""
+    return bsdf is not None and any(
         mi.has_flag(bsdf.flags(), kind) for kind in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission)
     )
 

@@ -364,17 +364,15 @@ class ScenePair:
         if not dr.is_float_v(value):
             return ParameterInfo(shape, False, False, "it holds integers", perturbable=False)
         traits = self.parameter_traits(key)
-        if not traits.replayable:
-            return ParameterInfo(shape, False, False, traits.reason, limits.low, limits.high, singular=limits.singular)
         return ParameterInfo(
             shape,
-            True,
-            traits.shares_paths,
+            traits.replayable,
+            traits.replayable and traits.shares_paths,
             traits.reason,
             limits.low,
             limits.high,
             singular=limits.singular,
-            resizable=self._resizable(key, shape),
+            resizable=traits.replayable and self._resizable(key, shape),
             mesh=partial(self._mesh, key) if is_of_vertices(self.current_parameters, key) else None,
             welded=key.endswith(f".{mesh_layout.POSITIONS}"),
         )

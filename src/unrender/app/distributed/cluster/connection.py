@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from unrender.app.distributed.cluster.private import check_private, private_cluster
+from unrender.app.distributed.cluster.waiting import Waiter
 from unrender.app.distributed.cluster.workers import Share, Workers, most_by_memory, share
 from unrender.backend import limits, variant
 from unrender.backend.access import can_change, can_read
@@ -108,11 +109,21 @@ class Cluster:
     share: Share
     address: str | None
     head: HeadNode = field(default_factory=HeadNode)
+    _waiter: Waiter = field(default_factory=Waiter, repr=False, compare=False)
 
     @property
     def resources(self) -> dict[str, float]:
         """Return the resources of each worker for Ray: `task.options(**cluster.resources)`. Ray sets CUDA_VISIBLE_DEVICES accordingly."""
         return {"num_cpus": self.share.cpus, "num_gpus": self.share.gpus}
+
+    def wait(self, references: list[Any], count: int = 1, seconds: float = 0.0) -> set[Any]:
+        """Return the references that are ready, once `count` of them are, or after some time. Handlers of signals may raise anything."""
+        return set(self._waiter.wait(self.ray, references, count, seconds)) if references else set()
+
+    def get(self, reference: Any, seconds: float | None = None) -> Any:
+        """Return the object of a reference that is ready; raise Ray's `GetTimeoutError` if its transfer takes longer."""
+        options = {} if seconds is None else {"timeout": seconds}
+        return self._waiter.call(lambda: self.ray.get(reference, **options))
 
 
 def load_ray() -> Any:

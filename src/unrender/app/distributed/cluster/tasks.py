@@ -109,7 +109,7 @@ class OnWorkers:
     """
 
     def __init__(self, cluster: Cluster, function: Callable[..., Any]):
-        self._ray, self._head = cluster.ray, cluster.head
+        self._cluster, self._ray = cluster, cluster.ray
         self._remote = cluster.ray.remote(function).options(
             **cluster.resources, max_retries=0, scheduling_strategy="SPREAD", name="unrender"
         )
@@ -125,11 +125,11 @@ class OnWorkers:
 
     def wait(self, seconds: float) -> list[Ended]:
         """Return completed tasks. Raise `InputError` if the cluster's head node is lost."""
-        self._head.check()
+        self._cluster.head.check()
         try:
-            ready = set(self._ray.wait(list(self._begun), num_returns=1, timeout=seconds)[0])
+            ready = self._cluster.wait(list(self._begun), 1, seconds)
             if ready:  # all completed tasks
-                ready |= set(self._ray.wait(list(self._begun), num_returns=len(self._begun), timeout=0)[0])
+                ready |= self._cluster.wait(list(self._begun), len(self._begun))
             ended = [self._end(reference) for reference in list(self._begun) if reference in ready]
             return [one for one in ended if one is not None]
         except KeyboardInterrupt:
@@ -138,12 +138,12 @@ class OnWorkers:
 
     def saved(self) -> list[Ended]:
         """Return, after an interrupt, the tasks that ended regularly, before it or because of it."""
-        ready = self._ray.wait(list(self._begun), num_returns=len(self._begun), timeout=0)[0] if self._begun else []
+        ready = self._cluster.wait(list(self._begun), len(self._begun))
         ended = []
-        for reference in ready:
+        for reference in [reference for reference in self._begun if reference in ready]:
             task = self._begun.pop(reference)
             with contextlib.suppress(self._ray.exceptions.RayError):
-                ended.append(Ended(task.key, self._ray.get(reference), "", task.attempts))
+                ended.append(Ended(task.key, self._cluster.get(reference), "", task.attempts))
         return ended
 
     def _start(self, task: _Begun) -> None:
@@ -154,7 +154,7 @@ class OnWorkers:
         errors = self._ray.exceptions
         task = self._begun.pop(reference)
         try:
-            return Ended(task.key, self._ray.get(reference), "", task.attempts)
+            return Ended(task.key, self._cluster.get(reference), "", task.attempts)
         except errors.RayTaskError as error:
             return Ended(task.key, None, _reason(error.cause or error), task.attempts)
         except errors.LocalRayletDiedError as error:  # nothing can be begun any more
@@ -175,7 +175,7 @@ class OnWorkers:
                 self._ray.cancel(reference)
             until = time.monotonic() + _GRACE_SECONDS
             waiting = list(self._begun)
-            self._ray.wait(waiting, num_returns=len(waiting), timeout=max(until - time.monotonic(), 0))
+            self._cluster.wait(waiting, len(waiting), max(until - time.monotonic(), 0.0))
 
 
 def _reason(error: BaseException) -> str:

@@ -1,0 +1,45 @@
+"""The heights of three lenses, from their caustics: pictures at the truth, the plan, and the descent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unrender as ur
+
+pytestmark = pytest.mark.mitsuba
+
+
+@pytest.fixture(scope="module")
+def problem() -> ur.Problem:
+    return ur.gallery.problem("lenses", resolution=16, mesh_resolution=32, reference_spp=8192)
+
+
+def blocks(pictures: np.ndarray) -> np.ndarray:
+    """Return the means of blocks of 4 x 4 pixels, which few paths that hit the lamp make bright."""
+    return pictures.reshape(-1, 4, 4, 4, 4, 3).mean(axis=(2, 4))
+
+
+def test_the_true_heights_render_the_reference(problem: ur.Problem) -> None:
+    own = blocks(np.stack([ur.render(problem, problem.truth, 0, spp=128, seed=seed) for seed in range(16)]))
+    flat = blocks(ur.render(problem, {"height": np.zeros(3, np.float32)}, 0, spp=8192))[0]
+    reference = blocks(np.asarray(problem.views[0].reference))[0]
+    noise = own.std(axis=0, ddof=1) * np.sqrt(1 / 16 + 128 / 8192) + 1e-4
+    assert np.abs((own.mean(axis=0) - reference) / noise).max() < 5
+    assert np.abs((flat - reference) / noise).max() > 5
+
+
+def test_path_gradients_are_refused_and_auto_takes_gauss_newton_steps(problem: ur.Problem) -> None:
+    with pytest.raises(
+        ur.InputError, match=r"pane\.vertex_positions: .*a moving perfect mirror or smooth glass"
+    ) as caught:
+        ur.optimize(problem, "plain", steps=1, progress=False)
+    assert "\n" not in str(caught.value)
+    assert "Gauss-Newton" in ur.methods.method("auto").plan(problem).reasons[0]
+
+
+@pytest.mark.slow
+def test_auto_recovers_the_heights(problem: ur.Problem) -> None:
+    result = ur.optimize(problem, steps=60, progress=False)
+    start, end = (problem.parameter_error(x)["height"] for x in (problem.initial_values(), result.parameters))
+    assert end < 0.4 * start
