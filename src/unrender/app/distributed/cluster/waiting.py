@@ -42,8 +42,9 @@ class _Call:
 class Waiter:
     """Carries out the calls of Ray that block.
 
-    In the main thread, Ray's compiled code runs the handlers of signals itself while it waits. Where a handler raises another exception
-    than `KeyboardInterrupt`, such as `SystemExit`, it fails with a `SystemError`. In other threads it runs no handlers.
+    In the main thread, Ray's compiled code runs the handlers of signals itself while it waits. Where a handler raises `SystemExit`, the
+    process then ends with status 1, and other exceptions than `KeyboardInterrupt` become a `SystemError`. In other threads it runs no
+    handlers.
     """
 
     def __init__(self) -> None:
