@@ -47,10 +47,9 @@ from unrender.statistics.scores import positive_inverse
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
-_BLIND = 0.3
-"""Width up to which it grows while differences change no picture, relative to the parameter, or in its units if all values are 0."""
-_OF_RANGE = 0.125
-"""Largest width relative to the range between a parameter's bounds."""
+_OF_RANGE, _BLIND = 0.125, 0.3
+"""Largest width relative to the range between a parameter's bounds. Width up to which it grows while differences change no picture,
+relative to the parameter, or in its units if it is 0."""
 _SETTLED = 0.5
 """Maximum step, in units of the widths, after which the shift is halved."""
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
@@ -219,9 +218,8 @@ class GaussNewton:
         for key, width in state.widths.items():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
             target = state.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
-            if square <= 0.0 < slope:  # no picture has changed: in few samples a small difference may hit no lamp
-                value = float(np.abs(arrays.numpy(point.parameters[key])).max()) or 1.0
-                target = max(width, min(width * change, _BLIND * value))
+            if square <= 0.0 < slope:  # few samples show no small change
+                target = max(width, _BLIND * (float(np.abs(arrays.numpy(point.parameters[key])).max()) or 1.0))
             widths[key] = float(np.clip(target, width / change, min(width * change, point.largest[key])))
         return replace(
             state,
