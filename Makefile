@@ -1,10 +1,10 @@
 # make demo        recover a scene from images, this library against the usual loop, at equal time; a page with the result
 # make asset       from photographs, which it renders, to an asset: import, descent in stages, judgement, turntable, exports
-# make test        lint, types, and the quick tests: every feature, in a few minutes
+# make test        lint, types of the sources, and the quick tests: every feature, in a few minutes
 # make test-all    every test
 # make test-slow   the tests that `make test` leaves out
 # make test-unit   the tests that need no Mitsuba alone, in about a minute
-# make lint        lint and types alone
+# make lint        lint and all types
 # make docs        the documentation site, in build/site; its notebooks are executed, warnings are errors
 # make package     wheel and source archive, in dist; the wheel is installed into an empty environment and started there
 # make clean       remove what these wrote (the virtual environment stays)
@@ -28,11 +28,11 @@ SECONDS := 30
 WORKERS = $(shell n=$$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1); test $$n -lt 4 && echo $$n || echo 4)
 PYTEST = $(BIN)/python -m pytest -q --durations=10 -n $(WORKERS) --dist loadfile --max-worker-restart=2
 TYPES = $(BIN)/pyright --pythonpath $(BIN)/python
-# Types take a minute of one core: they are checked beside the tests, and told after them.
+# Types of the sources take half a minute of one core: they are checked beside the tests, and told after them. `make lint` checks all types.
 define WITH_LINT
 	$(BIN)/ruff check .
 	@mkdir -p .pytest_cache
-	@$(TYPES) > .pytest_cache/types.txt 2>&1 & types=$$!; \
+	@$(TYPES) src > .pytest_cache/types.txt 2>&1 & types=$$!; \
 	$(PYTEST) $(1); tests=$$?; \
 	wait $$types; types=$$?; cat .pytest_cache/types.txt; exit $$((tests + types))
 endef

@@ -146,7 +146,7 @@ def test_images_of_few_samples_have_the_mean_of_those_of_many(name: str) -> None
     assert not agree(few, many, scale=1.2), "too noisy to see a fifth"
 
 
-@pytest.mark.parametrize("name", DIFFERENTIABLE)
+@pytest.mark.parametrize("name", quick(DIFFERENTIABLE, "surface"))
 def test_a_pair_is_two_images(name: str) -> None:
     """From the same random numbers, to the bit; on the same paths, in the mean; and of equal states equal images."""
     backend = BACKENDS[name]
@@ -321,7 +321,7 @@ def test_tangent_moments_are_squares_of_the_derivatives_of_single_paths(name: st
 # ---------------------------------------------------------------------------------------------------- pixels and sensors
 
 
-@pytest.mark.parametrize("name", [name for name in BACKENDS if name != "poses"])
+@pytest.mark.parametrize("name", quick([name for name in BACKENDS if name != "poses"], "surface"))
 def test_chosen_pixels_are_those_of_the_whole_film(name: str) -> None:
     backend = BACKENDS[name]
     renderer = backend.renderer()
@@ -539,6 +539,7 @@ def test_a_callback_that_renders_changes_nothing(method: str) -> None:
     np.testing.assert_array_equal(seen.images[1], seen.images[5])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_two_estimators_take_turns_on_one_problem_as_if_they_were_alone() -> None:
     """Path gradients with derivatives of both parameters, smoothing without; the second begins after the first has begun."""

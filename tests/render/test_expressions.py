@@ -148,6 +148,7 @@ def test_two_lamps_of_one_strength_are_recovered() -> None:
     assert result.status == "finished"
 
 
+@pytest.mark.slow
 def test_a_palette_and_its_mask_are_recovered() -> None:
     """A texture of two colours, mixed by a mask: seven numbers and sixteen in place of 48."""
     mask = np.zeros((ROWS, ROWS, 1), np.float32)
@@ -164,6 +165,7 @@ def test_a_palette_and_its_mask_are_recovered() -> None:
     assert np.sqrt(np.mean((found - truth) ** 2)) < 0.05
 
 
+@pytest.mark.slow
 def test_a_small_network_over_coordinates_is_a_texture() -> None:
     """A Python function with Dr.Jit: a smooth texture from a layer of 16 sine units."""
     rows, columns = (x.astype(np.float32) / ROWS for x in np.mgrid[:ROWS, :ROWS])

@@ -240,6 +240,7 @@ def test_on_a_plateau_poses_take_steps_by_a_smoothed_loss() -> None:
     assert chosen == {"near": "GaussNewton", "far": "SmoothedDerivatives"}
 
 
+@pytest.mark.slow
 def test_the_pose_and_the_lens_of_a_camera_take_gauss_newton_steps_together() -> None:
     made, _, _, _ = lens()
     reference = np.array(mi.render(mi.load_dict(made | {"integrator": {"type": "path", "max_depth": 2}}), spp=128))

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 import unrender as ur
+from tiers import quick
 from unrender import methods
 from unrender.core import periodic
 from unrender.core.errors import InputError
@@ -257,7 +258,7 @@ def test_a_malformed_mesh_file_is_one_line(renderer: MitsubaRenderer, tmp_path: 
 # ------------------------------------------------------------------ descents
 
 
-@pytest.mark.parametrize("method", ["auto", "plain", "smoothed"])
+@pytest.mark.parametrize("method", quick(["auto", "plain", "smoothed"], "plain"))
 def test_repeated_columns_follow_in_a_descent(folder: Path, method: str):
     scene = {
         "type": "scene",

@@ -83,6 +83,7 @@ def test_pictures_of_posed_objects_beside_instances_are_those_of_the_moved_scene
     assert difference(np.stack([images[1] for images in batches]), np.stack(stock)) > 6
 
 
+@pytest.mark.slow
 def test_a_descent_recovers_the_pose_of_an_instance() -> None:
     renderer = MitsubaRenderer(scene, 2)
     session = renderer.prepare(["left.translation"], None, derivatives=False)

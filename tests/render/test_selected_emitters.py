@@ -94,7 +94,8 @@ CASES: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("name", quick(list(CASES), "control variate, pixels"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_gradients_are_unbiased(name: str) -> None:
     """An environment map among area lights; in parts of the texture, from the steps at which it has learnt something."""
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.full((8, 16, 3), 0.3, np.float32))}

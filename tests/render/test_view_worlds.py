@@ -170,6 +170,7 @@ def test_a_view_may_have_a_scene_and_a_film_of_its_own() -> None:
     assert np.abs(result.parameters[WALL][1:-1, 1:-1] - 0.3).mean() < 0.05
 
 
+@pytest.mark.slow
 def test_a_known_pose_moves_an_object_in_one_view() -> None:
     moved = picture(paint=0.3, shift=0.7)
     made = problem([ur.View(picture(paint=0.3)), ur.View(moved, known={"wall.translation": [0.7, 0.0, 0.0]})])

@@ -114,6 +114,7 @@ def test_equal_states_give_equal_images_and_gradients_and_seeds_repeat(space: An
         np.testing.assert_allclose(gradient, rows[0][1], rtol=1e-3, atol=1e-4 * np.abs(gradient).max())
 
 
+@pytest.mark.slow
 def test_the_adjoint_of_a_pair_s_current_state_needs_no_weights_of_the_previous() -> None:
     """Its collisions depended on both states, and so must the replay."""
     renderer = MitsubaRenderer(scene(cloud()), 4)

@@ -16,7 +16,7 @@ from zoo import DEPTH, SIZE, scene
 from zscores import z_scores
 
 import unrender as ur
-from tiers import quick, slow
+from tiers import quick
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.methods.base import method
@@ -198,11 +198,12 @@ def problem(material: dict[str, Any] | None = None, key: str = "", **scenery: An
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
-        slow({"pixels": ur.pixels.Uniform(128), "spp": 4}),
-        slow({"pixels": ur.pixels.Adaptive(128, refresh=1000, samples=512), "spp": 4}),
+        {"pixels": ur.pixels.Uniform(128), "spp": 4},
+        {"pixels": ur.pixels.Adaptive(128, refresh=1000, samples=512), "spp": 4},
         {"image": ur.images.RecursiveControlVariate(), "spp": 4},
     ],
     ids=["uniform", "adaptive", "rcv"],

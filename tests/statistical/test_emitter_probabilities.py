@@ -17,7 +17,6 @@ from scipy import stats
 from zoo import DEPTH, scene
 from zscores import agree, z_scores
 
-from tiers import quick, slow
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.pixels.pixel_statistics import random_signs
@@ -103,7 +102,8 @@ def test_images_and_gradients_are_unbiased_for_any_probabilities(renderer: Mitsu
     assert worst(faulty_gradients, gradients) > limit(gradients.shape[1]), "a planted error went unseen"
 
 
-@pytest.mark.parametrize("space", quick(["path", "primary"], "path"))
+@pytest.mark.slow
+@pytest.mark.parametrize("space", ["path", "primary"])
 def test_both_states_of_a_pair_are_unbiased(renderer: MitsubaRenderer, space: Any) -> None:
     """Along one set of paths, whose emitters are drawn by the same probabilities."""
     current = renderer.values([FLOOR, LAMP])
@@ -180,7 +180,8 @@ def told(behind: bool, depth: int, probabilities: np.ndarray, seed: int, noise: 
     return found, float((weights[0] ** 2 * np.array(whole)).sum())
 
 
-@pytest.mark.parametrize(("behind", "depth"), [slow(False, 2), (True, 3)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("behind", "depth"), [(False, 2), (True, 3)])
 @pytest.mark.parametrize("noise", [False, True])
 def test_where_paths_have_one_connection_it_tells_all_of_them(behind: bool, depth: int, noise: bool) -> None:
     """Directly or, behind a shade, after a bounce, whose throughput has a derivative of its own."""

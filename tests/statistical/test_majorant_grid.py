@@ -64,6 +64,7 @@ def test_images_agree_with_volpath_and_majorants_that_are_too_low_are_seen(monke
     assert not verdict, f"majorants of half the extinction went unseen: {figures}"
 
 
+@pytest.mark.slow
 def test_both_images_of_a_pair_agree_with_separate_renders() -> None:
     renderer = MitsubaRenderer(several(), DEPTH)
     keys = media_keys(renderer)

@@ -87,6 +87,7 @@ def test_a_batch_of_states_drops_what_is_not_finite() -> None:
     assert session.dropped.count > 0
 
 
+@pytest.mark.slow
 @pytest.mark.cpu("texture units spread a NaN of a grid, and its gradient is NaN")
 def test_media_drop_what_is_not_finite() -> None:
     renderer = MitsubaRenderer(fog.scene(fog.cloud()), fog.DEPTH)

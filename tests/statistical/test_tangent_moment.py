@@ -13,7 +13,6 @@ from scipy import stats
 from zoo import DEPTH, SIZE, TOGETHER, scene, size, subject, tiles, two_states
 
 import unrender as ur
-from tiers import quick
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -95,7 +94,8 @@ def test_random_signs_sum_the_squares_of_twelve_single_derivatives() -> None:
     assert np.abs((wrong - single)[known] / error[known]).max() > limit
 
 
-@pytest.mark.parametrize("name", quick(["smoke", "three-bodies", "nerf-volume"], "smoke"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["smoke", "three-bodies", "nerf-volume"])
 def test_in_media_it_is_the_squared_product_of_the_paths_own_gradient(name: str) -> None:
     """Collisions are chosen by chance apart from what they bring, so no finite difference sees a path's derivative; its adjoint does."""
     problem = ur.gallery.problem(name, resolution=5, reference_spp=1)

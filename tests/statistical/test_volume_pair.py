@@ -40,7 +40,8 @@ def changed(renderer: MitsubaRenderer, keys: list[str]) -> tuple[dict[str, Any],
     return current, previous
 
 
-@pytest.mark.parametrize("name", quick(SCENES, "fog in rough glass"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SCENES)
 def test_the_kernel_agrees_with_volpath(name: str) -> None:
     renderer = MitsubaRenderer(SCENES[name](), DEPTH)
     ours = renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from tiers import slow
 from unrender.core.random import Key
 from unrender.estimators import derivative_images
 from unrender.estimators import gauss_newton as module
@@ -255,7 +254,8 @@ def noisy(shape: tuple[int, int], seed: int, grey: bool, filtered: bool, size: f
     return convolve(noise, WIDE[..., None], mode="wrap") if filtered else noise
 
 
-@pytest.mark.parametrize(("grey", "filtered"), [slow(False, False), (True, True)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("grey", "filtered"), [(False, False), (True, True)])
 def test_standard_errors_cover_the_noise_of_the_references(
     monkeypatch: pytest.MonkeyPatch, grey: bool, filtered: bool
 ) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import slow
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.rendering.numpy.linear import AnalyticRenderer
@@ -265,7 +266,7 @@ def test_pixels_are_drawn_where_there_are_many() -> None:
     assert result.status == "finished"
 
 
-@pytest.mark.parametrize(("views", "share"), [(1, 0.0), (30, 0.0), (30, 1.0)])
+@pytest.mark.parametrize(("views", "share"), [(1, 0.0), slow(30, 0.0), (30, 1.0)])
 def test_pictures_of_other_pixels_are_not_subtracted(views: int, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the end of a run that stands still, other or more pixels are rendered than before, unless both pictures have all."""
     fresh: list[Any] = []
