@@ -15,6 +15,8 @@ SCHEMES: dict[str, Callable[..., PixelSampler]] = {
     "loss": ur.pixels.LossProportional,
     "adaptive": ur.pixels.Adaptive,
 }
+PAPERS: dict[str, Any] = {"relative": False, "uniform": 0.1, "learn_from_draws": False, "by_cost": False}
+"""Options of the paper's adaptive form, but for its levels."""
 
 
 def pixels(scheme: str, count: int, **options: Any) -> PixelSampler:

@@ -24,7 +24,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import dr
-from benchmarks.pixel_schemes import pixels
+from benchmarks.pixel_schemes import PAPERS, pixels
 from benchmarks.races import Entrant, Runs, follow, over, race, reached, scaled, tenths
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
@@ -45,8 +45,6 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
 }
 """Problem, its options, pixels a step."""
 RATES = (0.01, 0.03)
-PAPERS: dict[str, Any] = {"relative": False, "uniform": 0.1, "learn_from_draws": False, "by_cost": False}
-"""Options of the paper's form, but for its levels."""
 MERGE = ("entries.*.methods", "seconds_per_path.*", "levels")
 QUICK = {"problem": ("two-planets",), "seconds": 0.3, "seeds": 2, "resolution": 16, "count": 32, "rounds": 2}
 

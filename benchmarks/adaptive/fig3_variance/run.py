@@ -18,7 +18,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.pixel_schemes import SCHEMES, gradients, pixels, spread
+from benchmarks.pixel_schemes import PAPERS, SCHEMES, gradients, pixels, spread
 from benchmarks.runner.records import Record
 
 FIVE_LEVELS = "adaptive, five levels"
@@ -67,13 +67,7 @@ def measured(
         variance, error = spread(rows)
         yield f"all{GROUPS[spp]}", {"variance": variance * paths / budget, "error": error * paths / budget}, None
         exact = rows.mean(axis=0)
-    fixed: dict[str, Any] = {
-        "uniform": 0.1,
-        "learn_from_draws": False,
-        "by_cost": False,
-        "samples": samples,
-        "refresh": 10 * runs,
-    }
+    fixed = {**PAPERS, "samples": samples, "refresh": 10 * runs}
     for spp, stratified in ways:
         for scheme, levels in (*((scheme, {}) for scheme in SCHEMES), ("adaptive", {"levels": 4})):
             sampler = pixels(scheme, count, stratified=stratified, **fixed, **levels)

@@ -15,7 +15,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import Key, PixelSampler, pixel_probability
-from benchmarks.pixel_schemes import gradients, spread
+from benchmarks.pixel_schemes import PAPERS, gradients, spread
 from benchmarks.runner.records import Record
 
 PROBLEMS = ("caustic", "plain-and-textured", "mirror-trio")
@@ -25,12 +25,8 @@ QUICK = {"problem": ("caustic",), "resolution": 16, "many": 8, "repeats": 2, "ru
 
 def probabilities(problem: ur.Problem, spp: int, seed: int) -> np.ndarray:
     """Raw probabilities over uniform ones, one per pixel of view 0."""
-    paths = spp * problem.pixels
-    return pixel_probability(
-        problem,
-        ur.pixels.Adaptive(256, samples=paths, denoiser="none", uniform=0.01, learn_from_draws=False, by_cost=False),
-        Key(seed),
-    )
+    options = {**PAPERS, "relative": True, "uniform": 0.01, "denoiser": "none"}
+    return pixel_probability(problem, ur.pixels.Adaptive(256, samples=spp * problem.pixels, **options), Key(seed))
 
 
 def variances(problem: ur.Problem, many: int, repeats: int, runs: int) -> dict[str, Any]:
@@ -40,9 +36,7 @@ def variances(problem: ur.Problem, many: int, repeats: int, runs: int) -> dict[s
         return spread(gradients(problem, ur.PathGradient(pixels=sampler, spp=1), runs, seed)[0])[0]
 
     def adaptive(spp: int, denoiser: Any) -> PixelSampler:
-        paths = spp * problem.pixels
-        fixed: Any = {"uniform": 0.1, "learn_from_draws": False, "by_cost": False, "relative": False}
-        return ur.pixels.Adaptive(COUNT, samples=paths, refresh=10 * runs, denoiser=denoiser, **fixed)
+        return ur.pixels.Adaptive(COUNT, samples=spp * problem.pixels, refresh=10 * runs, denoiser=denoiser, **PAPERS)
 
     uniform = float(np.mean([summed(ur.pixels.Uniform(COUNT), seed) for seed in range(repeats)]))
     samplers = {"few": adaptive(FEW, "none"), "few, denoised": adaptive(FEW, "auto"), "many": adaptive(many, "none")}

@@ -3,11 +3,11 @@
 SUZANNE: 2562 vertices before pictures of `suzanne.ply` of Mitsuba's tutorials, which is looked for in --meshes. BANANA: 2737
 vertices and their colours, before pictures of a banana made by code. Every perturbation of vertices rebuilds the mesh for
 every view, so a step is dear and there are thousands of unknowns: a short run. All but CMA-ES perturb neighbours alike, and
-step so, by `LargeSteps` (--strength 0: each vertex by itself). σ, its schedule and the number of renders a step are chosen by
+step so, by `LargeSteps`. σ, its schedule and the number of renders a step are chosen by
 hand and the same for all; each method's learning rate or trust radius is the best of three, and of more where it is at an
 end, on runs of a third of the time from a seed of their own. OurHVPA takes one product a step in the paper's form, OurJoint
-gradient and product from the same renders, OurG is the gradient alone. The error is that of the images: the loss over that at
-the start. Seconds are the processor's.
+gradient and product from the same renders, OurG is the gradient alone. "OurJoint, Adam" passes Newton's step through Adam, as
+the paper does. The error is that of the images: the loss over that at the start. Seconds are the processor's.
 """
 
 from __future__ import annotations
@@ -58,26 +58,31 @@ def cma_es(deviation: float) -> tuple[Any, Any]:
     return ur.estimators.LossValues(spp=_SPP), optimizer
 
 
-def _adam(rate: float, smooth: bool) -> ur.optimizers.Adam:
-    return ur.optimizers.Adam(rate * SIGMA, uniform=smooth)
+def _adam(rate: float) -> ur.optimizers.Adam:
+    return ur.optimizers.Adam(rate * SIGMA, uniform=True)
 
 
-def _newton(radius: float, n: int) -> ur.optimizers.NewtonCG:
-    return ur.optimizers.NewtonCG(trust_radius=radius * math.sqrt(n), iterations=1, line=True)
+def _newton(radius: float, n: int, **options: Any) -> ur.optimizers.NewtonCG:
+    return ur.optimizers.NewtonCG(trust_radius=radius * math.sqrt(n), iterations=1, **options)
 
 
-Make = Callable[[float, int, bool], tuple[Any, Any]]
+def _through_adam(rate: float, n: int) -> ur.optimizers.NewtonCG:
+    return _newton(RADII[1], n, inner_optimizer=_adam(rate))
+
+
+Make = Callable[[float, int], tuple[Any, Any]]
 METHODS: dict[str, tuple[Make, tuple[float, ...]]] = {
-    "FR22": (lambda rate, _, smooth: (smoothed(product=True), _adam(rate, smooth)), RATES),
-    "CMA-ES": (lambda deviation, _, __: cma_es(deviation), (0.1, 0.3, 0.9)),
-    "OurG": (lambda rate, _, smooth: (smoothed(), _adam(rate, smooth)), RATES),
-    "OurJoint": (lambda radius, n, _: (smoothed(order="hvp"), _newton(radius, n)), RADII),
+    "FR22": (lambda rate, _: (smoothed(product=True), _adam(rate)), RATES),
+    "CMA-ES": (lambda deviation, _: cma_es(deviation), (0.1, 0.3, 0.9)),
+    "OurG": (lambda rate, _: (smoothed(), _adam(rate)), RATES),
+    "OurJoint": (lambda radius, n: (smoothed(order="hvp"), _newton(radius, n, line=True)), RADII),
+    "OurJoint, Adam": (lambda rate, n: (smoothed(order="hvp"), _through_adam(rate, n)), RATES),
     "OurHVPA": (
-        lambda radius, n, _: (smoothed(SAMPLES // 2, order="hvp", joint=False), _newton(radius, n)),
+        lambda radius, n: (smoothed(SAMPLES // 2, order="hvp", joint=False), _newton(radius, n, line=True)),
         RADII,
     ),
 }
-"""From a setting, the number of unknowns and whether perturbations are smooth; and the settings that are tried."""
+"""From a setting and the number of unknowns; and the settings that are tried."""
 
 
 def problem(task: str, resolution: int, views: int, vertices: int, meshes: Path) -> ur.Problem:
@@ -102,20 +107,21 @@ def one(problem: ur.Problem, make: Callable[[int], tuple[Any, Any]], seconds: fl
     }
 
 
-def measure(made: ur.Problem, method: str, seconds: float, runs: int, strength: float) -> dict[str, Any]:
-    """One method, tuned, over seeds 0, 1, ..."""
+def measure(made: ur.Problem, method: str, seconds: float, runs: int, setting: float | None) -> dict[str, Any]:
+    """One method, tuned where no setting is given, over seeds 0, 1, ..."""
     make, settings = METHODS[method]
-    smooth = strength > 0.0 and method != "CMA-ES"
-    if smooth:
-        made = with_preconditioner(made, ur.preconditioners.LargeSteps(strength), *(p.key for p in made.parameters))
+    if method != "CMA-ES":
+        large = ur.preconditioners.LargeSteps(STRENGTH)
+        made = with_preconditioner(made, large, *(p.key for p in made.parameters))
 
     def descent(setting: float, budget: float, seed: int) -> dict[str, Any]:
-        return one(made, lambda n: make(setting, n, smooth), budget, seed)
+        return one(made, lambda n: make(setting, n), budget, seed)
 
-    best, tried = search(settings, lambda setting: descent(setting, seconds / 3, TUNING_SEED)["final"])
-    print(made.name, method, tried, flush=True)
+    best, tried = setting, []
+    if best is None:
+        best, tried = search(settings, lambda setting: descent(setting, seconds / 3, TUNING_SEED)["final"])
     found = [descent(best, seconds, seed) for seed in range(runs)]
-    print(made.name, method, best, [run["final"] for run in found], flush=True)
+    print(made.name, method, best, tried, [run["final"] for run in found], flush=True)
     return {"setting": best, "tried": tried, "runs": found}
 
 
@@ -127,8 +133,8 @@ def run(
     views: int = 2,
     vertices: int = shapes.VERTICES,
     meshes: Path = Path("../shared/assets/tutorials/meshes"),
-    strength: float = STRENGTH,
     only: tuple[str, ...] = tuple(METHODS),
+    setting: float | None = None,
 ) -> Iterator[dict[str, Any]]:
     """A part per task and method.
 
@@ -137,17 +143,17 @@ def run(
         views: pictures from around
         vertices: of BANANA's sphere, and the most of SUZANNE's
         meshes: folder of suzanne.ply
-        strength: λ of LargeSteps, 0 for none
         only: methods to run; the others' figures stay
+        setting: of all of them, which are not tuned; they have an entry of their own
     """
     dr.set_thread_count(1)
     for name in task:
         made = problem(name, resolution, views, vertices, meshes)
         numbers = trees.ravel(made.initial()).size
         for method in only:
-            found = measure(made, method, seconds, runs, strength)
-            entry = {"numbers": numbers, "strength": strength, "methods": {method: found}}
-            yield {"tasks": {name if strength else f"{name}, each vertex by itself": entry}}
+            found = measure(made, method, seconds, runs, setting)
+            entry = {"numbers": numbers, "strength": STRENGTH, "methods": {method: found}}
+            yield {"tasks": {f"{name}, not tuned" if setting else name: entry}}
 
 
 def table(record: Record) -> str:
