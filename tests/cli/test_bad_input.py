@@ -105,6 +105,14 @@ MISTAKES += [  # options that would be ignored
     (["gallery", "exponential", "-p", "loss=L1", "--overwrite"], "gallery: --overwrite needs --out"),
     (["methods", "rcv", "--variant", "auto"], "methods: --variant needs --plan PROBLEM"),
     (["methods", "-s", "spp=2"], "methods: --set needs --plan PROBLEM"),
+    (["run", "."], ".: a folder, expected a problem file; did you mean problem.toml?"),
+    (["methods", "--plan", "."], ".: a folder, expected a problem file; did you mean problem.toml?"),
+    (["run", "photo.exr"], "photo.exr: expected a problem file, whose name ends in .toml"),
+    (
+        ["compare", "problem.toml", "wall.xml"],
+        "problem.toml: not a run folder; give one problem, or several run folders",
+    ),
+    (["export", "wall.xml"], "wall.xml: a file, expected a run folder or a problem file (.toml)"),
 ]
 
 
@@ -201,6 +209,10 @@ SPOILT = [
         "problem.toml:6: parameters[0].bounds: low must",
     ),
     (_edit("problem.toml", '"L2"', '"L2'), "problem.toml:2: not valid TOML"),
+    (
+        _edit("problem.toml", "[[parameters]]", "[[parameter]]"),
+        "problem.toml:4: parameter: no such field; did you mean parameters?",
+    ),
     (_edit("problem.toml", "wall.bsdf.reflectance.value", "wall.to_world"), "cannot be recovered: its type"),
 ]
 

@@ -39,6 +39,20 @@ def test_a_toml_problems_result_goes_home(unrender, run: Path, mitsuba_variant: 
     np.testing.assert_allclose([float(row["value"]) for row in rows], value, rtol=1e-6)
 
 
+def test_an_export_of_another_scene_is_told(unrender, run: Path, mitsuba_variant: str) -> None:
+    wall = run.parent / "wall.xml"
+    wall.write_text(wall.read_text().replace('<emitter type="constant"/>', '<emitter type="point" id="bulb"/>'))
+    answer = unrender("export", "result", "--variant", mitsuba_variant)
+    assert answer.status == 0, answer.error
+    (line,) = (line for line in answer.out.splitlines() if line.startswith("note: "))
+    assert line.startswith("note: result: the result is of an earlier scene, since ")
+    assert "scene: bulb is new" in line
+    assert "file wall.xml has changed" in line
+    answer = unrender("run", "result")
+    assert answer.status == 2
+    assert "result: a folder, expected a problem file; it is a run folder: `unrender resume result`" in answer.error
+
+
 @pytest.mark.slow
 def test_a_gallery_problems_maps_are_pictures(unrender, tmp_path: Path, mitsuba_variant: str) -> None:
     options = ["-p", "resolution=8", "-p", "texture_resolution=4", "-p", "reference_spp=2"]

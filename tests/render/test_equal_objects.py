@@ -56,6 +56,13 @@ def test_both_keys_are_named(key: str, other: str) -> None:
     assert {key, other} <= {*mi.traverse(mi.load_dict(described, optimize=False)).keys()}
 
 
+def test_two_unknowns_share_the_notice() -> None:
+    keys = ["first.bsdf.reflectance.value", "second.bsdf.reflectance.value"]
+    parameters = [ur.Parameter(key) for key in keys]
+    (line,) = ur.Problem(scene(matte(), matte()), parameters, [ur.View(np.zeros((4, 4, 3)))], max_depth=2).notices
+    assert all(key in line for key in keys)
+
+
 def test_equal_textures_of_other_materials(tmp_path: Path) -> None:
     mi.Bitmap(np.ones((4, 4, 3), np.float32)).write(str(tmp_path / "a.exr"))
     described = scene(textured(0.2, tmp_path / "a.exr"), textured(0.3, tmp_path / "a.exr"))

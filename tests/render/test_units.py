@@ -46,6 +46,20 @@ def problem(unit: float, parameters: list[ur.Parameter], **options: Any) -> ur.P
     return ur.Problem(scene(unit, **options), parameters, views, max_depth=2, truth=truth)
 
 
+def test_degrees_in_place_of_radians_are_told() -> None:
+    def notices(parameter: ur.Parameter, **known: Any) -> list[str]:
+        blank = ur.View(np.zeros((SIZE, SIZE, 3), np.float32), known=known.get("known"))
+        return ur.Problem(scene(1.0), [parameter], [blank], max_depth=2).notices
+
+    told = "45 is more than a full turn, since angles are in radians; 45 degrees are 0.7854"
+    assert notices(ur.Parameter("block.rotation.y", 45.0)) == [f"parameter block.rotation.y: {told}"]
+    assert notices(ur.Parameter("cam.rotation", 0.0, bounds=(-45, 45))) == [f"parameter cam.rotation: {told}"]
+    turned = notices(ur.Parameter("lamp.intensity.value"), known={"block.rotation": [0.0, -45.0, 0.0]})
+    assert turned == [f"view 0: block.rotation: {told}"]
+    assert notices(ur.Parameter("block.rotation.y", 0.5, bounds=(-6.2831853, np.inf))) == []
+    assert notices(ur.Parameter("block.translation.y", 45.0)) == []
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_default_widths_are_in_units_of_what_moves(unit: float) -> None:
     renderer = ur.Problem(

@@ -161,6 +161,12 @@ def test_a_transformation_leads_to_the_pose() -> None:
     assert instead_of("box.bsdf.reflectance.value", known) == ""
 
 
+def test_the_same_quantity_of_the_same_object_comes_first() -> None:
+    known = {"floor.bsdf.reflectance.value": ABLE, "toy.bsdf.base_color.value": ABLE}
+    assert near_key("toy.bsdf.reflectance.value", known) == "; did you mean toy.bsdf.base_color.value?"
+    assert near_key("clay.reflectance.value", known) == "; did you mean floor.bsdf.reflectance.value?"
+
+
 # ------------------------------------------------------------------ settings
 
 

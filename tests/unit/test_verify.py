@@ -51,6 +51,46 @@ class Rising(ur.schedules.Schedule):
         return 1.0 if step < 70 else 40.0
 
 
+@ur.register
+@dataclass(frozen=True)
+class Away:
+    """An optimizer that adds a constant at each step, whatever the gradient."""
+
+    pace: float = 0.002
+    schedule: ur.schedules.Schedule | None = None
+
+    @property
+    def requires(self) -> frozenset[str]:
+        return frozenset()
+
+    def init(self, parameters: Any, learning_rates: Any = None) -> int:
+        return 0
+
+    def update(self, estimate: Any, state: int, parameters: Any) -> tuple[Any, int]:
+        return {key: value * 0 + self.pace for key, value in parameters.items()}, state + 1
+
+
+def test_a_loss_within_the_noise_of_few_paths_is_judged_by_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = made(start=None, noise=8.0)
+    found = ur.optimize(problem, ur.PathGradient(spp=1024), Away(), steps=40)
+    assert found.status == "worse than start"
+    np.testing.assert_array_equal(found.parameters["x"], found.initial["x"])
+    assert ur.optimize(problem, ur.PathGradient(spp=1024), Away(1e-9), steps=40).status == "finished"
+    monkeypatch.setattr(verify, "_LARGER_SHARE", 0.0)
+    assert ur.optimize(problem, ur.PathGradient(spp=1024), Away(), steps=40).status == "finished"
+
+
+def test_parts_of_the_launches_have_the_same_mean() -> None:
+    problem = made()
+    one, several = FreshPictures(problem, 1, 1 << 17), FreshPictures(problem, 1, 1 << 17, parts=8)
+    values = problem.initial()
+    assert one.paths == several.paths
+    (few,), (many,) = one.images(values), several.images(values)
+    assert (len(few), len(many)) == (4, 32)
+    np.testing.assert_allclose(many.mean(axis=0), few.mean(axis=0), rtol=1e-12)
+    assert many.std(axis=0).mean() > 2.0 * few.std(axis=0).mean()
+
+
 # ---------------------------------------------------------------------- the statistics
 
 

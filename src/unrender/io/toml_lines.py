@@ -100,7 +100,7 @@ def find(text: str, place: Place) -> int:
 
 
 def _lines(text: str) -> dict[Place, int]:
-    """Return {place: line} of every table header and every assignment."""
+    """Return {place: line} of every table header, every list of tables (that of its first) and every assignment."""
     # TOML separates lines by line feeds only; str.splitlines would also split at form feeds and other characters.
     rows = text.split("\n")
     line_of: dict[Place, int] = {}
@@ -119,6 +119,7 @@ def _lines(text: str) -> dict[Place, int]:
         if row.startswith("["):
             table = _through_arrays(path, counts)
             if row.startswith("[["):
+                line_of.setdefault(table, at + 1)
                 counts[table] = counts.get(table, -1) + 1
                 table = (*table, counts[table])
             line_of.setdefault(table, at + 1)

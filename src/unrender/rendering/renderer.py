@@ -49,6 +49,7 @@ class ParameterInfo:
         nonlinear: whether it changes the form of the picture, not its brightness: positions, lenses, skies, indices of refraction.
         shapes_bsdf: whether it changes the form of a BSDF, such as a roughness, and not its colour.
         length: order of magnitude of lengths at the object that it moves, a power of ten; 1 for other values.
+        angle: whether its values are angles in radians.
         lobe: whether it decides the probability of a lobe, which is never sampled if all values are at an end of the range.
     """
 
@@ -73,6 +74,7 @@ class ParameterInfo:
     brightness: Literal["", "light", "reflectance"] = ""
     nonlinear: bool = False
     shapes_bsdf: bool = False
+    angle: bool = False
     lobe: bool = False
     length: float = 1.0
 

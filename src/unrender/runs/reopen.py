@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +20,13 @@ from unrender.runs.refinement import remeshed
 from unrender.runs.result import Result
 from unrender.runs.resume import load_run, resume_run
 from unrender.scene import serialization
+from unrender.scene.fingerprint import differences, fingerprint, shortened
 from unrender.scene.problem import Problem
 
 _LONGEST = 1 << 24
+
+_SCENE = ("scene", "file ", "max_depth", "expression ")
+"""First words of the parts of a fingerprint that decide the pictures of given parameters."""
 
 
 @exclusive("resume", long=True)
@@ -66,6 +70,22 @@ def with_meshes(problem: Problem, run: RunFolder) -> Problem:
         if key in problem.faces and not np.array_equal(mesh.faces, problem.faces[key])
     }
     return remeshed(problem, replaced) if replaced else problem
+
+
+def scene_changes(problem: Problem, run: RunFolder) -> list[str]:
+    """Return a notice if the scene of the reopened problem is no longer that of the run, else nothing.
+
+    What a run recovered suits its own scene only.
+    """
+    before = run.record.problem.fingerprint
+    parts = [] if before is None else differences(_of_scene(before), _of_scene(fingerprint(problem)))
+    if not parts:
+        return []
+    return [f"{run.path}: the result is of an earlier scene, since {shortened(parts)}; run again for the present one"]
+
+
+def _of_scene(parts: Mapping[str, str]) -> dict[str, str]:
+    return {name: text for name, text in parts.items() if name.startswith(_SCENE)}
 
 
 def problem_of(directory: str | Path) -> Problem:

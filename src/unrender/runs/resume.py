@@ -33,11 +33,10 @@ from unrender.runs.optimize import check, connected, open_writer
 from unrender.runs.result import NON_FINITE, Result
 from unrender.runs.run import SNAPSHOT_COUNTS, Run, terminate_if_told
 from unrender.scene.coarse_to_fine import NEVER
-from unrender.scene.fingerprint import differences
+from unrender.scene.fingerprint import differences, shortened
 from unrender.scene.problem import Problem
 from unrender.scene.serialization import origin
 
-_MOST_SHOWN = 6
 _WARNINGS = "warnings"
 _SENT, _CANDIDATE, _AHEAD, _NUMBERS = "sent", "candidate", "ahead", "numbers"
 _OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS)
@@ -190,8 +189,7 @@ def _changes(stored: StoredRun, source: Checkpoint | None, fingerprint: dict[str
     if source is not None:
         changed += differences(source.manifest.versions, deciding_versions())
         changed += differences({"seed": str(source.manifest.seed)}, {"seed": str(stored.method.seed)})
-    more = f" and {len(changed) - _MOST_SHOWN} more" if len(changed) > _MOST_SHOWN else ""
-    return "; ".join(changed[:_MOST_SHOWN]) + more
+    return shortened(changed)
 
 
 def _method_settings(record: RunRecord) -> dict[str, Any]:

@@ -32,8 +32,11 @@ __all__ = ["Memory", "Verify", "compare_memory"]
 
 _SHARE = 0.004
 """Fraction of the run's paths for one new image; there are at most four."""
-_LEVEL = 1e-4
-"""False positive rate of each test."""
+_LARGER_SHARE, _PARTS = 0.064, 8
+"""The same fraction, and the number of parts with images of their own, where the first images do not tell whether the end is better or
+worse than the start: few bright pixels, such as those of a visible lamp, may hold most of the noise."""
+_LEVEL, _LEVEL_AGAIN = 1e-4, 1e-3
+"""False positive rate of each test; that of the test by more paths, which few runs reach."""
 _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
 _OF_RESIDUAL, _OF_PICTURE = 0.1, 0.02
@@ -86,7 +89,7 @@ class Verify(Callback):
 
     Candidates are the start, the parameters after 64, 128, 256, … steps, and the end. The one with the least loss becomes
     `Result.parameters`; another one than the end must be significantly better. Each image uses 0.4 % of the run's paths, or about 8,000
-    paths in a short run. The steps are not affected.
+    paths in a short run; 6.4 % where these leave open which end of the run is better. The steps are not affected.
     """
 
     _pictures: FreshPictures | None = field(default=None, init=False)
@@ -129,10 +132,7 @@ class Verify(Callback):
 
     def _verified(self, run: Run, result: Result) -> Result:
         problem = run.problem
-        pictures = FreshPictures(problem, run.seed, _SHARE * run.state.samples, _END)
-        first = pictures.picture(result.initial, problem.remeshed_from or problem)
-        result, last = _end(run, result, pictures)
-        worse = _is_worse(pictures, first, last)
+        pictures, first, result, last, worse = _ends(run, result)
         places: dict[str, tuple[Picture, Mapping[str, np.ndarray]]] = {}
         if worse and problem.remeshed_from is None:
             places["start"] = first, result.initial
@@ -249,6 +249,24 @@ class _Earlier:
         return cls(step, *picture.loss, pictures.differences(picture.images))
 
 
+def _ends(run: Run, result: Result) -> tuple[FreshPictures, Picture, Result, Picture, bool]:
+    """Return the renderer of new images, the image of the start, the result as `_end` returns it, its image, and whether it is worse.
+
+    If these images show all pixels and do not tell which end of the run is better, they are rendered once more, from more paths.
+    """
+    start = run.problem.remeshed_from or run.problem
+    pictures = FreshPictures(run.problem, run.seed, _SHARE * run.state.samples, _END)
+    first, (ended, last) = pictures.picture(result.initial, start), _end(run, result, pictures)
+    worse = _is_worse(pictures, first, last)
+    if not (pictures.sampled or worse or _is_worse(pictures, last, first)):
+        larger = FreshPictures(run.problem, run.seed, _LARGER_SHARE * run.state.samples, _END, _PARTS)
+        if larger.paths > pictures.paths:
+            pictures, first = larger, larger.picture(result.initial, start)
+            ended, last = _end(run, result, larger)
+            worse = _is_worse(larger, first, last, _LEVEL_AGAIN)
+    return pictures, first, ended, last, worse
+
+
 def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Picture]:
     """Return the result with means of its numbers, unless its picture is worse than with the last values, and that picture."""
     mean = averaged(run, result)
@@ -308,7 +326,7 @@ def _memory(run: Run, pictures: FreshPictures, last: Picture) -> Memory | None:
     return max(memories, key=lambda memory: (memory.disagrees, memory.score), default=None)
 
 
-def _is_worse(pictures: FreshPictures, first: Picture, other: Picture) -> bool:
+def _is_worse(pictures: FreshPictures, first: Picture, other: Picture, level: float = _LEVEL) -> bool:
     """Return whether the loss of `other` is significantly above that of `first`; an image that is not finite is worse."""
     if not is_finite(first, other):
         return True
@@ -320,7 +338,7 @@ def _is_worse(pictures: FreshPictures, first: Picture, other: Picture) -> bool:
     if not pictures.sampled and not math.isfinite(change.standard_error):
         return not change.value <= 0  # the standard error has overflowed
     least = _LEAST_CHANGE * abs(float(a.mean(axis=0).sum()))
-    return change.value > least and change.exceeds_noise(_LEVEL)
+    return change.value > least and change.exceeds_noise(level)
 
 
 def _other_meshes(problem: Problem) -> bool:

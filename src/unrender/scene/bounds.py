@@ -25,6 +25,9 @@ _LOBE_START = 0.01
 _CLEARANCE = 0.01
 """Distance to a singular value that bounds keep, relative to that value; at most half of the initial distance."""
 
+_FULL_TURN = 2.0 * math.pi + 1e-4
+"""Largest angle in radians that is plausible, with a margin for rounding."""
+
 
 def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[Bounds, str]:
     """Return the bounds of a parameter, and a notice of how they were narrowed; "" if they were not.
@@ -49,8 +52,7 @@ def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[B
     side = (singular + gap, high) if start.flat[0] > singular else (low, singular - gap)
     if bounds is None:
         return side, ""
-    shown = ", ".join("open" if end is None else f"{end:g}" for end in side)
-    return side, f"bounds narrowed to [{shown}]: images are singular at {singular:g}"
+    return side, f"bounds narrowed to {_interval(side)}: images are singular at {singular:g}"
 
 
 def clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
@@ -63,7 +65,7 @@ def clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
     )
     if not moved:
         return start, ""
-    notice = f"{moved} of {start.size} initial values moved into the bounds [{low}, {high}]"
+    notice = f"{moved} of {start.size} initial values moved into the bounds {_interval(bounds)}"
     return np.asarray(np.clip(start, low, high), np.float32), notice  # clip returns a scalar for a scalar
 
 
@@ -87,6 +89,20 @@ def project(x: Array, low: float | None, high: float | None, scale: float = 1.0)
     if high is not None:
         x = arrays.minimum(x, high - margin)
     return x
+
+
+def angle_notice(info: ParameterInfo, *values: Any) -> str:
+    """Return a notice of angles above a full turn, which may be degrees; "" for none. Infinite values and None are ignored."""
+    if not info.angle:
+        return ""
+    sizes = [np.abs(np.asarray(value, np.float64)) for value in values if value is not None]
+    largest = max((float(size[np.isfinite(size)].max(initial=0.0)) for size in sizes), default=0.0)
+    if largest <= _FULL_TURN:
+        return ""
+    return (
+        f"{largest:g} is more than a full turn, since angles are in radians; {largest:g} degrees are "
+        f"{math.radians(largest):.4g}"
+    )
 
 
 def move_inside(start: np.ndarray, bounds: Bounds, info: ParameterInfo) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -149,6 +165,10 @@ def _read(bounds: Any) -> Bounds:
 def _below(low: float | None, high: float | None) -> bool:
     """Return whether one limit is at most the other; None is unbounded."""
     return low is None or high is None or low <= high
+
+
+def _interval(bounds: Bounds) -> str:
+    return f"[{', '.join('open' if end is None else f'{end:g}' for end in bounds)}]"
 
 
 def _span(values: np.ndarray) -> str:

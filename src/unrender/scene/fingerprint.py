@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,10 @@ from unrender.rendering.expressions import expression_layer
 from unrender.scene.parameter import ties_of
 from unrender.scene.problem import Problem
 
-__all__ = ["differences", "digest", "fingerprint"]
+__all__ = ["differences", "digest", "fingerprint", "shortened"]
 
 _DIGEST = "sha256:"
-_MOST_OBJECTS = 64
+_MOST_OBJECTS, _MOST_SHOWN = 64, 6
 _known: weakref.WeakKeyDictionary[Problem, dict[str, str]] = weakref.WeakKeyDictionary()
 
 
@@ -48,6 +48,12 @@ def differences(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
         else:
             changes.append(f"{part} was {old}, is {new}")
     return changes
+
+
+def shortened(changes: Sequence[str]) -> str:
+    """Join the phrases of `differences` to one line with at most six of them."""
+    more = f" and {len(changes) - _MOST_SHOWN} more" if len(changes) > _MOST_SHOWN else ""
+    return "; ".join(changes[:_MOST_SHOWN]) + more
 
 
 def digest(*parts: bytes) -> str:

@@ -63,7 +63,12 @@ def near_key(key: str, known: Mapping[str, ParameterInfo]) -> str:
     similar = [name for name in able if name.endswith("." + rest) and not _is_nameless(name)] if rest else []
     named = [name for name in able if not _is_nameless(name)]
     equivalent = _same_quantity(key, named)
-    if near := did_you_mean(key, similar or equivalent, 0.0) or did_you_mean(key, named) or did_you_mean(key, known):
+    own = [name for name in equivalent if name.startswith(f"{owner}.")]
+    if (
+        near := did_you_mean(key, own or similar or equivalent, 0.0)
+        or did_you_mean(key, named)
+        or did_you_mean(key, known)
+    ):
         return near
     shown = named or able
     return f"; it has {', '.join(shown[:6])}{' and others' if len(shown) > 6 else ''}" if shown else ""

@@ -46,7 +46,7 @@ from unrender.scene.validation import (
     texture_coordinates,
 )
 from unrender.scene.view import View
-from unrender.scene.view_checks import check_views
+from unrender.scene.view_checks import check_views, known_angles
 from unrender.scene.view_losses import ViewLosses
 from unrender.scene.view_worlds import known_keys, of_views
 
@@ -146,7 +146,12 @@ class Problem(ViewLosses):
             max_depth=max_depth or longest_path(renderer),
             name=name or (path.stem if path else "problem"),
             origin={"scene": str(path.resolve())} if path and are_storable(renderer) else {},
-            notices=[*renderer_notices(renderer), *unknown_notices, *view_notices],
+            notices=[
+                *renderer_notices(renderer),
+                *unknown_notices,
+                *known_angles(given_views, renderer.parameters()),
+                *view_notices,
+            ],
             references=References(checked_views, renderer.array),
             executor=LOCAL,
             remeshed_from=None,
@@ -200,9 +205,10 @@ class Problem(ViewLosses):
         origin: Mapping[str, Any] | None = None,
         executor: Executor | None = None,
         remeshed_from: Problem | None = None,
+        notices: list[str] | None = None,
     ) -> Problem:
         """Return the same problem with other attributes, which are not checked; None keeps the current one."""
-        parts = {"renderer": renderer, "unknowns": unknowns, "origin": origin, "executor": executor}
+        parts = {"renderer": renderer, "unknowns": unknowns, "origin": origin, "executor": executor, "notices": notices}
         changes = {name: part for name, part in {**parts, "remeshed_from": remeshed_from}.items() if part is not None}
         made = object.__new__(Problem)
         vars(made).update({field.name: getattr(self, field.name) for field in fields(self)} | changes)

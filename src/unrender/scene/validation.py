@@ -23,7 +23,7 @@ from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene import coarse_to_fine
-from unrender.scene.bounds import check_bounds, move_inside, open_scale, project
+from unrender.scene.bounds import angle_notice, check_bounds, move_inside, open_scale, project
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
 from unrender.scene.key_hints import instead_of, near_key
@@ -135,7 +135,7 @@ def check_parameter(
         remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
     with checking("self_intersection"):
         check_self_intersection(parameter.self_intersection, mesh)
-    changes = (f"initial {notice}" if notice else "", narrowed, *moved)
+    changes = (f"initial {notice}" if notice else "", narrowed, *moved, angle_notice(info, start, *bounds))
     notices = [f"parameter {key}: {line}" for line in changes if line]
     notices += _at_bounds(key, parameterisation, transform, initial, bounds)
     notices += [] if mesh is None else mesh_notices(key, *mesh)

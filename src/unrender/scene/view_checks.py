@@ -17,7 +17,7 @@ with it. Negative values are refused, unless the film's reconstruction filter ha
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,8 @@ from unrender.io import images
 from unrender.io.stored_pictures import PictureStore, StoredPicture
 from unrender.losses import Censored, Loss
 from unrender.rendering.picture_format import PictureFormat, format_of
-from unrender.rendering.renderer import Renderer
+from unrender.rendering.renderer import ParameterInfo, Renderer
+from unrender.scene.bounds import angle_notice
 from unrender.scene.errors import FieldError
 from unrender.scene.references import ON_DEVICE
 from unrender.scene.validation import is_number
@@ -163,6 +164,13 @@ def check_views(views: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[
         checked.append(view if store is None else _stored(view, store))
         notices += notes
     return tuple(checked), notices
+
+
+def known_angles(views: Iterable[View], known: Mapping[str, ParameterInfo]) -> list[str]:
+    """Return a notice for each known value of a view that is an angle above a full turn."""
+    pairs = [(index, key, value) for index, view in enumerate(views) for key, value in (view.known or {}).items()]
+    found = [(index, key, angle_notice(known[key], value)) for index, key, value in pairs if key in known]
+    return [f"view {index}: {key}: {line}" for index, key, line in found if line]
 
 
 def check_sensor(index: int, view: View, count: int) -> None:

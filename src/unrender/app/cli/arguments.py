@@ -203,7 +203,11 @@ def check_problem(name: str, options: Mapping[str, str]) -> None:
     """Raise `InputError` if `open_problem` would fail for reasons that can be checked without Mitsuba."""
     from unrender import gallery
 
+    if name not in gallery.names() and Path(name).is_dir():
+        raise InputError(f"{name}: a folder, expected a problem file{_in_folder(Path(name))}")
     if _is_file(name):
+        if Path(name).suffix.lower() not in ("", ".toml", ".xml"):
+            raise InputError(f"{name}: expected a problem file, whose name ends in .toml")
         if Path(name).suffix.lower() == ".xml":
             raise InputError(
                 f"{name}: a scene does not define the unknowns; write a problem file with: "
@@ -220,6 +224,14 @@ def check_problem(name: str, options: Mapping[str, str]) -> None:
         file = f"; did you mean {name}.toml?" if Path(f"{name}.toml").is_file() else ""
         hint = file or did_you_mean(name, gallery.names()) or f" ({', '.join(gallery.names())})"
         raise InputError(f"no problem {name}: neither a TOML file nor in the gallery{hint}")
+
+
+def _in_folder(folder: Path) -> str:
+    """Return a hint at what a folder that was typed in place of a problem can be used for; "" if there is none."""
+    if (folder / "run.json").is_file():
+        return f"; it is a run folder: `unrender resume {folder}` continues it, `unrender report {folder}` shows it"
+    files = sorted(folder.glob("*.toml"))
+    return f"; did you mean {files[0]}?" if len(files) == 1 else ""
 
 
 def refuse_stages(file: str) -> None:
@@ -245,7 +257,11 @@ def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> 
         check_problem(name, options)
         if _is_file(name):
             return Problem.from_file(name)
-        return gallery.problem(name, **{key: literal(value) for key, value in options.items()})
+        made = gallery.problem(name, **{key: literal(value) for key, value in options.items()})
+        if not Path(f"{name}.toml").is_file():
+            return made
+        notice = f"{name} is the gallery's problem; the file in this folder is {name}.toml"
+        return made.with_parts(notices=[*made.notices, notice])
 
 
 def short_name(problem: str) -> str:

@@ -168,7 +168,8 @@ def _check_single(what: Sequence[str]) -> None:
     """Raise `InputError` unless there is exactly one problem."""
     if len(what) > 1:
         missing = next(name for name in what if not Path(name).is_dir())
-        raise InputError(f"{missing}: no such run folder (give run folders, or one problem)")
+        what_is = "not a run folder" if Path(missing).exists() else "no such run folder"
+        raise InputError(f"{missing}: {what_is}; give one problem, or several run folders")
 
 
 def _compare_folders(

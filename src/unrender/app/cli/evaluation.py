@@ -115,13 +115,17 @@ def turntable(
     if not directory.is_dir():
         raise InputError(f"{directory}: no such run folder")
     directory = arguments.finished_run(directory)
+    notices: list[str] = []
     place = directory / ("turntable.mp4" if turntable.has_ffmpeg() else "turntable.gif") if out is None else out
     with Progress(console):
         arguments.use_variant(variant)
         from unrender.app.evaluation.turntable import turntable as write
 
         axis = None if up is None else _axis(up)
-        video = write(directory, place, environment, frames, rate, size, spp, elevation, axis, background, overwrite)
+        look = environment, frames, rate, size, spp, elevation, axis, background
+        video = write(directory, place, *look, overwrite, notices.append)
+    for notice in notices:
+        console.print(f"note: {notice}", soft_wrap=True, markup=False)
     console.print(f"video: {video}", soft_wrap=True, markup=False)
 
 

@@ -43,7 +43,8 @@ def export(
     console = Console(highlight=False)
     is_problem = directory.suffix.lower() == ".toml" and directory.is_file()
     if not is_problem and not directory.is_dir():
-        raise InputError(f"{directory}: no such run folder")
+        expected = "a file, expected a run folder or a problem file (.toml)"
+        raise InputError(f"{directory}: {expected if directory.exists() else 'no such run folder'}")
     if is_problem:
         arguments.refuse_stages(str(directory))
     directory = directory if is_problem else arguments.finished_run(directory)

@@ -107,7 +107,7 @@ def judge(
     judged, values, notices = _problem(problem, held_out_file, values, result)
     measured = light is None or held_out is not None
     exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
-    notices += _unknown_of_photographs(problem) if measured else []
+    notices += [*reopen.scene_changes(problem, result), *(_unknown_of_photographs(problem) if measured else [])]
 
     def fill(folder: Path) -> tuple[list[Measures], Albedo | None]:
         with tempfile.TemporaryDirectory() as scratch:

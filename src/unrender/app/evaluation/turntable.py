@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,6 +75,7 @@ def turntable(
     up: Sequence[float] | None = None,
     background: str = "light",
     overwrite: bool = False,
+    notify: Callable[[str], None] | None = None,
 ) -> Path:
     """Render a video of one rotation of the result of a run in front of a fixed camera under a fixed light.
 
@@ -92,6 +93,7 @@ def turntable(
         up: the axis, (3,); None for the mean of the cameras' up axes, or y for a single camera.
         background: "light", "black", "grey", "white".
         overwrite: whether existing files at `out` may be replaced.
+        notify: called with each notice, one line.
 
     Returns:
         The path of the video.
@@ -106,7 +108,11 @@ def turntable(
     check_video(place, overwrite)
     light = None if environment is None else scenes.read_light(Path(environment))
     result = folders.read(run)
-    problem = reopen.with_meshes(reopen.problem_of(run), result)
+    problem = reopen.problem_of(run)
+    if notify is not None:
+        for line in reopen.scene_changes(problem, result):
+            notify(line)
+    problem = reopen.with_meshes(problem, result)
     with tempfile.TemporaryDirectory() as scratch:
         path = scenes.export_scene(problem, problem.full(result.parameters), Path(scratch) / "scene")
         scene = scenes.load_scene(path)

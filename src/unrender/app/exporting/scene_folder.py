@@ -108,7 +108,7 @@ def export(
     variant.ensure()
     out, formats_ = Path(out), check_formats(formats)
     files.check_replaceable(out, _OWN, textures.RECORD, overwrite, f"export to {out}", "an earlier export")
-    problem, parameters, related = _opened(what)
+    problem, parameters, related, changed = _opened(what)
     renderer = scene_renderer(problem.renderer)
     if not isinstance(renderer, MitsubaRenderer):
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
@@ -121,20 +121,21 @@ def export(
     except OSError as error:
         raise InputError(f"export to {out}: {error.strerror or error}") from error
     has_scene = MITSUBA in formats_ and not renderer.pair.emissive
-    return Exported(out, out / SCENE if has_scene else None, tuple(notices), renamed)
+    return Exported(out, out / SCENE if has_scene else None, (*changed, *notices), renamed)
 
 
 def _opened(
     what: str | Path | tuple[Problem, Mapping[str, np.ndarray]],
-) -> tuple[Problem, Mapping[str, np.ndarray], _Maps]:
+) -> tuple[Problem, Mapping[str, np.ndarray], _Maps, list[str]]:
     if not isinstance(what, (str, Path)):
-        return what[0], what[1], {}
+        return what[0], what[1], {}, []
     if Path(what).suffix.lower() == ".toml":
         problem = Problem.from_file(what)
-        return problem, problem.initial_values(), {}
+        return problem, problem.initial_values(), {}, []
     run = folders.read(what)
     maps = {"standard_error": run.standard_error, "data_share": run.data_share}
-    return reopen.with_meshes(reopen.problem_of(what), run), run.parameters, maps
+    problem = reopen.problem_of(what)
+    return reopen.with_meshes(problem, run), run.parameters, maps, reopen.scene_changes(problem, run)
 
 
 def _write(

@@ -37,18 +37,20 @@ def equal_objects(nodes: Sequence[Any]) -> tuple[tuple[str, ...], ...]:
 
 
 def merge_notices(keys: Iterable[str], equal: Iterable[Sequence[str]]) -> list[str]:
-    """Return one notice for each parameter whose object has equal objects.
+    """Return one notice for each parameter whose object has equal objects; parameters that equal one another share it.
 
     Args:
         keys: keys of the unknowns.
         equal: result of `equal_objects`.
     """
-    notices = []
+    notices: list[str] = []
+    named: set[str] = set()
     for key in keys:
         for names in equal:
             own = next((name for name in names if key.startswith(f"{name}.")), None)
-            if own is None:
+            if own is None or key in named:
                 continue
+            named.update(f"{name}{key.removeprefix(own)}" for name in names)
             other = next(name for name in names if name != own)
             more = f" and {len(names) - 2} more" if len(names) > 2 else ""
             notices.append(

@@ -140,6 +140,7 @@ def info(key: PoseKey, obstacle: str, sensor: int | None, length: float = 1.0) -
         light=key.light,
         viewpoint=viewpoint,
         sensor=sensor,
+        angle=key.part == "rotation",
         length=length if key.part == "translation" else 1.0,
     )
 
