@@ -25,6 +25,7 @@ from unrender.losses.metrics import exposure, srgb
 from unrender.rendering.mitsuba import turntable_light
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
+from unrender.scene.problem import Problem
 
 BACKGROUNDS = {"light": None, "black": 0.0, "grey": 0.18, "white": 1.0}
 """Backgrounds of the object: the light itself (None), or a linear value."""
@@ -107,12 +108,7 @@ def turntable(
     axis = None if up is None else _axis(up)
     check_video(place, overwrite)
     light = None if environment is None else scenes.read_light(Path(environment))
-    result = folders.read(run)
-    problem = reopen.problem_of(run)
-    if notify is not None:
-        for line in reopen.scene_changes(problem, result):
-            notify(line)
-    problem = reopen.with_meshes(problem, result)
+    problem, result = _opened(run, notify)
     with tempfile.TemporaryDirectory() as scratch:
         path = scenes.export_scene(problem, problem.full(result.parameters), Path(scratch) / "scene")
         scene = scenes.load_scene(path)
@@ -125,6 +121,15 @@ def turntable(
         pictures = _frames(scene, table, frames, size, spp, elevation, problem.max_depth, BACKGROUNDS[background])
         write_video(place, pictures, rate)
     return place
+
+
+def _opened(run: str | Path, notify: Callable[[str], None] | None) -> tuple[Problem, folders.RunFolder]:
+    """Return the problem of a run folder with its final meshes, and the folder's contents."""
+    result, problem = folders.read(run), reopen.problem_of(run)
+    for line in reopen.scene_changes(problem, result):
+        if notify is not None:
+            notify(line)
+    return reopen.with_meshes(problem, result), result
 
 
 def _check(frames: int, rate: float, size: int, spp: int, elevation: float, background: str) -> None:
