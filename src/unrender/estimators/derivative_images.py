@@ -40,7 +40,13 @@ _GROWTH = 1.0
 
 @dataclass(frozen=True)
 class HalvedImage:
-    """The image of a view, the variance of its noise, and its two independent halves, (H, W, 3) each."""
+    """Image of a view, (H, W, 3).
+
+    Attributes:
+        mean: mean of both halves.
+        variance: variance of the noise of `mean`.
+        one, other: images of the two halves of the samples, independent of each other.
+    """
 
     mean: Array
     variance: Array
@@ -231,8 +237,8 @@ def products(
         block: side of the blocks of pixels over which all but `squares` are summed.
         remembered: whether all steps share the derivative images. Their noise times that of the references then moves the solution, and
             `scores` include it.
-        inverse: of the Hessian, (m, m). `scores` then count the residuals that each pixel would have in a fit without it. A fit follows
-            the noise of the pixels that decide it, which hides there otherwise.
+        inverse: inverse of the Hessian, (m, m). `scores` then contain the residuals that each pixel would have in a fit without it, see
+            `scores.without_own_pixel`. None for the residuals themselves, which are less than the noise where few pixels decide the fit.
     """
     m = len(halves[0])
     total = Products.zero(m)

@@ -13,6 +13,7 @@ from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.penalties import penalty
+from unrender.images.base import leave_one_out
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.batches import PixelBatch, PixelSample
 from unrender.scene.problem import Problem
@@ -182,7 +183,7 @@ class FreshPictures:
 
     def _losses(self, frame: _Frame, images: np.ndarray) -> np.ndarray:
         """Return the pseudo-values (K, N) of pixels, or (K, 1) of the view if the loss needs full images."""
-        candidates = [images.mean(axis=0), *paired_losses.leave_one_out(images)]
+        candidates = [images.mean(axis=0), *leave_one_out(images)]
         total, *others = (self._values(frame, image) for image in candidates)
         pseudo = paired_losses.pseudo_values(total, np.stack(others))
         if not self.sampled:

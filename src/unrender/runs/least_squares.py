@@ -150,7 +150,7 @@ def check_numbers(
         start: {key: array} at the start.
         seconds: time after which nothing further is started; the numbers are `unchecked` then.
         sensitivities: sensitivities of textures and grids, see `unrender.sensitivity`; those without one are fixed.
-        weights: weights of each view's pixels in the steps of the run, beside those of the loss, see `pixel_weights`; () for equal ones.
+        weights: weights of each view's pixels in the steps of the run, see `pixel_weights`; () for equal ones.
             A fit with other weights has another solution, and the distance from it would count as an error of the run.
     """
     numbers = Numbers.of(problem, values, start)
@@ -168,7 +168,10 @@ def check_numbers(
 
 
 def pixel_weights(estimator: Estimator, state: Any) -> tuple[np.ndarray, ...]:
-    """Return the weights of each view's pixels in the next step, (H, W, 1), by the noise of earlier images; () for equal ones."""
+    """Return the weights of each view's pixels in the next step, (H, W, 1), from the noise of earlier images; () for equal ones.
+
+    Only `GaussNewton` with a `noise_limit` has weights.
+    """
     if not (isinstance(estimator, GaussNewton) and isinstance(state, GaussNewtonState) and estimator.noise_limit):
         return ()
     return tuple(noise_weights(variance, estimator.noise_limit) for variance in state.variances)

@@ -88,7 +88,7 @@ class Numbers:
         rigid: whether a number is of a pose, (n,).
         spp: samples per pixel of a picture.
         fields: {key: (k, *shape)}, directions of textures and grids.
-        weights: weights of each view's pixels beside those of the loss, (H, W, 1); () for equal ones.
+        weights: weights of each view's pixels in addition to the views' weights, (H, W, 1); () for equal ones.
     """
 
     problem: Problem

@@ -56,12 +56,6 @@ class SystematicDifference:
     score: float
 
 
-def leave_one_out(images: np.ndarray) -> np.ndarray:
-    """Return, for each of K >= 2 images (K, ...), the mean of the others."""
-    count = len(images)
-    return (images.mean(axis=0) * count - images) / (count - 1)
-
-
 def pseudo_values(losses: np.ndarray, left_out: np.ndarray) -> np.ndarray:
     """Return the jackknife pseudo-values (K, N) of N losses.
 

@@ -74,7 +74,10 @@ def without_own_pixel(
 
 
 def positive_inverse(matrix: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse of a symmetric matrix (n, n) from eigenvalues above 0.001 of the largest, scaled to unit diagonal."""
+    """Return the pseudo-inverse of a symmetric matrix, (n, n).
+
+    The matrix is scaled to unit diagonal. Eigenvalues below 0.001 of the largest then count as 0.
+    """
     units = np.sqrt(np.abs(np.diag(matrix)))
     units = np.where(units > 0.0, units, 1.0)
     eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
