@@ -146,6 +146,21 @@ def test_the_diagonal_of_a_priors_curvature_is_that_of_its_product() -> None:
     np.testing.assert_allclose(bound.diagonal(x).reshape(-1), expected, rtol=1e-6)
 
 
+def test_texels_that_share_each_pixel_with_a_neighbour_have_no_standard_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = problem()
+    a = matrix()
+    texels = a.reshape(-1, TEXELS, TEXELS, 3)
+    mixed = 0.5 * (texels + np.roll(texels, 1, axis=1)).reshape(a.shape)
+    products = np.square(mixed.T @ mixed)
+    made.renderer.matrix = mixed  # type: ignore[attr-defined]
+    values = estimate(problem())
+    assert curvature(made, values).overlap["wall"] == pytest.approx(products.sum() / products.trace(), rel=0.1)
+    monkeypatch.setattr(module, "misfit_of_views", lambda *given: "")
+    assert not uncertainty(made, values).standard_error
+    monkeypatch.setattr(module, "_MOST_OVERLAP", 2.0)
+    assert "wall" in uncertainty(made, values).standard_error
+
+
 def test_elements_that_share_pixels_have_an_overlap_and_no_standard_error() -> None:
     """Blocks of four texels in one pixel: Σ_ij H_ij² is four times the sum over the diagonal."""
     texels = 2 * SIZE

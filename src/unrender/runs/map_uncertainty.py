@@ -38,7 +38,7 @@ _PROBES = 4.0
 """Number of probes that the curvature of the neighbours weighs as much as."""
 _FEWEST, _ERRORS = 8, 3.0
 """Fewest probes, and standard errors by which the residual must exceed the pictures' noise, or there is no map."""
-_MOST_OVERLAP = 2.0
+_MOST_OVERLAP = 1.3
 """Overlap from which on texels are not independent, such as with more texels than pixels that see them."""
 _ELEMENTS, _LEAST = 9.0, 0.1
 """Number of elements whose weight the mean over all cells has in a mean with the neighbours, and the least ratio to it."""
@@ -89,8 +89,8 @@ def uncertainty(
     Standard errors are too large where noise of the references remains in m: after few steps, and with strong smoothing.
 
     Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels,
-    and a diagonal does not bound their errors; nor have textures with κ ≥ 2, such as those with more texels than pixels that see them, and
-    textures of which the picture is no linear function, such as of a roughness, a normal map or a weight.
+    and a diagonal does not bound their errors; nor have textures with κ ≥ 1.3, such as those with more texels than pixels that see them,
+    and textures of which the picture is no linear function, such as of a roughness, a normal map or a weight.
     There is none either if time or samples are too few.
 
     Args:
@@ -100,7 +100,7 @@ def uncertainty(
         seed: seed of all random numbers.
 
     Returns:
-        Maps of the textures with path gradients and κ < 2, and standard errors of the numbers.
+        Maps of the textures with path gradients and κ < 1.3, and standard errors of the numbers.
 
     Raises:
         InputError: `values` have other keys or shapes than the problem's.
