@@ -1,0 +1,98 @@
+"""Standard errors of textures and numbers against the true errors, as scores z = error / standard error, on problems with known truth.
+
+Short runs of `auto` at small sizes, and `unrender.runs.uncertainty` at their ends. Textures count where the references decide at least half
+of an element (`Result.data_share`). "wall, noisy" has references of 8 samples per pixel.
+"""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+import unrender as ur
+from benchmarks import figures, markdown
+from benchmarks.runner.records import Record
+from benchmarks.suite import scenes
+
+MERGE = ("problems.*",)
+QUICK: dict[str, Any] = {"problems": ("wall",), "seeds": 1, "steps": (4,)}
+_WALL = {"resolution": 40, "texture_resolution": 20}
+_QUANTILES = 41
+
+
+def problem(name: str, assets: Path) -> ur.Problem:
+    """The problem of a name."""
+    if name.startswith("wall"):
+        return ur.gallery.problem("wall", reference_spp=8 if "noisy" in name else 1024, **_WALL)
+    if name == "smoke":
+        return ur.gallery.problem("smoke", resolution=16, grid_resolution=8, reference_spp=256, views=4, max_depth=4)
+    return scenes.problem(f"{name}, L2", assets, 48, 32, 256)
+
+
+def run(
+    assets: Path = Path("assets"),
+    problems: tuple[str, ...] = ("wall", "wall, noisy", "tray", "spot", "numbers", "smoke"),
+    seeds: int = 3,
+    steps: tuple[int, ...] = (40, 160),
+) -> dict[str, Any]:
+    """Scores of every problem.
+
+    Args:
+        assets: folder of the suite's assets
+        problems: names
+        seeds: runs of each
+        steps: numbers of steps of the runs
+    """
+    found: dict[str, Any] = {}
+    for name, count in itertools.product(problems, steps):
+        made, scores, shares = problem(name, assets), [], []
+        for seed in range(seeds):
+            values = ur.optimize(made, steps=count, seed=seed).parameters
+            known = ur.runs.uncertainty(made, values, seed=seed)
+            for key, error in known.standard_error.items():
+                z = (values[key] - made.truth[key].reshape(error.shape)) / error
+                share = known.data_share.get(key)
+                scores.append(np.ravel(z if share is None else z[share >= 0.5]))
+                shares.append(1.0 if share is None else float(np.mean(share >= 0.5)))
+        z = np.concatenate(scores) if scores else np.zeros(0)
+        z = z[np.isfinite(z)]
+        entry: dict[str, Any] = {"count": len(z)}
+        if len(z):
+            levels = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+            entry |= {"std": float(z.std()), "mean": float(z.mean()), "beyond_2": float(np.mean(np.abs(z) > 2))}
+            entry |= {"decided": float(np.mean(shares)), "quantiles": np.quantile(z, levels).tolist()}
+        found[f"{name}, {count} steps"] = entry
+        print(name, count, {k: x for k, x in entry.items() if k != "quantiles"}, flush=True)
+    return {"problems": found}
+
+
+def table(record: Record) -> str:
+    """Spread of the scores."""
+    rows = []
+    for name, entry in record["problems"].items():
+        if not entry["count"]:
+            rows.append([name, 0, "no standard error", "", "", ""])
+            continue
+        numbers = [f"{entry[key]:.2f}" for key in ("std", "mean")]
+        shares = [f"{entry[key]:.1%}" for key in ("beyond_2", "decided")]
+        rows.append([name, entry["count"], *numbers, *shares])
+    head = "problem | scores | standard deviation of z (1 is right) | mean of z | beyond ± 2 (4.6 % is right) | decided by the references"
+    return markdown.blocks("{seeds} seeds.".format(**record["settings"]), markdown.table(head, rows))
+
+
+def plot(record: Record) -> figures.Figure:
+    """Quantiles of the scores over those of the normal distribution."""
+    panels = {}
+    for name, entry in record["problems"].items():
+        if entry["count"]:
+            n = len(entry["quantiles"])
+            normal = stats.norm.ppf((np.arange(n) + 0.5) / n)
+            panels[name] = {
+                "measured": [(normal.tolist(), entry["quantiles"])],
+                "calibrated": [(normal.tolist(), normal.tolist())],
+            }
+    return figures.curves(panels, "quantile of the normal distribution", "quantile of z", log="")
