@@ -158,7 +158,7 @@ def test_a_mesh_is_built_by_the_constructor_of_either_layout(monkeypatch: pytest
 
 def test_no_other_file_knows_the_layout() -> None:
     layout = re.compile(
-        r'"vertex_(positions|normals|texcoords)"|_buffer\(\)|\.has_vertex_\w+\(|\bmi\.Mesh\(|geometric_faces'
+        r'"vertex_(positions|normals|texcoords)"|(vertex|face)\w*_buffer\(\)|\.has_vertex_\w+\(|\bmi\.Mesh\(|geometric_faces'
     )
     others = [path for path in SOURCE.rglob("*.py") if path != Path(mesh_layout.__file__)]
     assert [path.name for path in others if layout.search(path.read_text())] == []

@@ -75,7 +75,10 @@ def three_views() -> ur.Problem:
     return ur.Problem(description, [ur.Parameter("light.map.data")], views, max_depth=3)
 
 
-def test_views_of_a_turntable_share_their_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("sharing", [True, False])
+def test_views_of_a_turntable_share_their_kernels(sharing: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one recording, or in one for each view whose time is an input."""
+    monkeypatch.setattr(recordable, "_MANY", 3 if sharing else 4)
     given = three_views()
     pictures = [ur.render(given, view=0, spp=4)]
     with recorded() as new:
@@ -88,7 +91,7 @@ def test_views_of_a_turntable_share_their_kernels(monkeypatch: pytest.MonkeyPatc
     ur.render(fresh, view=0, spp=4)
     with recorded() as new:
         again = ur.render(fresh, view=1, spp=4)
-    assert any(new)
+    assert any(new) != sharing
     np.testing.assert_array_equal(again, pictures[1])
 
 

@@ -9,7 +9,6 @@ finite differences of Mitsuba's own renders, with other samples.
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -172,7 +171,6 @@ def test_one_recording_serves_all_cameras(filter_name: str, monkeypatch: pytest.
         return of_sensor
 
     alone = [session_of(n)(0) for n in range(4)]
-    gc.collect()  # a lens of an earlier test, which no recording may hold
     made: list[FrozenFunction] = []
 
     def recorder(*arguments: Any) -> FrozenFunction:

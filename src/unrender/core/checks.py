@@ -7,8 +7,6 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
-import numpy as np
-
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
@@ -43,7 +41,7 @@ def integer(owner: str, name: str, value: Any, at_least: int) -> int:
 def flags(part: Any) -> None:
     """Raise `InputError` unless each field of a dataclass instance whose annotation is `bool` is true or false."""
     for field in dataclasses.fields(part):
-        if field.type in ("bool", bool) and not isinstance(value := getattr(part, field.name), (bool, np.bool_)):
+        if field.type in ("bool", bool) and type(value := getattr(part, field.name)).__name__ not in ("bool", "bool_"):
             raise InputError(f"{type(part).__name__}: {field.name} must be true or false, got {value!r}")
 
 

@@ -36,17 +36,20 @@ def are_recordable(sensor: Any, several: bool) -> bool:
 def for_every_sensor(request: SampleRequest, sensors: Sequence[mi.Sensor], count: int) -> SampleRequest:
     """Return a request in which each pixel has its own sensor, so that one recording serves all sensors of a scene.
 
-    A scene of one or two sensors, and sensors that a recording does not support, keep the request.
+    A scene of one or two sensors, or with a sensor that a recording does not support, keeps the request: random numbers depend on the scene
+    alone, not on other scenes of the process.
 
     Args:
         request: request of one sensor.
         sensors: all sensors of the scene.
         count: number of pixels.
     """
-    if request.sensors is not None or len(sensors) < _MANY or not are_recordable(sensors[0], several=True):
+    supported = all(sensor.class_name() in _COMPLETE for sensor in sensors)
+    if request.sensors is not None or len(sensors) < _MANY or not supported:
         return request
     pixels = dr.arange(mi.UInt32, count) if request.pixels is None else request.pixels
-    return replace(request, pixels=pixels, sensors=dr.full(mi.UInt32, request.sensor, count))
+    # A literal would be recorded as one, and the kernel once more at the second sensor.
+    return replace(request, pixels=pixels, sensors=dr.opaque(mi.UInt32, request.sensor, count))
 
 
 def build_emitter_tables() -> None:
