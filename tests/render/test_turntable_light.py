@@ -12,7 +12,7 @@ import pytest
 import unrender as ur
 from kernels import recorded
 from unrender.app.evaluation import scenes
-from unrender.rendering.mitsuba import film, turntable_light
+from unrender.rendering.mitsuba import film, recordable, turntable_light
 
 ANGLE = 60.0
 MAP = (np.random.default_rng(0).uniform(0, 1, (8, 16, 3)) ** 4 * 5).astype(np.float32)
