@@ -119,9 +119,12 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
 
 
 def _of_bsdfs(traits: Traits) -> list[str]:
-    """Return the keys of numbers that change the form of a BSDF; none where path gradients are as good at lower cost, or may be."""
+    """Return the keys of numbers that change the form of a BSDF, on small films; none where path gradients were measured to be as good.
+
+    One number alone is such a case: a roughness ended two to six times as far from the truth (`benchmarks/limit/notes.md`).
+    """
     keys = [key for key, info in traits.infos.items() if info.shapes_bsdf]
-    small = traits.elements * traits.problem.pixels <= traits.constants.bsdf_pixels
+    small = traits.elements > 1 and traits.elements * traits.problem.pixels <= traits.constants.bsdf_pixels
     measured = traits.problem.loss.linear and all(x.shapes_bsdf or x.brightness for x in traits.infos.values())
     return keys if keys and ((small and measured) or traits.unreachable) else []
 
