@@ -17,6 +17,7 @@ from unrender.estimators.base import as_numpy
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.rendering.expression_texts import parse
 from unrender.rendering.expressions import ExpressionRenderer
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.photographs import scene_values
 from unrender.scene.fingerprint import fingerprint
 
@@ -299,3 +300,24 @@ def test_an_unknown_that_nothing_reads_is_refused() -> None:
     parameters = [ur.Parameter("strength", initial=1.0), ur.Parameter("other", initial=1.0)]
     with pytest.raises(InputError, match="parameter other: neither a parameter of the scene nor read by an expression"):
         problem(picture(), LAMPS, *parameters)
+
+
+@pytest.mark.parametrize("text", ["0.1 + 0.5 * bumps ** 2", "bumps"])
+def test_a_texture_that_an_expression_turns_into_a_roughness_has_no_map(text: str) -> None:
+    """Nor has the roughness itself. Textures that colours transmit are linear."""
+    image = mi.Bitmap(np.full((ROWS, ROWS, 1), 0.3, np.float32))
+    colour = mi.Bitmap(np.full((ROWS, ROWS, 3), 0.5, np.float32))
+    rough = {"type": "bitmap", "bitmap": image, "raw": True}
+    clear = {"type": "bitmap", "bitmap": colour, "raw": True}
+    made = scene()
+    made["wall"]["bsdf"] = {"type": "roughconductor", "alpha": rough, "specular_reflectance": clear}
+    made["pane"] = {"type": "rectangle", "bsdf": {"type": "roughdielectric", "specular_transmittance": dict(clear)}}
+    known = MitsubaRenderer(made).parameters()
+    alpha, passed = "wall.bsdf.alpha.data", "pane.bsdf.specular_transmittance.data"
+    assert known[alpha].curved
+    assert not known[passed].curved
+    assert not known["wall.bsdf.specular_reflectance.data"].curved
+    start = np.full((ROWS, ROWS, 1), 0.4, np.float32)
+    of = ur.Problem(made, [ur.Parameter("bumps", initial=start)], [ur.View(picture())], expressions={alpha: text})
+    assert of.renderer.parameters()["bumps"].curved
+    assert not of.renderer.parameters()[passed].curved

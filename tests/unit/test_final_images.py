@@ -193,3 +193,19 @@ def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:
     assert list(watch.seconds) == ["compiling", "verification", "final pictures"]
     assert set(record["image_errors"]) == {"view0/initial", "view0/result"}
     assert all(len(pair) == 2 for pair in record["image_errors"].values())
+
+
+def test_a_texture_without_a_map_has_the_reason_in_the_record(tmp_path: Path) -> None:
+    """A volume has none, nor has what is not tested for lack of time."""
+    truth = {"fog": np.full((1, 4, 4, 3), 0.5)}
+    renderer = AnalyticRenderer(truth, np.random.default_rng(0).random((768, 48)), 0.0, 0.1, shape=SHAPE, sensors=1)
+    made = Problem(renderer, [Parameter("fog", initial=0.4, bounds=(0, 1))], [View(renderer.exact(truth))])
+    result = run(made, run_directory=tmp_path / "run")
+    record = json.loads((tmp_path / "run" / "run.json").read_text())
+    said = "fog: no map of standard errors: rays pass many voxels, so errors of voxels depend on each other"
+    assert record["without_errors"] == list(result.without_errors) == [said]
+    late = final_images.render_final_images(made, result, tested=False)
+    assert late.without_errors == (
+        "fog: no map of standard errors: the end of the run was not tested, or had no time left",
+    )
+    assert not final_images.render_final_images(made, replace(result, history=[])).without_errors

@@ -11,6 +11,7 @@ import pytest
 import unrender as ur
 from unrender.core.random import Key
 from unrender.estimators.gauss_newton import GaussNewtonState
+from unrender.estimators.hybrid import HybridState
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import least_squares
 from unrender.runs.least_squares import NumbersCheck, _Fit, _judged, check_numbers, pixel_weights
@@ -117,6 +118,28 @@ def test_only_runs_with_weights_by_noise_have_them_in_the_test():
     np.testing.assert_allclose(weights.ravel(), 1.0 / (1.0 + np.array([1.0, 2.0, 9.0]) / 6.0))
     assert pixel_weights(ur.GaussNewton(), state) == ()
     assert pixel_weights(ur.PathGradient(), None) == ()
+
+
+def test_a_block_beside_path_gradients_has_its_weights_in_the_test():
+    state = HybridState(None, GaussNewtonState({}, variances=(np.array([[[1.0], [2.0], [9.0]]]),)))
+    (weights,) = pixel_weights(ur.HybridGradient(perturbed=ur.GaussNewton(noise_limit=3.0)), state)
+    np.testing.assert_allclose(weights.ravel(), 1.0 / (1.0 + np.array([1.0, 2.0, 9.0]) / 6.0))
+    assert pixel_weights(ur.HybridGradient(perturbed=ur.GaussNewton()), state) == ()
+    assert pixel_weights(ur.HybridGradient(), HybridState(None, None)) == ()  # pyright: ignore[reportArgumentType]
+
+
+def test_the_slope_of_the_references_has_the_weights_of_the_pictures():
+    """Equal weights scale it as they scale the pictures; edges of the weights are no edges of the picture, and a masked half counts not."""
+    picture = np.linspace(1.0, 2.0, SHAPE[1])[None, :, None] * np.ones((*SHAPE, 3))
+    picture[4:] *= 1.0 + 3.0 * np.random.default_rng(0).random((4, SHAPE[1], 1))
+    made = problem(MATRIX).replaced(views=[ur.View(picture.astype(np.float32))])
+    plain = Numbers.of(made, at(np.ones(4)), made.initial_values())
+    assert plain is not None
+    weighted = dataclasses.replace(plain, weights=(np.full((*SHAPE, 1), 0.01),))
+    assert weighted.slope() == pytest.approx(0.1 * plain.slope())
+    half = np.where(np.arange(8)[:, None, None] < 4, 1.0, 0.0) * np.ones((*SHAPE, 1))
+    upper = 0.5 * np.square(np.diff(picture[:4], axis=1)).sum() / picture.size
+    assert dataclasses.replace(plain, weights=(half,)).slope() == pytest.approx(np.sqrt(upper), rel=1e-4)
 
 
 def test_a_run_that_arrived_is_told_nothing():

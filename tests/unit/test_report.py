@@ -277,3 +277,11 @@ def test_a_map_has_its_standard_error_and_what_the_references_decided(tmp_path):
     captions = {item.caption: item for stack in panels.map_of_run(run, KEY).stacks for item in stack}
     assert captions["Standard error"].note == "mean 0.02"
     assert captions["Decided by the references"].note.startswith(f"{2 / shape[0]:.0%} decided by the references")
+
+
+def test_a_map_without_standard_errors_has_the_reason(tmp_path):
+    said = "no map of standard errors: pictures may not change in proportion to it"
+    run = read(write_run(tmp_path / "run", without_errors=[f"{KEY}: {said}", f"{KEY}.other: no map: another reason"]))
+    note = panels.map_of_run(run, KEY).note
+    assert said in note
+    assert "another reason" not in note

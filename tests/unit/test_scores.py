@@ -93,3 +93,20 @@ def test_small_and_negative_eigenvalues_are_left_out_of_the_inverse() -> None:
     np.testing.assert_allclose(scores.positive_inverse(whole) @ whole, np.eye(3), atol=1e-6)
     flat = np.array([[1.0, 1.0 + 1e-6], [1.0 + 1e-6, 1.0]])
     np.testing.assert_allclose(scores.positive_inverse(flat), np.full((2, 2), 0.25), rtol=1e-5)
+
+
+def test_only_pixels_with_a_leverage_have_eigenvalues(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two pixels of many decide the fit. The others differ from the exact result by their leverage at most."""
+    rng = np.random.default_rng(0)
+    slopes = rng.normal(size=(2, 900, 3))
+    slopes[:, :2] *= 200.0
+    flat = slopes.reshape(2, -1)
+    inverse, residuals = np.linalg.inv(flat @ flat.T), rng.normal(size=(900, 3))
+    taken, eigh = [], np.linalg.eigh
+    monkeypatch.setattr(np.linalg, "eigh", lambda of: taken.append(len(of)) or eigh(of))
+    found = scores.without_own_pixel(residuals, slopes, slopes, inverse)
+    monkeypatch.setattr(scores, "_LEAST_LEVERAGE", 0.0)
+    exact = scores.without_own_pixel(residuals, slopes, slopes, inverse)
+    assert taken == [2, 900]
+    np.testing.assert_array_equal(found[2:], residuals[2:])
+    np.testing.assert_allclose(found, exact, atol=2e-3 * np.linalg.norm(residuals, axis=1).max())

@@ -11,7 +11,7 @@ import pytest
 
 import unrender as ur
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs import final_images
+from unrender.runs import final_images, image_sensitivity
 from unrender.runs import map_uncertainty as module
 from unrender.runs.folder import reader as folders
 from unrender.runs.image_sensitivity import curvature
@@ -241,3 +241,17 @@ def test_too_few_probes_or_samples_give_no_map() -> None:
     enough = curvature(made, values, noise=pixel_noise(made, noisy))
     found = of_residuals(made, values, noisy, enough)
     assert (not found.standard_error, "too few samples" in found.missing[0]) == (True, True)
+
+
+def test_an_overlap_that_is_not_measured_gives_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The projections of one probe alone fit into memory. The planted fault is an overlap of 1."""
+    made = problem()
+    monkeypatch.setattr(image_sensitivity, "_KEPT", 3 * TEXELS**2)
+    assert np.isinf(curvature(made).overlap["wall"])
+    found = uncertainty(made, estimate(made))
+    assert not found.standard_error
+    assert found.missing == (
+        "wall: no map of standard errors: it has too many texels to measure whether pixels see several of them",
+    )
+    monkeypatch.setattr(image_sensitivity, "_overlap", lambda *given: 1.0)
+    assert "wall" in uncertainty(made, estimate(made)).standard_error

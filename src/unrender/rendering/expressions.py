@@ -248,6 +248,7 @@ def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo
         sensor=sensors.pop() if len(sensors) == 1 else None,
         nonlinear=any(info.nonlinear or info.welded for info in targets),
         shapes_bsdf=any(info.shapes_bsdf for info in targets),
+        of_expression=True,
     )
 
 

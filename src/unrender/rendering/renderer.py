@@ -51,6 +51,7 @@ class ParameterInfo:
         length: order of magnitude of lengths at the object that it moves, a power of ten; 1 for other values.
         angle: whether its values are angles in radians.
         lobe: whether it decides the probability of a lobe, which is never sampled if all values are at an end of the range.
+        of_expression: whether expressions read it, which may be nonlinear.
     """
 
     shape: tuple[int, ...]
@@ -76,12 +77,16 @@ class ParameterInfo:
     shapes_bsdf: bool = False
     angle: bool = False
     lobe: bool = False
+    of_expression: bool = False
     length: float = 1.0
 
     @property
     def curved(self) -> bool:
-        """Whether it is a texture or grid of which the picture is no linear function, such as of roughness, a normal map or a weight."""
-        return self.resizable and not self.brightness
+        """Whether it is a texture or grid of which the picture is no linear function, such as of roughness, a normal map or a weight.
+
+        Those that expressions read count as such.
+        """
+        return self.of_expression or (self.resizable and not self.brightness)
 
     @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:

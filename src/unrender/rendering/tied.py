@@ -92,6 +92,7 @@ class Tie:
             brightness=infos[0].brightness if len({info.brightness for info in infos}) == 1 else "",
             nonlinear=any(info.nonlinear for info in infos),
             shapes_bsdf=any(info.shapes_bsdf for info in infos),
+            of_expression=any(info.of_expression for info in infos),
             length=max(info.length for info in infos),
         )
 

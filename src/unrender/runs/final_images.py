@@ -13,9 +13,9 @@ from unrender.core import phases
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
-from unrender.runs.image_sensitivity import Curvature, curvature
+from unrender.runs.image_sensitivity import MAP_AXES, Curvature, curvature
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
-from unrender.runs.map_uncertainty import Uncertainty, of_residuals, pixel_noise
+from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
 from unrender.runs.verification import misfit_of_views
 from unrender.scene.problem import Problem
@@ -60,6 +60,7 @@ class FinalImages:
         warnings: one line for each unknown that had not settled at the end.
         standard_error: see `Result.standard_error`.
         data_share: see `Result.data_share`.
+        without_errors: see `Result.without_errors`.
     """
 
     pictures: dict[str, np.ndarray]
@@ -70,6 +71,7 @@ class FinalImages:
     warnings: tuple[str, ...] = ()
     standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
     data_share: Mapping[str, np.ndarray] = field(default_factory=dict)
+    without_errors: tuple[str, ...] = ()
 
 
 def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
@@ -120,7 +122,10 @@ def render_final_images(
         everything = tested and len(chosen) == len(problem.views)
         halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
         noise = pixel_noise(problem, halves) if halves else ()
-        known, maps = Curvature({}, {}, 0), Uncertainty()
+        known, maps = (
+            Curvature({}, {}, 0),
+            _untested(problem, result, "the end of the run was not tested, or had no time left"),
+        )
         if everything:
             known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
         sensitivities, deviations = known.sensitivity(), dict(result.standard_error)
@@ -134,10 +139,21 @@ def render_final_images(
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
     if result.steps and (differs := misfit_of_views(problem, chosen, ends, result.warnings)):
-        deviations = {}
+        deviations, maps = (
+            {},
+            _untested(problem, result, "the final picture differs from the references by more than noise"),
+        )
         if differs not in result.warnings:
             warnings = (*warnings, differs)
-    return FinalImages(pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share)
+    return FinalImages(
+        pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share, maps.missing
+    )
+
+
+def _untested(problem: Problem, result: Result, reason: str) -> Uncertainty:
+    """Return no standard errors, with this reason for each texture and grid; without one for a run without steps."""
+    keys = [key for key, shape in problem.shapes().items() if len(shape) >= MAP_AXES] if result.steps else []
+    return Uncertainty(missing=no_maps(dict.fromkeys(keys, reason)))
 
 
 def _pictures(

@@ -21,6 +21,8 @@ from unrender.scene.render import as_tree, view_request
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 MAP_AXES = 3
 """Number of axes from which a parameter is a texture or grid."""
+FEWEST_PROBES = 8
+"""Fewest probes from which the curvature and the overlap are known."""
 _KEPT = 1 << 25
 """Numbers of the probes' projections that are kept for the overlap."""
 _HARDLY = 0.05
@@ -33,7 +35,8 @@ class Curvature:
 
     Attributes:
         squares: {key: diagonal elements} of the parameters' shapes. Estimates below 0 are 0.
-        overlap: {key: Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²}, at least 1, of textures and grids: 1 if no pixel depends on two elements.
+        overlap: {key: Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²}, at least 1, of textures and grids: 1 if no pixel depends on two elements. It is
+            infinite if it is unknown: too few probes are made, or fit into memory.
         probes: number of probes of the estimate.
         noise: {key: diagonal elements of JᵀΣJ} for pixels of variance Σ; {} if that is unknown.
     """
@@ -139,10 +142,15 @@ def curvature(
 
 
 def _overlap(squares: np.ndarray, probes: int, kept: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii² from diagonal elements, whose noise it removes, and the projections of probes."""
+    """Return Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii² from diagonal elements, whose noise it removes, and the projections of probes.
+
+    It is infinite for too few projections, or without a curvature.
+    """
+    if len(kept) < FEWEST_PROBES:
+        return np.inf
     pairs = [float(np.vdot(a[0], b[0])) * float(np.vdot(a[1], b[1])) for n, a in enumerate(kept) for b in kept[n + 1 :]]
     diagonal = float(np.sum(np.square(squares))) / (1.0 + 2.0 / probes)
-    return max(1.0, sum(pairs) / len(pairs) / diagonal) if pairs and diagonal > 0.0 else 1.0
+    return max(1.0, sum(pairs) / len(pairs) / diagonal) if diagonal > 0.0 else np.inf
 
 
 def mask_roots(problem: Problem, view: int) -> np.ndarray:

@@ -20,6 +20,7 @@ from unrender.display import formatting
 from unrender.estimators.base import Estimator
 from unrender.estimators.derivative_images import noise_weights
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
+from unrender.estimators.hybrid import HybridGradient, HybridState
 from unrender.runs.field_directions import beside_fields, fields_of
 from unrender.runs.numbers import Differences, Numbers
 from unrender.scene.problem import Problem
@@ -170,8 +171,10 @@ def check_numbers(
 def pixel_weights(estimator: Estimator, state: Any) -> tuple[np.ndarray, ...]:
     """Return the weights of each view's pixels in the next step, (H, W, 1), from the noise of earlier images; () for equal ones.
 
-    Only `GaussNewton` with a `noise_limit` has weights.
+    Only `GaussNewton` with a `noise_limit` has weights, alone or for the numbers of a `HybridGradient`.
     """
+    if isinstance(estimator, HybridGradient) and isinstance(state, HybridState):
+        estimator, state = estimator.perturbed, state.perturbed
     if not (isinstance(estimator, GaussNewton) and isinstance(state, GaussNewtonState) and estimator.noise_limit):
         return ()
     return tuple(noise_weights(variance, estimator.noise_limit) for variance in state.variances)

@@ -13,6 +13,7 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.image_sensitivity import (
+    FEWEST_PROBES,
     MAP_AXES,
     Curvature,
     curvature,
@@ -26,7 +27,7 @@ from unrender.runs.verification import misfit_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render
 
-__all__ = ["Uncertainty", "of_residuals", "pixel_noise", "uncertainty"]
+__all__ = ["Uncertainty", "no_maps", "of_residuals", "pixel_noise", "uncertainty"]
 
 _STREAM, _PASSES = 6, 4
 """Stream of the random numbers, and number of adjoints of each half of the residual."""
@@ -36,8 +37,8 @@ _COUNTED = 0.1
 """Curvature relative to the median above which a cell counts in means over cells."""
 _PROBES = 4.0
 """Number of probes that the curvature of the neighbours weighs as much as."""
-_FEWEST, _ERRORS = 8, 3.0
-"""Fewest probes, and standard errors by which the residual must exceed the pictures' noise, or there is no map."""
+_ERRORS = 3.0
+"""Standard errors by which the residual must exceed the pictures' noise, or there is no map."""
 _MOST_OVERLAP = 1.3
 """Overlap from which on texels are not independent, such as with more texels than pixels that see them."""
 _ELEMENTS, _LEAST = 9.0, 0.1
@@ -174,7 +175,7 @@ def of_residuals(
     reasons = {key: _refusal(infos[key], known, key) for key, shape in shapes.items() if len(shape) >= MAP_AXES}
     keys = [key for key, reason in reasons.items() if not reason]
     if not keys:
-        return Uncertainty(missing=_lines(reasons))
+        return Uncertainty(missing=no_maps(reasons))
     roots = [mask_roots(problem, view) for view in range(len(problem.views))]
     residuals = _residuals(problem, halves)
     noise = _Mean.of(np.concatenate([products[seen] for products, seen in _unshared(residuals)]))
@@ -186,13 +187,13 @@ def of_residuals(
     for key in keys:
         own = _Cells.of(values[key], problem.unknowns[key].initial, known.squares[key], known.noise[key], known.probes)
         prior = 0.0 if (of := problem.unknowns[key].prior) is None else of.diagonal(values[key])
-        posterior = own.posterior(one[key] * other[key], known.overlap.get(key, 1.0), noise.is_known, prior)
+        posterior = own.posterior(one[key] * other[key], known.overlap[key], noise.is_known, prior)
         if posterior is None:
             reasons[key] = "the pictures have too few samples to tell their differences from the references from noise"
             continue
         variance, share = posterior
         errors[key], shares[key] = np.sqrt(variance).astype(np.float32), share.astype(np.float32)
-    return Uncertainty(errors, shares, _lines(reasons))
+    return Uncertainty(errors, shares, no_maps(reasons))
 
 
 def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
@@ -205,13 +206,17 @@ def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
     if not square.any():
         return "no picture depends on it"
     if info.curved:
-        return "pictures do not change in proportion to it"
-    if known.overlap.get(key, 1.0) >= _MOST_OVERLAP:
-        return "pixels see several texels, so errors of texels depend on each other"
-    return "" if known.probes >= _FEWEST else "no time was left; use more seconds or fewer pixels"
+        return "pictures may not change in proportion to it"
+    if known.probes < FEWEST_PROBES:
+        return "no time was left; use more seconds or fewer pixels"
+    overlap = known.overlap.get(key, math.inf)
+    if math.isinf(overlap):
+        return "it has too many texels to measure whether pixels see several of them"
+    return "" if overlap < _MOST_OVERLAP else "pixels see several texels, so errors of texels depend on each other"
 
 
-def _lines(reasons: Mapping[str, str]) -> tuple[str, ...]:
+def no_maps(reasons: Mapping[str, str]) -> tuple[str, ...]:
+    """Return a line for each texture or grid that has no map for a reason other than ""."""
     return tuple(f"{key}: no map of standard errors: {reason}" for key, reason in reasons.items() if reason)
 
 

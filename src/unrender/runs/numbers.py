@@ -10,7 +10,6 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.random import Key
-from unrender.estimators.derivative_images import squared_slope
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.runs.image_sensitivity import mask_roots
 from unrender.scene.problem import Problem
@@ -241,11 +240,16 @@ class Numbers:
         return Differences(0.5 * (ends[:count] - ends[count:]).T.astype(np.float64), one, other)
 
     def slope(self) -> float:
-        """Return the root mean square of the references' differences of neighbouring pixels, or 1 % of the references."""
+        """Return the root mean square of the references' differences of neighbouring pixels, or 1 % of the references.
+
+        Differences have the root of the smaller weight of both pixels: the weights do not move with the picture.
+        """
         squares, total = 0.0, 0
         for view in self.views:
             image = np.asarray(self.problem.views[view].reference, np.float64)
-            squares += squared_slope([image[None]] * 2)
+            roots = self.roots(view).reshape(*image.shape[:2], 1)
+            for x, root in ((image, roots), (image.swapaxes(0, 1), roots.swapaxes(0, 1))):
+                squares += 0.5 * float(np.square(np.diff(x, axis=0) * np.minimum(root[1:], root[:-1])).sum())
             total += image.size
         least = 0.01 * math.sqrt(float(np.mean(np.square(self.references()))))
         return max(math.sqrt(squares / total), least, 1e-30)

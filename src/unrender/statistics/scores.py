@@ -6,6 +6,8 @@ import numpy as np
 
 _MOST_LEVERAGE = 0.9
 """Largest leverage of a pixel; noise of the slopes may make it larger."""
+_LEAST_LEVERAGE = 1e-3
+"""Norm of the leverages of a pixel up to which its residual is left as it is."""
 _LEAST_CURVATURE = 1e-3
 """Smallest eigenvalue of a Hessian, relative to the largest, along which pixels have leverage."""
 _AGREE_ERRORS = 3.0
@@ -58,6 +60,7 @@ def without_own_pixel(
 
     A fit follows the noise of its pixels, so its residuals r are smaller than the noise. h = J_p (JᵀJ)⁻¹ J_pᵀ (C, C) is the leverage of a
     pixel, with eigenvalues clamped to [0, 0.9] (Efron's jackknife; HC3 of MacKinnon and White 1985).
+    Residuals of pixels whose h has a Frobenius norm of at most 0.001 are unchanged: such h are of most pixels of large pictures.
 
     Args:
         residuals: residuals of the fit, (..., P, C), times the weights if there are any.
@@ -67,10 +70,14 @@ def without_own_pixel(
     """
     roots = np.ones(one.shape[1:]) if weights is None else np.sqrt(np.maximum(weights, 0.0))
     leverages = np.einsum("kpc,kpd->pcd", np.tensordot(inverse, one * roots, axes=1), other * roots)
-    values, vectors = np.linalg.eigh(0.5 * (leverages + leverages.swapaxes(1, 2)))
-    left, units = 1.0 - np.clip(values, 0.0, _MOST_LEVERAGE), np.where(roots > 0.0, roots, 1.0)
-    along = np.einsum("pcd,...pc->...pd", vectors, residuals / units)
-    return np.einsum("pcd,...pd->...pc", vectors, along / left) * units
+    leverages = 0.5 * (leverages + leverages.swapaxes(1, 2))
+    high = np.square(leverages).sum(axis=(1, 2)) > _LEAST_LEVERAGE**2
+    values, vectors = np.linalg.eigh(leverages[high])
+    left, units = 1.0 - np.clip(values, 0.0, _MOST_LEVERAGE), np.where(roots > 0.0, roots, 1.0)[high]
+    along = np.einsum("pcd,...pc->...pd", vectors, residuals[..., high, :] / units)
+    result = np.array(residuals, np.float64)
+    result[..., high, :] = np.einsum("pcd,...pd->...pc", vectors, along / left) * units
+    return result
 
 
 def positive_inverse(matrix: np.ndarray) -> np.ndarray:

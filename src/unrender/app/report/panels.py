@@ -13,7 +13,7 @@ from unrender.core import periodic
 from unrender.display import formatting, pictures
 from unrender.display.pictures import is_map
 from unrender.runs.folder.reader import RunFolder, ViewPictures
-from unrender.runs.image_sensitivity import MAP_AXES, around, hardly_seen
+from unrender.runs.image_sensitivity import around, hardly_seen
 
 __all__ = [
     "ColourScale",
@@ -198,9 +198,8 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
             stacks += [(item,) for item in column]
         else:
             stacks.append(tuple(column))
-    note = _map_note(result, scale)
-    if sensitivity is not None and deviation is None and result.ndim > MAP_AXES:
-        note += "; no map of standard errors, since rays pass many voxels"
+    reasons = [line.removeprefix(f"{key}: ") for line in run.record.without_errors if line.startswith(f"{key}: ")]
+    note = "; ".join([_map_note(result, scale), *reasons])
     return Panel(key, note, tuple(stacks), len(planes) == 1, len(planes) > 1)
 
 

@@ -46,7 +46,9 @@ _REFUTED = {
 }
 """{class of a BSDF: slots whose path gradients disagree with finite differences}."""
 _LIGHT = ("radiance", "intensity", "irradiance")
-_REFLECTANCE = ("reflectance", "diffuse_reflectance", "specular_reflectance", "base_color")
+_REFLECTANCE = (
+    "reflectance", "diffuse_reflectance", "specular_reflectance", "diffuse_transmittance", "specular_transmittance", "base_color",
+)  # fmt: skip
 _DIRECTIONS = (NORMALS, "sun_direction", "direction")
 
 _OUTLINES = {

@@ -108,6 +108,7 @@ def record(result: Result, status: str, error: str = "") -> dict[str, Any]:
         "resumed": list(result.resumed),
         "image_errors": {name: list(error) for name, error in result.image_errors.items() if np.isfinite(error).all()},
         "undetermined": list(result.undetermined),
+        "without_errors": list(result.without_errors),
         "standard_error": {
             key: [float(f"{value:.6g}") if np.isfinite(value) else None for value in np.ravel(error)]
             for key, error in result.standard_error.items()

@@ -125,7 +125,7 @@ class RunRecord(BaseModel):
         steps, seconds, warmup_seconds, skipped, warnings: see `Result`.
         problem: description of the problem.
         resumed: steps at which it was resumed.
-        image_errors, undetermined, phases: see `Result`.
+        image_errors, undetermined, without_errors, phases: see `Result`.
         standard_error: standard errors of each number, {key: one value per element}, None for infinite; see `Result`.
         verification: see `Result`; empty for runs that were not verified.
         error: exception by which the run failed; "" for none.
@@ -154,6 +154,7 @@ class RunRecord(BaseModel):
     resumed: list[_Count] = []
     image_errors: dict[StrictStr, tuple[_Seconds, _Seconds]] = {}
     undetermined: list[StrictStr] = []
+    without_errors: list[StrictStr] = []
     standard_error: dict[StrictStr, list[_Seconds | None]] = {}
     verification: dict[StrictStr, Any] = {}
     phases: dict[StrictStr, _Seconds] = {}

@@ -188,6 +188,7 @@ class RunWriter(Callback):
                 sensitivity=images.sensitivity,
                 data_share=images.data_share,
                 undetermined=images.undetermined,
+                without_errors=images.without_errors,
                 standard_error=images.standard_error,
                 warnings=[*result.warnings, *images.warnings],
             )
