@@ -224,8 +224,17 @@ def test_nothing_but_an_earlier_import_is_removed(unrender: Unrender, capture: P
     assert Path("../asset/problem.toml").is_file()
 
 
+@pytest.mark.parametrize(
+    ("option", "value"), [("--texture", 64), ("--band", 2), ("--unknowns", "colour"), ("--field", 8)]
+)
+def test_check_refuses_what_it_would_ignore(option: str, value: object, unrender: Unrender, capture: Path) -> None:
+    answer = unrender("import", capture, "--check", "--out", "look", option, value)
+    assert (answer.status, f"{option}: does not apply to a check" in answer.error) == (2, True), answer.error
+    assert not Path("look").exists()
+
+
 def test_check_draws_every_photograph(unrender: Unrender, capture: Path) -> None:
-    answer = unrender("import", capture, "--check", "--out", "look", *SMALL)
+    answer = unrender("import", capture, "--check", "--out", "look", *SMALL[:4])
     assert answer.status == 0, answer.error
     assert len(list(Path("look/check").glob("*.png"))) == VIEWS
     assert not Path("look/problem.toml").exists()

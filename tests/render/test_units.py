@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -46,16 +47,21 @@ def problem(unit: float, parameters: list[ur.Parameter], **options: Any) -> ur.P
     return ur.Problem(scene(unit, **options), parameters, views, max_depth=2, truth=truth)
 
 
-def test_degrees_in_place_of_radians_are_told() -> None:
+def test_degrees_in_place_of_radians_are_told(tmp_path: Path) -> None:
     def notices(parameter: ur.Parameter, **known: Any) -> list[str]:
         blank = ur.View(np.zeros((SIZE, SIZE, 3), np.float32), known=known.get("known"))
         return ur.Problem(scene(1.0), [parameter], [blank], max_depth=2).notices
 
-    told = "45 is more than a full turn, since angles are in radians; 45 degrees are 0.7854"
+    told = "45 radians is more than a full turn; if it is in degrees, give 0.7854"
     assert notices(ur.Parameter("block.rotation.y", 45.0)) == [f"parameter block.rotation.y: {told}"]
     assert notices(ur.Parameter("cam.rotation", 0.0, bounds=(-45, 45))) == [f"parameter cam.rotation: {told}"]
     turned = notices(ur.Parameter("lamp.intensity.value"), known={"block.rotation": [0.0, -45.0, 0.0]})
     assert turned == [f"view 0: block.rotation: {told}"]
+    file = tmp_path / "rotation.npy"
+    for name in (file, str(file)):
+        for degrees, lines in ((0.5, []), (-45.0, turned)):
+            np.save(file, np.array([0.0, degrees, 0.0]))
+            assert notices(ur.Parameter("lamp.intensity.value"), known={"block.rotation": name}) == lines
     assert notices(ur.Parameter("block.rotation.y", 0.5, bounds=(-6.2831853, np.inf))) == []
     assert notices(ur.Parameter("block.translation.y", 45.0)) == []
 

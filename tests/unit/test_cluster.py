@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import threading
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -253,12 +252,12 @@ def test_an_exception_of_a_signals_handler_is_raised_once_the_call_has_ended() -
         raise SystemExit(7)
 
     def slow() -> None:
+        os.kill(os.getpid(), signal.SIGUSR1)
         time.sleep(0.3)
         ended.append(True)
 
     before = signal.signal(signal.SIGUSR1, handler)
     try:
-        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGUSR1)).start()
         waiter = Waiter()
         with pytest.raises(SystemExit, match="7"):
             waiter.call(slow)

@@ -16,7 +16,7 @@ from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.images.base import leave_one_out
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs import verify
+from unrender.runs import run, verify
 from unrender.runs.folder import reader
 from unrender.runs.folder.schema import NOT_VERIFIED
 from unrender.statistics import paired_losses
@@ -52,7 +52,6 @@ class Rising(ur.schedules.Schedule):
         return 1.0 if step < 70 else 40.0
 
 
-@ur.register
 @dataclass(frozen=True)
 class Away:
     """An optimizer that adds a constant at each step, whatever the gradient."""
@@ -79,6 +78,31 @@ def test_a_loss_within_the_noise_of_few_paths_is_judged_by_more(monkeypatch: pyt
     assert ur.optimize(problem, ur.PathGradient(spp=1024), Away(1e-9), steps=40).status == "finished"
     monkeypatch.setattr(verify, "_LARGER_SHARE", 0.0)
     assert ur.optimize(problem, ur.PathGradient(spp=1024), Away(), steps=40).status == "finished"
+    monkeypatch.undo()
+    monkeypatch.setattr(run.Run, "time_left", lambda self: 0.0)
+    assert ur.optimize(problem, ur.PathGradient(spp=1024), Away(), steps=40).status == "finished"
+
+
+@pytest.mark.parametrize("pace", [0.002, 1e-9])
+def test_more_paths_are_at_most_a_tenth_of_the_runs_and_have_their_own_random_numbers(
+    pace: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numbers: dict[int, list[int]] = {}
+
+    class Numbered(FreshPictures):
+        def picture(self, parameters: Any, problem: Any = None) -> Any:
+            numbers.setdefault(self.paths, []).append(self._key.fold(1).uint32())
+            return super().picture(parameters, problem)
+
+    monkeypatch.setattr(verify, "FreshPictures", Numbered)
+    problem, forms = noting(made(start=None, noise=8.0), offset=0.0, noise=8.0)
+    result = ur.optimize(problem, ur.PathGradient(spp=1024), Away(pace), steps=40)
+    assert result.status == ("finished" if pace < 1e-3 else "worse than start")
+    few, many = (numbers[paths] for paths in sorted(numbers))
+    assert (len(many), len(set(many))) == (2, 1)  # the start and the end
+    assert not set(few) & set(many)
+    paths = sum(spp * SIDE * SIDE for spp, _ in forms)
+    assert paths < 0.1 * 40 * 1024 * SIDE * SIDE
 
 
 def test_parts_of_the_launches_have_the_same_mean() -> None:
@@ -337,11 +361,13 @@ class Noting(AnalyticRenderer):
         return super().image(parameters, request)
 
 
-def noting(problem: ur.Problem) -> tuple[ur.Problem, list[Any]]:
+def noting(problem: ur.Problem, offset: float = 0.5, noise: float = 0.5) -> tuple[ur.Problem, list[Any]]:
     """The problem, and the list of the forms that it is asked for from now on."""
     assert isinstance(problem.renderer, AnalyticRenderer)
     sensors = len(problem.views)
-    renderer = Noting({"x": np.full(SIZE, 0.5)}, problem.renderer.matrix, 0.5, shape=(SIDE, SIDE), sensors=sensors)
+    renderer = Noting(
+        {"x": np.full(SIZE, 0.5)}, problem.renderer.matrix, offset, noise, shape=(SIDE, SIDE), sensors=sensors
+    )
     renderer.forms = []
     return problem.with_parts(renderer=renderer), renderer.forms
 

@@ -262,9 +262,9 @@ def has_cuda_driver() -> bool:
 def llvm_version() -> tuple[int, ...] | None:
     """Return the version of the LLVM that Dr.Jit has loaded, such as (19, 1, 7); None if there is none.
 
-    If the configured library is unusable, the result is its major version (n,), or None if that is unknown. Dr.Jit is asked neither
-    then nor if no usable library exists. It would deadlock: it waits for its own
-    initialisation, whose thread waits for the interpreter lock of this call to report the failure.
+    If the configured library is unusable, the result is its major version (n,), or None if that is unknown. None also means that no
+    usable library exists. Dr.Jit is not asked in these cases. It would deadlock: it waits for its own initialisation, whose thread waits
+    for the interpreter lock of this call to report the failure.
     """
     library = os.environ.get(llvm.ENVIRONMENT_VARIABLE)
     if library and not llvm.is_usable(major := llvm.identify(Path(library)).major):

@@ -32,9 +32,12 @@ __all__ = ["Memory", "Verify", "compare_memory"]
 
 _SHARE = 0.004
 """Fraction of the run's paths for one new image; there are at most four."""
-_LARGER_SHARE, _PARTS = 0.064, 8
+_LARGER_SHARE, _PARTS = 0.01, 8
 """The same fraction, and the number of parts with images of their own, where the first images do not tell whether the end is better or
-worse than the start: few bright pixels, such as those of a visible lamp, may hold most of the noise."""
+worse than the start: few bright pixels, such as those of a visible lamp, may hold most of the noise. All images then use at most 6 % of
+the run's paths. Samples of pixels, those of more than 4,096 pixels, get no larger images."""
+_LARGER_IMAGES = 4
+"""Number of larger images for which time must be left: the start, the end, a candidate and a control variate."""
 _LEVEL, _LEVEL_AGAIN = 1e-4, 1e-3
 """False positive rate of each test; that of the test by more paths, which few runs reach."""
 _LEAST_CHANGE = 1e-3
@@ -54,7 +57,7 @@ _FIRST_EARLIER, _COST = 4, 0.02
 _EARLIER_SHORT, _STILL_SHORT, _SURE, _OF_PICTURE_SHORT = 0.5, 0.9, 2.0, 0.05
 """The same limits as above for runs whose earlier image is of a step before 64: fraction of the steps; ratio of the losses, with the number
 of standard errors by which it must be exceeded; smallest size of the residual relative to the image."""
-_CANDIDATES, _END = 1, 2
+_CANDIDATES, _END, _AGAIN = 1, 2, 3
 """Indices of the sets of random numbers."""
 
 
@@ -89,7 +92,8 @@ class Verify(Callback):
 
     Candidates are the start, the parameters after 64, 128, 256, … steps, and the end. The one with the least loss becomes
     `Result.parameters`; another one than the end must be significantly better. Each image uses 0.4 % of the run's paths, or about 8,000
-    paths in a short run; 6.4 % where these leave open which end of the run is better. The steps are not affected.
+    paths in a short run. Where these leave open which end of the run is better, larger images of 1 % judge it, if time is left. Films of
+    more than 4,096 pixels in total get no larger images if a sample of their pixels is rendered. The steps are not affected.
     """
 
     _pictures: FreshPictures | None = field(default=None, init=False)
@@ -252,18 +256,23 @@ class _Earlier:
 def _ends(run: Run, result: Result) -> tuple[FreshPictures, Picture, Result, Picture, bool]:
     """Return the renderer of new images, the image of the start, the result as `_end` returns it, its image, and whether it is worse.
 
-    If these images show all pixels and do not tell which end of the run is better, they are rendered once more, from more paths.
+    If these images show all pixels and do not tell which end of the run is better, larger ones with other random numbers judge it, if the
+    run's budget leaves time for them. They are returned only if the end is worse by them.
     """
     start = run.problem.remeshed_from or run.problem
     pictures = FreshPictures(run.problem, run.seed, _SHARE * run.state.samples, _END)
-    first, (ended, last) = pictures.picture(result.initial, start), _end(run, result, pictures)
+    began = time.perf_counter()
+    first = pictures.picture(result.initial, start)
+    seconds = time.perf_counter() - began
+    ended, last = _end(run, result, pictures)
     worse = _is_worse(pictures, first, last)
     if not (pictures.sampled or worse or _is_worse(pictures, last, first)):
-        larger = FreshPictures(run.problem, run.seed, _LARGER_SHARE * run.state.samples, _END, _PARTS)
-        if larger.paths > pictures.paths:
-            pictures, first = larger, larger.picture(result.initial, start)
-            ended, last = _end(run, result, larger)
-            worse = _is_worse(larger, first, last, _LEVEL_AGAIN)
+        larger = FreshPictures(run.problem, run.seed, _LARGER_SHARE * run.state.samples, _AGAIN, _PARTS)
+        expected = _LARGER_IMAGES * seconds * larger.paths / pictures.paths
+        if larger.paths > pictures.paths and expected < run.time_left():
+            others = larger.picture(result.initial, start), larger.picture(ended.parameters)
+            if _is_worse(larger, *others, _LEVEL_AGAIN):
+                return larger, others[0], ended, others[1], True
     return pictures, first, ended, last, worse
 
 

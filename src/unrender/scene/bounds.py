@@ -99,10 +99,7 @@ def angle_notice(info: ParameterInfo, *values: Any) -> str:
     largest = max((float(size[np.isfinite(size)].max(initial=0.0)) for size in sizes), default=0.0)
     if largest <= _FULL_TURN:
         return ""
-    return (
-        f"{largest:g} is more than a full turn, since angles are in radians; {largest:g} degrees are "
-        f"{math.radians(largest):.4g}"
-    )
+    return f"{largest:g} radians is more than a full turn; if it is in degrees, give {math.radians(largest):.4g}"
 
 
 def move_inside(start: np.ndarray, bounds: Bounds, info: ParameterInfo) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -26,7 +26,7 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.errors import InputError
-from unrender.io import images
+from unrender.io import images, parameter_values
 from unrender.io.stored_pictures import PictureStore, StoredPicture
 from unrender.losses import Censored, Loss
 from unrender.rendering.picture_format import PictureFormat, format_of
@@ -167,10 +167,14 @@ def check_views(views: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[
 
 
 def known_angles(views: Iterable[View], known: Mapping[str, ParameterInfo]) -> list[str]:
-    """Return a notice for each known value of a view that is an angle above a full turn."""
-    pairs = [(index, key, value) for index, view in enumerate(views) for key, value in (view.known or {}).items()]
-    found = [(index, key, angle_notice(known[key], value)) for index, key, value in pairs if key in known]
-    return [f"view {index}: {key}: {line}" for index, key, line in found if line]
+    """Return a notice for each known value of a view, or of its file, that is an angle above a full turn."""
+    notices = []
+    for index, view in enumerate(views):
+        for key in [key for key in view.known or {} if key in known and known[key].angle]:
+            value, _ = parameter_values.fill((view.known or {})[key], known[key].shape, known[key].conversion)
+            line = angle_notice(known[key], value)
+            notices += [f"view {index}: {key}: {line}"] if line else []
+    return notices
 
 
 def check_sensor(index: int, view: View, count: int) -> None:

@@ -285,7 +285,7 @@ def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, st
     _check_place(out, folder, options, _OF_CHECK)
     if formats.is_lit(folder, options.kind):
         raise InputError(f"{folder}: one camera under known lights has no poses to check")
-    options.refuse(("field",), "a check of the mesh")
+    options.refuse(("field", "texture", "band", "unknowns"), "a check of the mesh")
     data = _read(folder, options, unwrapped=False)
 
     def fill(place: Path) -> None:

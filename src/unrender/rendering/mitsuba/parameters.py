@@ -36,7 +36,8 @@ _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "Smoot
 _WRAPPERS = {"TwoSidedBRDF"}
 _NORMAL_PERTURBATIONS = {"BumpMap", "NormalMap"}
 MOVED_MIRROR = (
-    "path gradients do not follow the directions that a moving perfect mirror or smooth glass reflects and refracts"
+    "path gradients do not follow the directions of a moving perfectly specular lobe (conductor, dielectric, plastic); "
+    "use --method smoothed, or a rough BSDF"
 )
 _MIXED = "its BSDF mixes perfectly specular lobes with others"
 _COMPUTED_OR_FIXED = (NORMALS, TEXCOORDS)

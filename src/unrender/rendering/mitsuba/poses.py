@@ -128,7 +128,8 @@ def info(key: PoseKey, obstacle: str, sensor: int | None, length: float = 1.0) -
     kind = "light" if key.light else "sensor" if viewpoint else "shape"
     reason = f"it moves a {kind} rigidly"
     if obstacle:
-        reason += f", and {obstacle}; use --method smoothed (SmoothedDerivatives)"
+        advice = "" if "--method smoothed" in obstacle else "; use --method smoothed (SmoothedDerivatives)"
+        reason += f", and {obstacle}{advice}"
     low = 1e-3 if key.part == "scale" else None
     return ParameterInfo(
         key.shape,

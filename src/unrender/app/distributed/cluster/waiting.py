@@ -25,7 +25,7 @@ class _Call:
         self._error: BaseException | None = None
 
     def run(self) -> None:
-        """Carry it out."""
+        """Run the function and store its result."""
         try:
             self._value = self._function()
         except BaseException as error:
@@ -61,9 +61,8 @@ class Waiter:
         call = _Call(function)
         self._calls.put(call)
         try:
-            while not call.ended.wait(
-                _SLICE
-            ):  # the system may give a signal to another thread, which wakes this one not
+            # The system may deliver a signal to another thread, which does not wake this one. So the wait ends now and then.
+            while not call.ended.wait(_SLICE):
                 pass
         except BaseException:
             call.ended.wait(_ANSWER)  # nothing may leave Ray while a thread is in it
