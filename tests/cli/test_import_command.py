@@ -266,14 +266,14 @@ def test_a_flipped_convention_is_named(case: str, unrender: Unrender, capture: P
     given, name = case.split(": ")
     spoil, remedy = FLIPPED[name]
     spoil(capture)
-    more = ("--mesh", mesh) if given == "mesh" else ()
-    answer = unrender("import", capture, "--out", "asset", *SMALL, *more)
+    shape = ("--mesh", mesh, *SMALL[4:]) if given == "mesh" else SMALL
+    answer = unrender("import", capture, "--out", "asset", *shape)
     assert answer.status == 2
     assert remedy in answer.error
     assert answer.error.count("\n") == 1
     assert not Path("asset").exists()
     words = answer.error.split(": give ")[1].split()
-    assert unrender("import", capture, "--out", "asset", *SMALL, *more, *words).status == 0
+    assert unrender("import", capture, "--out", "asset", *shape, *words).status == 0
 
 
 @pytest.mark.parametrize(
