@@ -123,7 +123,7 @@ class Cosine:
 @register(position=5)
 @dataclass(frozen=True)
 class Steps:
-    """`factor` to the power ⌊step / `every`⌋.
+    """`factor` to the power of the integer part of step / `every`.
 
     Args:
         every: number of steps, >= 1.
