@@ -93,9 +93,9 @@ def test_pairs_of_neighbours_are_counted_once() -> None:
 
 
 def test_a_value_and_a_palette_are_two_terms() -> None:
-    x, options = np.full(3, 0.5), {"std": 0.2}
-    parts = [Prior(**options, **own).on(x) for own in ({"near": 0.1}, {"palette": [[0.9, 0.5, 0.5]]})]
-    both = Prior(**options, near=0.1, palette=[[0.9, 0.5, 0.5]]).on(x)
+    x, colours = np.full(3, 0.5), [[0.9, 0.5, 0.5]]
+    parts = [Prior(std=0.2, near=0.1).on(x), Prior(std=0.2, palette=colours).on(x)]
+    both = Prior(std=0.2, near=0.1, palette=colours).on(x)
     assert both.evaluate(x)[0] == pytest.approx(sum(part.evaluate(x)[0] for part in parts))
     assert both.product(x, x) == pytest.approx(sum(part.product(x, x) for part in parts))
 
