@@ -82,7 +82,7 @@ class ParameterInfo:
 
     @property
     def curved(self) -> bool:
-        """Whether it is a texture or grid of which the picture is no linear function, such as of roughness, a normal map or a weight.
+        """True for a texture or grid of which the picture is no linear function, such as a roughness, a normal map or a weight.
 
         Those that expressions read count as such.
         """

@@ -13,7 +13,7 @@ from unrender.core import phases
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
-from unrender.runs.image_sensitivity import MAP_AXES, Curvature, curvature
+from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
@@ -139,10 +139,8 @@ def render_final_images(
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
     if result.steps and (differs := misfit_of_views(problem, chosen, ends, result.warnings)):
-        deviations, maps = (
-            {},
-            _untested(problem, result, "the final picture differs from the references by more than noise"),
-        )
+        deviations = {}
+        maps = _untested(problem, result, "the final picture differs from the references by more than noise")
         if differs not in result.warnings:
             warnings = (*warnings, differs)
     return FinalImages(
@@ -152,7 +150,7 @@ def render_final_images(
 
 def _untested(problem: Problem, result: Result, reason: str) -> Uncertainty:
     """Return no standard errors, with this reason for each texture and grid; without one for a run without steps."""
-    keys = [key for key, shape in problem.shapes().items() if len(shape) >= MAP_AXES] if result.steps else []
+    keys = map_keys(problem) if result.steps else []
     return Uncertainty(missing=no_maps(dict.fromkeys(keys, reason)))
 
 

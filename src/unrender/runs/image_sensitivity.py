@@ -153,6 +153,11 @@ def _overlap(squares: np.ndarray, probes: int, kept: list[tuple[np.ndarray, np.n
     return max(1.0, sum(pairs) / len(pairs) / diagonal) if diagonal > 0.0 else np.inf
 
 
+def map_keys(problem: Problem) -> list[str]:
+    """Return the keys of the textures and grids among the unknowns."""
+    return [key for key, shape in problem.shapes().items() if len(shape) >= MAP_AXES]
+
+
 def mask_roots(problem: Problem, view: int) -> np.ndarray:
     """Return the roots of the weights of a view's pixels by its mask, (H, W, 1)."""
     weights = problem.views[view].pixel_weights(problem.sizes[view])

@@ -17,6 +17,7 @@ from unrender.runs.image_sensitivity import (
     MAP_AXES,
     Curvature,
     curvature,
+    map_keys,
     mask_roots,
     neighbour_means,
     transposed,
@@ -110,7 +111,7 @@ def uncertainty(
     until = time.perf_counter() + seconds
     known, maps = Curvature({}, {}, 0), Uncertainty()
     keys = checked_keys(problem, values, problem.initial_values())
-    mapped = any(len(shape) >= MAP_AXES for shape in problem.shapes().values())
+    mapped = map_keys(problem)
     if mapped or keys:
         views = range(len(problem.views)) if mapped else tested_views(problem)
         halves = _halves(problem, values, views, seed)
@@ -122,16 +123,15 @@ def uncertainty(
     left = until - time.perf_counter()
     numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity())
     errors = {**numbers.standard_errors(values), **maps.standard_error}
-    told = {key for key, shape in problem.shapes().items() if len(shape) >= MAP_AXES}
-    others = _others(problem, keys, told.union(errors, numbers.unchecked, numbers.fixed))
+    others = _others(problem, keys, {*mapped, *errors, *numbers.unchecked, *numbers.fixed})
     return Uncertainty(errors, maps.data_share, (*maps.missing, *numbers.missing(), *others))
 
 
-def _others(problem: Problem, tested: Sequence[str], told: Collection[str]) -> list[str]:
-    """Return a line for each unknown that has no standard errors and is not among those `told`."""
+def _others(problem: Problem, tested: Sequence[str], explained: Collection[str]) -> list[str]:
+    """Return a line for each unknown that has no standard errors and is not among those `explained`."""
     infos, result = problem.renderer.parameters(), []
     for key, unknown in problem.unknowns.items():
-        if key in told:
+        if key in explained:
             continue
         reason = "least squares test few numbers only"
         if infos[key].welded:

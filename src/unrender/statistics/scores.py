@@ -85,17 +85,22 @@ def positive_inverse(matrix: np.ndarray) -> np.ndarray:
 
     The matrix is scaled to unit diagonal. Eigenvalues below 0.001 of the largest then count as 0.
     """
-    units = np.sqrt(np.abs(np.diag(matrix)))
-    units = np.where(units > 0.0, units, 1.0)
-    eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
+    scales, eigenvalues, vectors = _scaled_eigh(matrix)
     used = eigenvalues > _LEAST_CURVATURE * eigenvalues[-1]
     inverse = np.divide(1.0, eigenvalues, out=np.zeros_like(eigenvalues), where=used)
-    return (vectors * inverse) @ vectors.T / np.outer(units, units)
+    return (vectors * inverse) @ vectors.T / scales
 
 
 def positive_part(matrix: np.ndarray) -> np.ndarray:
     """Return D P D for the symmetric matrix D M D, where D is diagonal, M has a unit diagonal, and P is M without negative eigenvalues."""
+    scales, eigenvalues, vectors = _scaled_eigh(matrix)
+    return (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T * scales
+
+
+def _scaled_eigh(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the elements' scales, and eigenvalues and eigenvectors of a symmetric matrix over them, which has a unit diagonal."""
     units = np.sqrt(np.abs(np.diag(matrix)))
     units = np.where(units > 0.0, units, 1.0)
-    eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
-    return (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T * np.outer(units, units)
+    scales = np.outer(units, units)
+    eigenvalues, vectors = np.linalg.eigh(matrix / scales)
+    return scales, eigenvalues, vectors

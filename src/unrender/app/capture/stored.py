@@ -82,7 +82,7 @@ class StoredViews:
 
     @property
     def masked(self) -> list[bool]:
-        """Whether each view has a mask."""
+        """True if each view has a mask."""
         return [self._views[index][1] for index in self._indices]
 
     def __len__(self) -> int:

@@ -56,8 +56,8 @@ def thinned(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         stride *= 2
         if stride > records[-1]["step"]:
             return list(records)
-    kept = [r for r in records[:early] if r["step"] % (2 * stride) == 0 or not _REFINEMENTS.isdisjoint(r)]
-    return [*kept, *records[early:]]
+    remaining = [r for r in records[:early] if r["step"] % (2 * stride) == 0 or not _REFINEMENTS.isdisjoint(r)]
+    return [*remaining, *records[early:]]
 
 
 # ---------------------------------------------------------------------- writing
