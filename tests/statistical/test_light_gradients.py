@@ -16,7 +16,7 @@ from tests.render.test_light_poses import LIGHTS, light, motion, scene
 from tiers import quick
 from unrender.estimators.base import as_numpy
 
-KINDS = ("point", "spot", "projector", "directional", "rectangle")
+KINDS = ("point", "spot", "projector", "directional", "rectangle", "envmap", "sunsky")
 DEPTH, LEVEL = 2, 1e-3
 WIDTH = 0.01
 """Half the distance of the differences, in units of the scene, radians, and of the scale as loaded."""
@@ -83,7 +83,7 @@ def compare(kind: str, estimator: Any, runs: int, spp: int = 1024) -> None:
     assert np.abs(z_scores(0.75 * found[:, seen], expected[:, seen])).max() > limit, "a lost quarter went unseen"
 
 
-@pytest.mark.parametrize("kind", quick(KINDS, "point"))
+@pytest.mark.parametrize("kind", quick(KINDS, "point", "envmap"))
 def test_gauss_newton_gradients_are_the_slope_of_the_loss(kind: str) -> None:
     """The widths of its differences are as small as those here: at five times the shift, edges of shadows cross several pixels."""
     compare(kind, ur.GaussNewton(shift=0.01, derivative_spp=256), 16)
