@@ -32,8 +32,17 @@ def words(part: Slice, command: Command, folder: Folder) -> list[str]:
         case "doctor":
             return [sys.executable, "-m", "unrender", "doctor", *arguments]
         case "tests":
-            processes = str(min(8, max(2, (os.cpu_count() or 2) // 4)))
-            own = ["-q", "-n", processes, "-p", "benchmarks.gpu.outcomes", "--outcomes", str(where / "tests.jsonl")]
+            own = [
+                "-q",
+                "-n",
+                "auto",
+                "--dist",
+                "loadfile",
+                "-p",
+                "benchmarks.gpu.outcomes",
+                "--outcomes",
+                str(where / "tests.jsonl"),
+            ]
             return [sys.executable, "-m", "pytest", *own, *arguments]
         case name:
             beside = _relative(where / name)

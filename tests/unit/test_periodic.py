@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from test_large_steps import matrix
 
 import unrender as ur
 from unrender.core import periodic
 from unrender.preconditioners.base import Preconditioner
-from unrender.preconditioners.grid import laplacian
 from unrender.scene.coordinates import Coordinates
 
 HEIGHT, WIDTH = 5, 8
@@ -40,9 +40,7 @@ def test_repeats_on_the_device_as_in_numpy():
 
 def root(strength: float) -> np.ndarray:
     """(I + λ L)^(-1/2) of the grid that is closed along its width."""
-    values, vectors = np.linalg.eigh(
-        np.eye(HEIGHT * WIDTH) + strength * laplacian((HEIGHT, WIDTH), (False, True)).toarray()
-    )
+    values, vectors = np.linalg.eigh(matrix(strength, (HEIGHT, WIDTH), (False, True)).toarray())
     return vectors @ np.diag(values**-0.5) @ vectors.T
 
 

@@ -131,6 +131,7 @@ def run(
     count: int | None = None,
     steps: int | None = None,
     views: int | None = None,
+    texture_resolution: int | None = None,
     only: tuple[str, ...] = (),
     part: tuple[str, ...] = ("race", "cost"),
     rounds: int = 5,
@@ -144,22 +145,21 @@ def run(
         count: pixels a step
         steps: of every run, in place of its seconds, with falling rates
         views: how many, where the problem takes them
+        texture_resolution: texels a side, for GPUs
         only: methods to run and to time; the others' figures stay
         part: measured; the other's figures stay
         rounds: of turns of the cost
         levels: race one level against five, by steps; the rest of the record stays
     """
+    given = {"resolution": resolution, "views": views, "texture_resolution": texture_resolution}
+    given = {key: value for key, value in given.items() if value}
     if levels:
-        size = {**FINE, **({"resolution": resolution} if resolution else {})}
-        yield {"levels": {f"{count or 512} pixels": race_levels(count or 512, steps or 400, seeds, only, size)}}
+        races = race_levels(count or 512, steps or 400, seeds, only, {**FINE, **given})
+        yield {"levels": {f"{count or 512} pixels": races}}
         return
     for task in problem:
         name, options, usual = TASKS[task]
-        options = {
-            **options,
-            **({"resolution": resolution} if resolution else {}),
-            **({"views": views} if views else {}),
-        }
+        options = {**options, **given}
         made, pixel_count, found = ur.gallery.problem(name, **options), count or usual, {}
         chosen = [e for e in entrants(task, pixel_count, steps) if not only or e.name in only]
         label = f"{task}, {steps} steps" if steps else task

@@ -3,50 +3,17 @@
 (L x)_i is the sum of x_i − x_j over the neighbours j of cell i, one on each side along each axis. Beyond a border there is no neighbour
 (zero slope), or with `wrap` the cell at the other end.
 
-Two solvers are used. In two dimensions the sparse Cholesky factor is small. In three dimensions its fill-in grows as n^(4/3): 48³ cells
-take half a minute and 64³ several. There the Laplacian is diagonalised by the cosine transform along axes with borders, and by the
-Fourier transform along axes that wrap.
+The cosine transform diagonalises L along axes with borders, and the Fourier transform along axes that wrap.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    import scipy.sparse
-
 from unrender.core.errors import InputError
-
-
-class Solver(Protocol):
-    """Solver of (I + λ L) y = x on one grid."""
-
-    def solve(self, x: np.ndarray) -> np.ndarray:
-        """Return y with (I + λ L) y = x, for each channel separately. x, y: (*grid, channels), float32."""
-        ...
-
-
-class CholeskySolver:
-    """Solver by a sparse Cholesky factorisation that is computed once. A solve takes time proportional to the factor's entries."""
-
-    def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]):
-        import scipy.sparse
-        from cholespy import CholeskySolverF, MatrixType  # type: ignore  (a compiled module without stubs)
-
-        cells = int(np.prod(grid))
-        matrix = (scipy.sparse.identity(cells) + strength * laplacian(grid, wrap)).tocoo()
-        rows, columns = matrix.row.astype(np.int32), matrix.col.astype(np.int32)
-        entries = matrix.data.astype(np.float64)
-        self._factor = CholeskySolverF(cells, rows, columns, entries, MatrixType.COO)
-
-    def solve(self, x: np.ndarray) -> np.ndarray:
-        right = np.ascontiguousarray(x, np.float32).reshape(-1, x.shape[-1])
-        result = np.empty_like(right)
-        self._factor.solve(right, result)
-        return result.reshape(x.shape)
 
 
 class Transform:
@@ -87,13 +54,18 @@ class Transform:
 
 
 class TransformSolver:
-    """Solver of (I + λ L)^power y = x by the diagonalising transform, in O(n log n) without factorisation."""
+    """Solver of (I + λ L)^power y = x by the diagonalising transform, in O(n log n) without factorisation.
 
-    def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float = 1.0):
+    A sparse Cholesky factor would be as fast on textures of 64² texels and four times slower from 192² on. On grids its fill-in grows
+    as n^(4/3).
+    """
+
+    def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float):
         self._transform = transform(grid, wrap)
         self._gain = ((1.0 + strength * self._transform.eigenvalues) ** -power).astype(np.float32)
 
     def solve(self, x: np.ndarray) -> np.ndarray:
+        """Return y for x, for each channel separately. x, y: (*grid, channels), float32."""
         return self._transform.backward(self._transform.forward(x) * self._gain)
 
 
@@ -104,21 +76,16 @@ def transform(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Transform:
 
 
 @lru_cache(maxsize=16)
-def solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Solver:
-    """Return the cached solver of one system.
+def solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float = 1.0) -> TransformSolver:
+    """Return the cached solver of (I + λ L)^power y = x.
 
     Args:
         strength: λ, >= 0.
         grid: number of cells per axis.
         wrap: per axis, whether its two ends are neighbours.
+        power: exponent, > 0.
     """
-    return (CholeskySolver if len(grid) <= 2 else TransformSolver)(strength, grid, wrap)
-
-
-@lru_cache(maxsize=16)
-def square_root_solver(strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...]) -> Solver:
-    """Return the cached solver of (I + λ L)^(1/2) y = x; arguments as in `solver`."""
-    return TransformSolver(strength, grid, wrap, 0.5)
+    return TransformSolver(strength, grid, wrap, power)
 
 
 def check(owner: str, key: str, shape: tuple[int, ...], wrap: bool | tuple[bool, ...]) -> None:
@@ -152,21 +119,3 @@ def wraps(owner: str, wrap: Any) -> bool | tuple[bool, ...]:
 def per_axis(wrap: bool | tuple[bool, ...], axes: int) -> tuple[bool, ...]:
     """Return `wrap` as one truth value per axis."""
     return wrap if isinstance(wrap, tuple) else (wrap,) * axes
-
-
-def laplacian(grid: tuple[int, ...], wrap: tuple[bool, ...]) -> scipy.sparse.csr_matrix:
-    """Return L as a sparse matrix over the cells in row-major order: symmetric, positive semi-definite, with zero row sums."""
-    import scipy.sparse
-
-    cells = int(np.prod(grid))
-    index = np.arange(cells).reshape(grid)
-    starts, ends = [], []
-    for axis, (size, wraps) in enumerate(zip(grid, wrap, strict=True)):
-        after = np.roll(index, -1, axis)
-        starting = range(size if wraps else size - 1)
-        starts.append(np.take(index, starting, axis).ravel())
-        ends.append(np.take(after, starting, axis).ravel())
-    i, j = np.concatenate(starts), np.concatenate(ends)
-    edges = scipy.sparse.coo_matrix((np.ones(len(i)), (i, j)), (cells, cells))
-    adjacency = edges + edges.T
-    return (scipy.sparse.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()

@@ -82,7 +82,7 @@ class Sobolev:
             return around.apply(x)
         if (pyramid := self._pyramid(shape)) is not None:
             return pyramid.apply(x, self.strength_of(shape), 0.5)
-        solver = grid.square_root_solver(self.strength_of(shape), shape[:-1], self._wraps(shape))
+        solver = grid.solver(self.strength_of(shape), shape[:-1], self._wraps(shape), 0.5)
         return arrays.like(solver.solve(arrays.numpy(x)), x)
 
     def apply_twice(self, x: Array) -> Array:
