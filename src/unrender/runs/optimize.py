@@ -36,7 +36,7 @@ from unrender.runs.number_means import NumberMeans
 from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import MeshRefinement, Refinement
 from unrender.runs.result import Result
-from unrender.runs.run import Run, terminate_if_told, to_numpy
+from unrender.runs.run import Run, raise_termination, to_numpy
 from unrender.runs.verify import Verify
 from unrender.runs.watches import BoundsWatch, InfluenceWatch, MeshWatch
 from unrender.scene import serialization
@@ -135,7 +135,7 @@ def _folder(
     with open_writer(run, run.folder, annotations.method, checkpoint_every, annotations.final_spp) as writer:
         writer.start(run.result())
         yield [writer]
-    terminate_if_told(run)
+    raise_termination(run)
 
 
 @contextmanager

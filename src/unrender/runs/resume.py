@@ -31,7 +31,7 @@ from unrender.runs.metadata import RunAnnotations, describe_run, fingerprint_of,
 from unrender.runs.number_trace import NumberTrace
 from unrender.runs.optimize import check, connected, open_writer
 from unrender.runs.result import NON_FINITE, Result
-from unrender.runs.run import SNAPSHOT_COUNTS, Run, terminate_if_told
+from unrender.runs.run import SNAPSHOT_COUNTS, Run, raise_termination
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.fingerprint import differences, shortened
 from unrender.scene.problem import Problem
@@ -126,7 +126,7 @@ def resume_run(
                 source.passed_over.append(str(error))  # an earlier checkpoint may be usable
         else:
             raise InputError(f"run folder {folder}: no checkpoint can be used")
-    terminate_if_told(run)
+    raise_termination(run)
     return result
 
 

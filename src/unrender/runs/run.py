@@ -273,8 +273,8 @@ def interruptible(run: Run) -> Iterator[None]:
         restore_handlers()
 
 
-def terminate_if_told(run: Run) -> None:
-    """End the process by SIGTERM after a run that it stopped has been saved, if it has no handler."""
+def raise_termination(run: Run) -> None:
+    """End the process by SIGTERM if it stopped the run, which has been saved, and the signal has no handler."""
     if run.stopped == TERMINATED and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.raise_signal(signal.SIGTERM)
 
