@@ -21,7 +21,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
 _LAMPS = ((-2.2, 0.9, 1.2), (2.2, 0.9, 1.2), (0.0, -2.3, 1.2))
-"""Positions, low beside the plaque and in front of it."""
+"""Positions, low at the plaque's side and in front of it."""
 _INTENSITY = 14.0
 _LARGEST = 0.3
 """Largest height above and below the plaque's plane, whose sides are 2 long."""

@@ -15,7 +15,7 @@ from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree
 
-__all__ = ["beside_fields", "fields_of"]
+__all__ = ["add_field_directions", "fields_of"]
 
 _MOST_VALUES = 1 << 25
 """Values of all states of textures and grids up to which they are tested."""
@@ -61,7 +61,7 @@ def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tupl
     return tuple(moved), fixed
 
 
-def beside_fields(
+def add_field_directions(
     numbers: Numbers,
     differences: Differences,
     keys: Sequence[str],
@@ -101,7 +101,7 @@ def beside_fields(
         directions = adjoints.of(targets)
         if index == 0:
             directions = {k: np.concatenate([x, directions[k]]) for k, x in adjoints.scaled().items()}
-        before_these, made = len(made.point), made.beside(directions)
+        before_these, made = len(made.point), made.with_directions(directions)
         columns = np.eye(len(made.point))[:, before_these:]
         first = made.differences(_FIRST * columns, key.fold(3 + 2 * index))
         changes = np.sqrt(np.maximum(*first.squares()) / first.one[0].size)
@@ -177,7 +177,7 @@ def _independent(
     alone = numbers.alone()
     count = sums.shape[1]
     made, one, other = (
-        alone.beside(fields),
+        alone.with_directions(fields),
         *(np.tensordot((sums / longest).T, x, axes=1) for x in (of_fields.one, of_fields.other)),
     )
     own = np.zeros((len(made.point), count))

@@ -21,7 +21,7 @@ from unrender.estimators.base import Estimator
 from unrender.estimators.derivative_images import noise_weights
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.hybrid import HybridGradient, HybridState
-from unrender.runs.field_directions import beside_fields, fields_of
+from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.numbers import Differences, Numbers
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
@@ -100,7 +100,7 @@ class NumbersCheck:
         if not self.fixed:
             return [f"whether {listed(keys)} converged: no time was left to test it; use more seconds or fewer pixels"]
         others = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
-        return [f"standard errors of {listed(keys)}: they are unknown beside {others}"]
+        return [f"standard errors of {listed(keys)}: they are recovered together with {others}"]
 
     def standard_errors(
         self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] = MappingProxyType({})
@@ -139,8 +139,8 @@ def check_numbers(
     below, in each pixel that of a fit without the pixel. It contains the references' noise. If it is large relative to the numbers, the
     references do not determine them. Where the step −(JᵀJ)⁻¹ Jᵀ r is long, the run ended early.
 
-    Textures and grids move along directions that trade off against the numbers, see `beside_fields`. Other unknowns are fixed, and so
-    are those with a prior. Standard errors with fixed unknowns would be too small, so there are none: the numbers are `unchecked`.
+    Textures and grids move along directions that trade off against the numbers, see `add_field_directions`. Other unknowns are fixed, and
+    so are those with a prior. Standard errors with fixed unknowns would be too small, so there are none: the numbers are `unchecked`.
 
     Steps are reported for losses with a linear derivative only: others have their minimum elsewhere. The result is empty if there are
     no numbers (see `Numbers.of`), or if the renderer rejects a value.
@@ -219,7 +219,7 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
     if moved:
         now = time.perf_counter()
         half = now + 0.5 * (until - now) if math.isfinite(until) else until
-        extended = beside_fields(numbers, differences, moved, sensitivities, change, key.fold(_FIELDS), half)
+        extended = add_field_directions(numbers, differences, moved, sensitivities, change, key.fold(_FIELDS), half)
         if extended is None:
             return NumbersCheck(unchecked=numbers.keys)
         numbers, differences, missing = extended

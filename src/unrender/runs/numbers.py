@@ -162,7 +162,7 @@ class Numbers:
         """Return the numbers without directions of other unknowns."""
         return replace(self, fields={}, point=self.point[: self.count], limits=self.limits[: self.count])
 
-    def beside(self, fields: Mapping[str, np.ndarray]) -> Numbers:
+    def with_directions(self, fields: Mapping[str, np.ndarray]) -> Numbers:
         """Return the numbers with directions {key: (k, *shape)} of other unknowns in addition to their own."""
         added = len(next(iter(fields.values())))
         own = {key: np.concatenate([self.fields[key], w]) if key in self.fields else w for key, w in fields.items()}

@@ -35,7 +35,7 @@ from unrender.io import files
 from unrender.runs.budget import few_steps
 from unrender.runs.folder.lock import Lock
 from unrender.runs.folder.schema import DOUBTFUL, ENDED
-from unrender.runs.result import TERMINATED as TOLD_TO_TERMINATE
+from unrender.runs.result import TERMINATED as BY_SIGTERM
 from unrender.scene.problem import Problem
 
 _SHOWN, _SHOWN_LIVE = 10, 5
@@ -229,7 +229,7 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
             console.print(again, markup=False, highlight=False, soft_wrap=True)
         lock.release()
     if not trials.done:
-        raise typer.Exit(TERMINATED if state.stopped == TOLD_TO_TERMINATE else INTERRUPTED)
+        raise typer.Exit(TERMINATED if state.stopped == BY_SIGTERM else INTERRUPTED)
     if state.trials.best is None:
         raise typer.Exit(FAILED)
 

@@ -1,4 +1,4 @@
-"""Numbers beside textures and other unknowns: their standard errors are those of all unknowns, or there are none."""
+"""Numbers with textures and other unknowns: their standard errors are those of all unknowns, or there are none."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ CELLS = _RANDOM.normal(0.0, 1.0, (ROWS, 48)) * (_RANDOM.random((ROWS, 48)) < 0.1
 """Derivatives by a texture of 4 × 4 texels, each of which few pixels see."""
 
 
-def beside_a_texture(shared: float) -> tuple[ur.Problem, np.ndarray]:
-    """Return two numbers beside a texture, and the matrix (ROWS, 2 + 48). The first number changes the picture as a sum of texels does, and
+def with_a_texture(shared: float) -> tuple[ur.Problem, np.ndarray]:
+    """Return two numbers with a texture, and the matrix (ROWS, 2 + 48). The first number changes the picture as a sum of texels does, and
     by √(1 − shared²) in another way."""
     texels = CELLS @ np.random.default_rng(1).uniform(0.5, 1.0, 48)
     other, alone = MATRIX[:, 0], MATRIX[:, 1]
@@ -45,7 +45,7 @@ def at_truth(made: ur.Problem) -> dict[str, np.ndarray]:
     return {key: x.astype(np.float32) for key, x in made.renderer.values(list(made.shapes())).items()}
 
 
-def beside_a_known_texture(
+def with_a_known_texture(
     made: ur.Problem, values: Mapping[str, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> NumbersCheck:
     """Return the planted fault: the check that takes the texture as known and says so of no number."""
@@ -64,25 +64,25 @@ def deviations(made: ur.Problem, matrix: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.9, 0.99])
-def test_standard_errors_beside_a_texture_are_those_of_all_unknowns(shared: float, monkeypatch: pytest.MonkeyPatch):
+def test_standard_errors_with_a_texture_are_those_of_all_unknowns(shared: float, monkeypatch: pytest.MonkeyPatch):
     """Within a third, as the directions of the texture are approximate. With the texture fixed, the first is too small by 1/√(1 − s²)."""
-    made, matrix = beside_a_texture(shared)
+    made, matrix = with_a_texture(shared)
     values = at_truth(made)
     found = check_numbers(made, values, made.initial_values(), FAR, ur.runs.sensitivity(made, values))
     expected = deviations(made, matrix)
     np.testing.assert_allclose([found.errors["a"][0], found.errors["b"][0]], expected, rtol=0.33)
-    fixed = beside_a_known_texture(made, values, monkeypatch)
+    fixed = with_a_known_texture(made, values, monkeypatch)
     if shared >= 0.9:
         assert fixed.errors["a"][0] < 0.6 * expected[0]
 
 
 def test_a_number_that_a_texture_can_replace_is_told_with_it(monkeypatch: pytest.MonkeyPatch):
-    made, _ = beside_a_texture(1.0)
+    made, _ = with_a_texture(1.0)
     values = at_truth(made)
     found = check_numbers(made, values, made.initial_values(), FAR, ur.runs.sensitivity(made, values))
     assert list(found.undetermined) == ["a"]
     assert "together with texture" in found.undetermined["a"]
-    assert not beside_a_known_texture(made, values, monkeypatch).undetermined  # planted
+    assert not with_a_known_texture(made, values, monkeypatch).undetermined  # planted
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -104,9 +104,9 @@ def test_a_factor_of_a_texture_is_told_with_it(monkeypatch: pytest.MonkeyPatch, 
     assert found.errors["scale"][0] <= 2.0 or np.isinf(found.errors["scale"][0])  # beyond its size it has none
 
 
-def test_the_step_of_a_number_beside_a_texture_is_that_of_all_unknowns():
+def test_the_step_of_a_number_with_a_texture_is_that_of_all_unknowns():
     """The texture is still at its start, so the number has gone its way; with the texture fixed, it would stay there."""
-    made, matrix = beside_a_texture(0.9)
+    made, matrix = with_a_texture(0.9)
     start = made.initial_values()
     target = np.asarray(made.views[0].reference, np.float64).reshape(-1) - 2.0 - CELLS @ start["texture"].ravel()
     numbers = np.linalg.lstsq(matrix[:, :2], target, rcond=None)[0].astype(np.float32)
@@ -131,8 +131,8 @@ def assert_no_error_is_stated(made: ur.Problem, found: NumbersCheck, keys: tuple
 
 
 @pytest.mark.parametrize("seconds", [0.3, 1.0])
-def test_numbers_beside_a_texture_that_there_was_no_time_to_move(monkeypatch: pytest.MonkeyPatch, seconds: float):
-    made, _ = beside_a_texture(0.9)
+def test_numbers_with_a_texture_that_there_was_no_time_to_move(monkeypatch: pytest.MonkeyPatch, seconds: float):
+    made, _ = with_a_texture(0.9)
     values, prepare = at_truth(made), _Adjoints.__init__
     sensitivity = ur.runs.sensitivity(made, values)
 
@@ -145,9 +145,9 @@ def test_numbers_beside_a_texture_that_there_was_no_time_to_move(monkeypatch: py
     assert_no_error_is_stated(made, found, ("a", "b"), "whether a, b converged: no time was left")
 
 
-def test_numbers_beside_a_texture_that_there_was_time_to_move_once_only(monkeypatch: pytest.MonkeyPatch):
+def test_numbers_with_a_texture_that_there_was_time_to_move_once_only(monkeypatch: pytest.MonkeyPatch):
     """One round of directions states .57 of the error."""
-    made, _ = beside_a_texture(0.99)
+    made, _ = with_a_texture(0.99)
     values, scaled = at_truth(made), _Adjoints.of
     sensitivity = ur.runs.sensitivity(made, values)
 
@@ -166,8 +166,8 @@ def test_numbers_beside_a_texture_that_there_was_time_to_move_once_only(monkeypa
 
 
 @pytest.mark.parametrize("what", ["prior", "too large", "mesh", "no derivative"])
-def test_numbers_beside_an_unknown_that_the_test_cannot_move(monkeypatch: pytest.MonkeyPatch, what: str):
-    made, _ = beside_a_texture(1.0)
+def test_numbers_with_an_unknown_that_the_test_cannot_move(monkeypatch: pytest.MonkeyPatch, what: str):
+    made, _ = with_a_texture(1.0)
     if what == "prior":
         start = made.initial_values()
         parameters = [ur.Parameter(key, initial=start[key]) for key in ("a", "b")]
@@ -184,7 +184,7 @@ def test_numbers_beside_an_unknown_that_the_test_cannot_move(monkeypatch: pytest
     if what == "no derivative":
         sensitivity = {key: x for key, x in sensitivity.items() if key != "texture"}
     found = check_numbers(made, values, made.initial_values(), FAR, sensitivity)
-    assert_no_error_is_stated(made, found, ("a", "b"), "standard errors of a, b", "beside texture (", what)
+    assert_no_error_is_stated(made, found, ("a", "b"), "standard errors of a, b", "with texture (", what)
     assert not found.undetermined
     if what in ("prior", "too large"):
         stated = ur.runs.uncertainty(made, values)
@@ -194,8 +194,8 @@ def test_numbers_beside_an_unknown_that_the_test_cannot_move(monkeypatch: pytest
         assert [line for line in stated.missing if line not in lines.values()] == found.missing()
 
 
-def test_a_run_folder_states_no_error_of_numbers_beside_a_prior(tmp_path: Any):
-    made, _ = beside_a_texture(0.9)
+def test_a_run_folder_states_no_error_of_numbers_with_a_prior(tmp_path: Any):
+    made, _ = with_a_texture(0.9)
     start = made.initial_values()
     parameters = [ur.Parameter(key, initial=start[key]) for key in ("a", "b")]
     parameters += [ur.Parameter("texture", initial=start["texture"], prior=Prior(smoothness=0.5))]
@@ -206,26 +206,26 @@ def test_a_run_folder_states_no_error_of_numbers_beside_a_prior(tmp_path: Any):
     found = final_images.render_final_images(made, result, 16)
     assert not {"a", "b"} & set(found.standard_error)
     (line,) = [line for line in found.undetermined if line.startswith("standard errors of")]
-    assert line == "standard errors of a, b: they are unknown beside texture (it has a prior)"
+    assert line == "standard errors of a, b: they are recovered together with texture (it has a prior)"
 
 
 def test_a_number_that_is_undetermined_has_one_line():
     check = NumbersCheck(undetermined={"a": "a: open"}, unchecked=("a", "b"), fixed={"texture": "it has a prior"})
     assert check.missing(check.undetermined) == [
-        "standard errors of b: they are unknown beside texture (it has a prior)"
+        "standard errors of b: they are recovered together with texture (it has a prior)"
     ]
     assert not check.missing(check.unchecked)
 
 
-def test_a_number_beside_one_with_a_prior():
-    made, _ = beside_a_texture(0.9)
+def test_a_number_with_one_with_a_prior():
+    made, _ = with_a_texture(0.9)
     start = made.initial_values()
     prior = Prior(near=0.5, std=0.1)
     parameters = [ur.Parameter(key, initial=x, prior=prior if key == "b" else None) for key, x in start.items()]
     made = ur.Problem(made.renderer, parameters, made.views)
     values = at_truth(made)
     found = check_numbers(made, values, start, FAR, ur.runs.sensitivity(made, values))
-    assert_no_error_is_stated(made, found, ("a",), "beside b (it has a prior)")
+    assert_no_error_is_stated(made, found, ("a",), "with b (it has a prior)")
 
 
 def test_an_unknown_that_no_picture_shows_takes_no_error_away():
