@@ -14,10 +14,10 @@ from typing import Any
 import unrender as ur
 from benchmarks.internals import (
     Estimate,
+    FullView,
     Key,
     PlainState,
     Tree,
-    WholeView,
     arrays,
     leave_one_out_groups,
     prepare,
@@ -74,7 +74,7 @@ class DebiasedGradient:
         size = self.spp - self.spp // groups
         gradients, losses, samples = [], [], 0
         for view in range(len(problem.views)):
-            frame, of_view = WholeView(problem, view), key.fold(view)
+            frame, of_view = FullView(problem, view), key.fold(view)
             found, _ = ur.images.Plain().estimate(problem, parameters, state, frame, self.spp, groups, of_view.fold(0))
             more = frame.request(size * self.renders, of_view.fold(1).uint32(), self.renders)
             correction = bias_correction(frame.loss_derivative, session.image(parameters, more).images)

@@ -45,8 +45,8 @@ from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, 
 from unrender.rendering.wrapper import RendererWrapper
 from unrender.runs import loop
 from unrender.runs.budget import Budget
-from unrender.runs.image_sensitivity import hardly_seen
-from unrender.scene.batches import WholeView
+from unrender.runs.image_sensitivity import insensitive
+from unrender.scene.batches import FullView
 from unrender.scene.bounds import project
 from unrender.scene.executor import LOCAL
 from unrender.scene.parameter import ParameterSettings
@@ -107,7 +107,7 @@ def image_step(
     problem: ur.Problem, image: ImageEstimator, parameters: Tree, state: Any, spp: int, key: Key
 ) -> tuple[ImageEstimate, Any]:
     """An estimate of view 0 from an image estimator, and its state at the next step."""
-    estimate, kept = image.estimate(problem, parameters, state, WholeView(problem, 0), spp, 1, key)
+    estimate, kept = image.estimate(problem, parameters, state, FullView(problem, 0), spp, 1, key)
     return estimate, image.advance(parameters, state, (kept,))
 
 

@@ -36,8 +36,8 @@ class Clamped(ImageEstimator):
         estimate, update = self.inner.estimate(problem, parameters, state, frame, spp, groups, key, pair_request)
         return replace(estimate, filter=lambda image: arrays.minimum(image, self.limit)), update
 
-    def needs_whole_views(self, parameters, state, batches):
-        return self.inner.needs_whole_views(parameters, state, batches)
+    def needs_full_views(self, parameters, state, batches):
+        return self.inner.needs_full_views(parameters, state, batches)
 
     def prepare(self, problem, state):
         return self.inner.prepare(problem, state)

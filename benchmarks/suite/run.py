@@ -25,7 +25,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.fixed_point import applies, fixed_point
-from benchmarks.internals import dr, hardly_seen
+from benchmarks.internals import dr, insensitive
 from benchmarks.races import TUNING_SEED, Recorder
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
@@ -50,7 +50,7 @@ def visible(problem: ur.Problem) -> dict[str, np.ndarray]:
     """{key: mask of the elements that the images depend on at the truth}; of numbers, all."""
     found = {}
     for key, value in ur.runs.sensitivity(problem, {**problem.initial_values(), **problem.truth}).items():
-        seen = ~hardly_seen(value)[..., None] if value.ndim > 1 else np.True_
+        seen = ~insensitive(value)[..., None] if value.ndim > 1 else np.True_
         found[key] = np.broadcast_to(seen, value.shape)
     return found
 

@@ -17,7 +17,7 @@ from unrender.estimators.sample_groups import GradientRequest
 from unrender.pixels.base import DrawStatistics, MiniBatch
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder.state import pack, unpack
-from unrender.scene.batches import WholeView
+from unrender.scene.batches import FullView
 from unrender.scene.executor import LOCAL
 from unrender.scene.sample_counts import SampleCounts, SampleShares, rounded
 
@@ -125,13 +125,13 @@ def test_gradients_are_unbiased_whatever_the_numbers(image: Any, monkeypatch: py
 
     limit = stats.norm.isf((1 - (1 - 1e-3) ** (1 / exact.size)) / 2)
     assert worst(160) < limit
-    own = WholeView.loss_derivative
+    own = FullView.loss_derivative
 
-    def equal(frame: WholeView, image: Any) -> Any:
+    def equal(frame: FullView, image: Any) -> Any:
         assert frame.counts is not None
         return own(frame, image) * frame.counts.spread(frame.counts.divisors) / 5
 
-    monkeypatch.setattr(WholeView, "loss_derivative", equal)
+    monkeypatch.setattr(FullView, "loss_derivative", equal)
     assert worst(160) > 1.5 * limit, "weights as with equal numbers went unseen"
 
 

@@ -10,7 +10,7 @@ import unrender as ur
 from unrender.core.random import Key
 from unrender.images.recursive_control_variate import ViewMemory
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.scene.batches import WholeView
+from unrender.scene.batches import FullView
 from unrender.statistics import welford
 
 STEPS, RUNS, NOISE, SPP = 30, 12, 0.5, 2
@@ -64,7 +64,7 @@ def along(move: float) -> tuple[ViewMemory, np.ndarray]:
     state = image.init(asked, asked.initial())
     for step in range(20):
         at = {key: value * (1.0 + move) ** step for key, value in asked.initial().items()}
-        _, kept = image.estimate(asked, at, state, WholeView(asked, 0), SPP, 1, Key(0, step))
+        _, kept = image.estimate(asked, at, state, FullView(asked, 0), SPP, 1, Key(0, step))
         state = image.advance(at, state, (kept,))
     (memory,) = state.views
     return memory, np.asarray(welford.covariance(memory.previous))

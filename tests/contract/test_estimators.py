@@ -25,7 +25,7 @@ from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import SampleRequest
 from unrender.runs.callbacks import Callback
 from unrender.runs.run import Run
-from unrender.scene.batches import WholeView
+from unrender.scene.batches import FullView
 from unrender.scene.bounds import MARGIN
 
 Denoised = ur.images.Denoised
@@ -334,9 +334,9 @@ def test_a_fresh_gradient_follows_the_secant_of_a_loss_that_is_not_linear() -> N
     reference = asked.reference(0)
     residual = np.random.default_rng(0).choice([-0.3, 0.2], size=(1, *reference.shape))
     seen = ImageEstimate(reference + residual, None, fresh=reference + 2 * residual)
-    weights = WholeView(asked, 0).loss_derivative(seen.images)
+    weights = FullView(asked, 0).loss_derivative(seen.images)
     np.testing.assert_allclose(
-        fresh_weights(asked, WholeView(asked, 0), seen, seen.images, weights), 2 * weights, rtol=1e-6
+        fresh_weights(asked, FullView(asked, 0), seen, seen.images, weights), 2 * weights, rtol=1e-6
     )
     assert np.abs(weights).max() == pytest.approx(np.abs(weights).min())
 
@@ -532,7 +532,7 @@ def test_the_control_variate_reduces_the_noise_of_the_image() -> None:
             state, found = image.init(asked, parameters), None
             for step in range(8):
                 parameters = {k: v - 0.02 for k, v in parameters.items()}
-                found, keep = image.estimate(asked, parameters, state, WholeView(asked, 0), 2, 2, Key(seed, step))
+                found, keep = image.estimate(asked, parameters, state, FullView(asked, 0), 2, 2, Key(seed, step))
                 state = image.advance(parameters, state, (keep,))
             assert found is not None
             squares.append(np.mean((found.mean() - exact.exact(parameters)) ** 2))

@@ -18,7 +18,7 @@ from unrender.pixels import tiles as cells_module
 from unrender.pixels.map_denoising import denoise_side_by_side
 from unrender.pixels.tiles import Grid, InverseCdfTable, Tiles, cut
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.scene.batches import PixelBatch, PixelSample, WholeView
+from unrender.scene.batches import FullView, PixelBatch, PixelSample
 from unrender.scene.references import References
 
 SCHEMES: dict[str, Any] = {
@@ -216,7 +216,7 @@ def test_a_batch_of_all_pixels_is_the_whole_problem() -> None:
         np.repeat([0, 1], 16).astype(np.uint32), np.tile(np.arange(16), 2).astype(np.uint32), np.ones((32, 1))
     )
     batch = PixelBatch(asked, draw)
-    views = [WholeView(asked, 0), WholeView(asked, 1)]
+    views = [FullView(asked, 0), FullView(asked, 1)]
     assert batch.loss_value(flat) == pytest.approx(sum(view.loss_value(image) for view in views))
     whole = np.concatenate([view.loss_derivative(image).reshape(-1, 3) for view in views])
     np.testing.assert_allclose(batch.loss_derivative(flat), whole)
@@ -512,7 +512,7 @@ def test_a_snapshot_remembers_what_mini_batches_render_of_its_state(planted: boo
     drawn = PixelSample(np.zeros(40, np.uint32), rows.astype(np.uint32), np.ones((40, 1)))
     found: dict[bool, list[np.ndarray]] = {False: [], True: []}
     for seed in range(400):
-        _, kept = image.estimate(asked, start, image.init(asked, start), WholeView(asked, 0), 2, 2, Key(seed))
+        _, kept = image.estimate(asked, start, image.init(asked, start), FullView(asked, 0), 2, 2, Key(seed))
         state = image.prepare(asked, image.advance(start, image.init(asked, start), (kept,)))
         at = start if not planted else moved
         state = dataclasses.replace(state, parameters=at)

@@ -13,7 +13,7 @@ from unrender.core.random import Key
 from unrender.images import denoising
 from unrender.images.base import PairRequest
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.scene.batches import WholeView
+from unrender.scene.batches import FullView
 
 Denoised, Plain, CV = ur.images.Denoised, ur.images.Plain, ur.images.RecursiveControlVariate
 OIDN = pytest.param(
@@ -48,7 +48,7 @@ def test_the_image_is_nearer_the_truth_and_biased(by: Any) -> None:
         state = image.init(asked, asked.initial())
         return np.stack(
             [
-                image.estimate(asked, asked.initial(), state, WholeView(asked, 0), 2, 2, Key(s))[0].mean()
+                image.estimate(asked, asked.initial(), state, FullView(asked, 0), 2, 2, Key(s))[0].mean()
                 for s in range(40)
             ]
         )
@@ -69,7 +69,7 @@ def test_no_group_is_weighted_by_an_image_that_knows_it(inner: Any, groups: int)
     image = Denoised(inner, by="variation", groups=3)
     state = image.init(asked, asked.initial())
     for step in range(3):
-        found, kept = image.estimate(asked, asked.initial(), state, WholeView(asked, 0), 6, groups, Key(0, step))
+        found, kept = image.estimate(asked, asked.initial(), state, FullView(asked, 0), 6, groups, Key(0, step))
         state = image.advance(asked.initial(), state, (kept,))
     assert found.images.shape[0] == found.paths.groups == groups
     others = found.others()
@@ -93,7 +93,7 @@ def test_samples_form_few_groups(most: int, asked: int, got: int) -> None:
     problem_ = problem()
     image = Denoised(by="variation", groups=most)
     state = image.init(problem_, problem_.initial())
-    found, _ = image.estimate(problem_, problem_.initial(), state, WholeView(problem_, 0), asked, asked, Key(0))
+    found, _ = image.estimate(problem_, problem_.initial(), state, FullView(problem_, 0), asked, asked, Key(0))
     assert found.images.shape[0] == got
 
 
@@ -102,7 +102,7 @@ def test_the_previous_state_is_denoised_alike() -> None:
     image = Denoised(by="variation")
     pair_request = PairRequest(asked.initial(), "path")
     found, _ = image.estimate(
-        asked, asked.initial(), image.init(asked, asked.initial()), WholeView(asked, 0), 4, 4, Key(0), pair_request
+        asked, asked.initial(), image.init(asked, asked.initial()), FullView(asked, 0), 4, 4, Key(0), pair_request
     )
     np.testing.assert_array_equal(found.previous_others(), found.others())
 
@@ -128,7 +128,7 @@ def test_what_is_not_finite_is_seen() -> None:
     asked = problem()
     image = Denoised(by="variation")
     found, _ = image.estimate(
-        asked, asked.initial(), image.init(asked, asked.initial()), WholeView(asked, 0), 2, 2, Key(0)
+        asked, asked.initial(), image.init(asked, asked.initial()), FullView(asked, 0), 2, 2, Key(0)
     )
     found.images[0, 3, 3] = np.nan
     assert np.isnan(found.mean()).any()

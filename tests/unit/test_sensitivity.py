@@ -11,7 +11,7 @@ import unrender as ur
 from unrender.core.errors import InputError
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import image_sensitivity as module
-from unrender.runs.image_sensitivity import hardly_seen, sensitivity
+from unrender.runs.image_sensitivity import insensitive, sensitivity
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
@@ -63,8 +63,8 @@ def test_cells_that_no_pixel_sees_are_hardly_seen():
     found[8, 5] = 0.0
     expected = np.zeros((12, 9), bool)
     expected[:3] = True
-    np.testing.assert_array_equal(hardly_seen(found), expected)
-    assert hardly_seen(np.zeros((2, 2, 3))).all()
+    np.testing.assert_array_equal(insensitive(found), expected)
+    assert insensitive(np.zeros((2, 2, 3))).all()
 
 
 def test_time_ends_it_after_one_probe(monkeypatch: pytest.MonkeyPatch):

@@ -358,4 +358,4 @@ class MetaEstimator:
 
     def _renders_full_views(self, parameters: Tree, state: MetaState) -> bool:
         """Return whether a step renders full views: always without mini-batches, else if the image estimator requires it."""
-        return not draws_pixels(self.pixels) or self.image.needs_whole_views(parameters, state.image, state.batches)
+        return not draws_pixels(self.pixels) or self.image.needs_full_views(parameters, state.image, state.batches)

@@ -176,7 +176,7 @@ class PathGradient:
         problem = self._rendered(problem)
         batch, pixels = MiniBatch(None), state.pixels
         has_batches = draws_pixels(self.pixels)
-        if not has_batches or not self.image.needs_whole_views(parameters, state.image, state.batches):
+        if not has_batches or not self.image.needs_full_views(parameters, state.image, state.batches):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
         emitters, emitter_request = state.emitters, None
         if emitters is not None:

@@ -24,7 +24,7 @@ from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
 from unrender.rendering.renderer import EmitterMoments, RenderSession, SampleRequest
-from unrender.scene.batches import Frame, PixelBatch, PixelSample, WholeView, whole_views
+from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample, full_views
 from unrender.scene.problem import Problem
 from unrender.scene.sample_counts import SampleCounts
 
@@ -117,7 +117,7 @@ class GradientRequest:
         sample, shares = (self.batch.sample, self.batch.shares) if self.batch else (None, None)
         likely = None if self.emitters is None else self.emitters.probabilities
         frames: Sequence[Frame] = [PixelBatch(problem, sample, likely)] if sample is not None else ()
-        return GatheredFrames(self, frames or whole_views(problem, shares, self.spp, likely))
+        return GatheredFrames(self, frames or full_views(problem, shares, self.spp, likely))
 
     def estimate_frame(self, problem: Problem, frame: Frame, key: Key) -> FrameGradient:
         """Return the contribution of one frame, computed in this process. `key` is the random key of the frame."""
@@ -134,7 +134,7 @@ class GradientRequest:
         mean = image_estimate.mean()
         loss = frame.loss_value(mean)
         paths, traced = image_estimate.paths, spp
-        counts = frame.counts if isinstance(frame, WholeView) else None
+        counts = frame.counts if isinstance(frame, FullView) else None
         if groups == 1 and counts is None:
             samples = frame.request(adjoint_spp or spp, key.fold(1).uint32())
             paths = _paths(session, parameters, samples, on_images)
@@ -202,7 +202,7 @@ class GatheredFrames:
         )
         images: dict[int, Array] = {}
         for frame, part in zip(self.frames, parts, strict=True):
-            if isinstance(frame, WholeView):
+            if isinstance(frame, FullView):
                 images[frame.view] = part.image
                 for name, value in part.info.items():
                     info.setdefault(name, {})[frame.view] = value
@@ -319,7 +319,7 @@ def _derivative(problem: Problem, frame: Frame, variance: Array | None, toleranc
     if variance is None or not tolerance or loss.linear or not loss.pixelwise:
         return frame.loss_derivative
     match frame:
-        case WholeView():
+        case FullView():
             around, reference = (frame.expand(x) for x in (smoothed_variance(variance), problem.reference(frame.view)))
         case PixelBatch(complete_views=complete) if complete:
             around, reference = _variance_by_views(variance, complete), frame.targets[0]
@@ -348,7 +348,7 @@ def fresh_weights(problem: Problem, frame: Frame, image: ImageEstimate, others: 
         weights: loss derivative at these; it must be damped (`tolerance`) if it is not linear, since the secant would be unbounded.
     """
     fresh = image.fresh_others()
-    if problem.loss.linear or not isinstance(frame, WholeView):
+    if problem.loss.linear or not isinstance(frame, FullView):
         return frame.loss_derivative(fresh)
     reference = frame.expand(problem.reference(frame.view))
     residual = others - reference

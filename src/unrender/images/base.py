@@ -150,7 +150,7 @@ class ImageEstimator(Protocol):
         parameters."""
         ...
 
-    def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:
+    def needs_full_views(self, parameters: Tree, state: Any, batches: int) -> bool:
         """Return whether the next step must render full views, after `batches` steps with mini-batches since the last full one."""
         ...
 

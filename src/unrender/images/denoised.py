@@ -85,7 +85,7 @@ class Denoised:
         )
         return replace(estimate, filter=self._filter(problem), variance=None), contribution
 
-    def needs_whole_views(self, parameters: Tree, state: Any, batches: int) -> bool:
+    def needs_full_views(self, parameters: Tree, state: Any, batches: int) -> bool:
         """Return True."""
         del parameters, state, batches
         return True

@@ -10,7 +10,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
 from unrender.rendering.renderer import Space
-from unrender.scene.batches import Frame, PixelSample, WholeView
+from unrender.scene.batches import Frame, FullView, PixelSample
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
@@ -63,11 +63,11 @@ class Plain:
             session = problem.renderer.prepare(list(parameters), pair_request.space)
             request = replace(request, both_gradients=pair_request.difference_spp is None)
             rendering = session.image_pair(parameters, pair_request.previous, request, pair_request.space)
-        counts = frame.counts if isinstance(frame, WholeView) else None
+        counts = frame.counts if isinstance(frame, FullView) else None
         variance = variance_of_mean(rendering.images, counts)
         return ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance, counts=counts), None
 
-    def needs_whole_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
+    def needs_full_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
         """Return False."""
         del parameters, state, batches
         return False

@@ -20,7 +20,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
 from unrender.rendering.renderer import Rendering, Space
-from unrender.scene.batches import Frame, PixelBatch, PixelSample, WholeView
+from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample
 from unrender.scene.problem import Problem
 from unrender.scene.sample_counts import SampleCounts
 from unrender.scene.upsampling import Upsampler
@@ -157,7 +157,7 @@ class RecursiveControlVariate:
         """True, with a snapshot as control variate."""
         return True
 
-    def needs_whole_views(self, parameters: Tree, state: RecursiveControlVariateState, batches: int) -> bool:
+    def needs_full_views(self, parameters: Tree, state: RecursiveControlVariateState, batches: int) -> bool:
         """Return True at the first step, after a change of shapes, and after `whole_views` mini-batches."""
         return batches >= self.whole_views or self._is_first(parameters, state)
 
@@ -251,7 +251,7 @@ class RecursiveControlVariate:
                     raise InputError("RecursiveControlVariate: a pixel mini-batch needs an earlier step of full views")
                 contribution = arrays.mean_over_first(rendering.previous)
                 return self._combine_pixels(problem, state.snapshot, frame, rendering, requested), contribution
-            case WholeView():
+            case FullView():
                 if first:
                     images, previous_images, counts = rendering.images, rendering.previous, frame.counts
                     variance = variance_of_mean(images, counts)
@@ -278,7 +278,7 @@ class RecursiveControlVariate:
         return ImageEstimate(current, requested.paths, previous=previous, variance=variance)
 
     def _combine_view(
-        self, memory: ViewMemory, rendering: Rendering, requested: Rendering, frame: WholeView
+        self, memory: ViewMemory, rendering: Rendering, requested: Rendering, frame: FullView
     ) -> tuple[ImageEstimate, ViewMemory]:
         """Return both images of a view, (groups, H, W, 3) or samples (1, N, 3), and the next memory; `requested` renders the previous
         one."""

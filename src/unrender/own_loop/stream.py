@@ -17,7 +17,7 @@ from unrender.estimators.sample_groups import PIXELS
 from unrender.own_loop.options import Options
 from unrender.pixels.base import MiniBatch
 from unrender.rendering.renderer import RenderSession, SampleRequest, Space
-from unrender.scene.batches import Frame, PixelBatch, whole_views
+from unrender.scene.batches import Frame, PixelBatch, full_views
 from unrender.scene.problem import Problem
 from unrender.statistics import meta
 
@@ -179,9 +179,9 @@ class Stream:
         """
         options, state, problem = self._options, self.state, self.problem
         batch, pixels = MiniBatch(None), state.pixels
-        if not options.all_pixels and not options.image.needs_whole_views(parameters, state.image, state.batches):
+        if not options.all_pixels and not options.image.needs_full_views(parameters, state.image, state.batches):
             batch, pixels = options.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
-        frames = whole_views(problem) if batch.sample is None else [PixelBatch(problem, batch.sample)]
+        frames = full_views(problem) if batch.sample is None else [PixelBatch(problem, batch.sample)]
         records, images, contributions = [], [], []
         for index, frame in enumerate(frames):
             frame_key = key.fold(index)

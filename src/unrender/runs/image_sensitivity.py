@@ -25,7 +25,7 @@ FEWEST_PROBES = 8
 """Fewest probes from which the curvature and the overlap are known."""
 _KEPT = 1 << 25
 """Numbers of the probes' projections that are kept for the overlap."""
-_HARDLY = 0.05
+_INSENSITIVE = 0.05
 """Sensitivity relative to the median below which an element hardly affects the images."""
 
 
@@ -194,7 +194,7 @@ def neighbour_means(cells: np.ndarray) -> np.ndarray:
     return uniform_filter(cells, 3, mode="nearest")
 
 
-def hardly_seen(values: np.ndarray) -> np.ndarray:
+def insensitive(values: np.ndarray) -> np.ndarray:
     """Return a mask of the cells of a texture or grid whose smoothed sensitivity is below a twentieth of the median of the non-zero ones.
 
     Args:
@@ -205,7 +205,7 @@ def hardly_seen(values: np.ndarray) -> np.ndarray:
     """
     smoothed = around(values)
     return (
-        smoothed <= _HARDLY * np.median(smoothed[smoothed > 0])
+        smoothed <= _INSENSITIVE * np.median(smoothed[smoothed > 0])
         if (smoothed > 0).any()
         else np.ones(smoothed.shape, bool)
     )
@@ -217,7 +217,7 @@ def seen_cells(values: np.ndarray) -> np.ndarray | None:
     Args:
         values: result of `sensitivity`, (..., channels).
     """
-    return ~hardly_seen(values) if values.ndim >= MAP_AXES and values.size else None
+    return ~insensitive(values) if values.ndim >= MAP_AXES and values.size else None
 
 
 def adjoint_spp(problem: Problem) -> int:

@@ -22,7 +22,7 @@ _FURTHER, _FURTHER_EARLY = 1.1, 1.5
 """Ratio of a parameter's last error to its first from which a warning is given; the second one for runs of few steps."""
 _ERRORS = 2.0
 """Number of standard errors of a parameter that its last error must exceed in addition to its first error."""
-_HARDLY = 0.05
+_INSENSITIVE = 0.05
 """Fraction of the median of the seen cells below which a cell is hardly seen."""
 _PROBES, _SECONDS_SHARE = 8, 0.02
 """Probes of the sensitivity; fraction of the run's time after which no further one is started."""
@@ -94,7 +94,7 @@ def _seen(sensitivity: np.ndarray) -> np.ndarray | None:
     if where is None:
         return None
     own = np.sqrt(np.mean(np.square(sensitivity, dtype=np.float64), axis=-1))
-    return where & (own > _HARDLY * np.median(own[where])) if where.any() else where
+    return where & (own > _INSENSITIVE * np.median(own[where])) if where.any() else where
 
 
 def _noise(problem: Problem, key: str, sensitivity: np.ndarray, where: np.ndarray | None, residual: float) -> float:

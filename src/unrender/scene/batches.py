@@ -57,7 +57,7 @@ class Frame(Protocol):
 
 
 @dataclass(frozen=True)
-class WholeView:
+class FullView:
     """All pixels of one view, with images (H, W, 3).
 
     With `counts`, pixels have different numbers of samples. Images and loss derivatives then have one entry per sample, (1, N, 3), in a
@@ -146,10 +146,10 @@ class PixelBatch:
         return self.problem.loss.derivative(image, reference) * (factor * self.sample.weights)
 
 
-def whole_views(
+def full_views(
     problem: Problem, shares: SampleShares | None = None, spp: int = 1, emitters: np.ndarray | None = None
 ) -> list[Frame]:
     """Return one frame per view. With `shares`, pixels have different numbers of samples, `spp` on average."""
     views, array = range(len(problem.views)), problem.renderer.array
     counts = [None if shares is None else shares.counts(view, spp, array) for view in views]
-    return [WholeView(problem, view, counts[view], emitters) for view in views]
+    return [FullView(problem, view, counts[view], emitters) for view in views]

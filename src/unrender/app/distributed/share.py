@@ -19,7 +19,7 @@ from unrender.images.recursive_control_variate import RecursiveControlVariateSta
 from unrender.pixels.base import MiniBatch
 from unrender.pixels.pixel_statistics import PilotRequest
 from unrender.runs.folder.state import Packed, pack, unpack
-from unrender.scene.batches import Frame, PixelBatch, PixelSample, WholeView
+from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample
 from unrender.scene.problem import Problem
 
 
@@ -50,7 +50,7 @@ class ViewShare:
         if call.replay:
             self._remember(call, self._replayed(call, request))
             return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started)
-        frames: list[tuple[int, Frame]] = self._whole_views()
+        frames: list[tuple[int, Frame]] = self._full_views()
         if call.batch is not None:
             sample = self._sample(call.batch)
             frames = [(-1, PixelBatch(self.problem, sample))]
@@ -133,8 +133,8 @@ class ViewShare:
     def _pair_request(self, pair: Pair) -> PairRequest:
         return PairRequest(self._tree(pair.previous), pair.space, pair.step, difference_spp=pair.difference_spp)
 
-    def _whole_views(self) -> list[tuple[int, Frame]]:
-        return [(index, WholeView(self.problem, local)) for local, index in enumerate(self.views)]
+    def _full_views(self) -> list[tuple[int, Frame]]:
+        return [(index, FullView(self.problem, local)) for local, index in enumerate(self.views)]
 
     def _sample(self, batch: Batch) -> PixelSample:
         like = self.problem.renderer.array(batch.weights[:, None])
@@ -165,7 +165,7 @@ class ViewShare:
                 call.key.fold(index).fold(0),
                 request.pair_request,
             )[1]
-            for index, frame in self._whole_views()
+            for index, frame in self._full_views()
         )
         arrays.evaluate(memory)
         return memory

@@ -13,7 +13,7 @@ from unrender.core import periodic
 from unrender.display import formatting, pictures
 from unrender.display.pictures import is_map
 from unrender.runs.folder.reader import RunFolder, ViewPictures
-from unrender.runs.image_sensitivity import around, hardly_seen
+from unrender.runs.image_sensitivity import around, insensitive
 
 __all__ = [
     "ColourScale",
@@ -295,7 +295,7 @@ def _sensitivity(encoder: PictureEncoder, sensitivity: np.ndarray, greatest: flo
     bar = tone_mapping.colour_bar(
         _TENS, 0.0, tone_mapping.VALUE_COLORMAP, "Change of the images, log₁₀ of the greatest"
     )
-    note = f"{hardly_seen(sensitivity).mean():.0%} of the texels hardly change the images"
+    note = f"{insensitive(sensitivity).mean():.0%} of the texels hardly change the images"
     return Figure(encoder.false_colour(tens, _TENS, 0.0, tone_mapping.VALUE_COLORMAP, alt), "Sensitivity", note, bar)
 
 
