@@ -349,13 +349,13 @@ def test_cores_are_shared_by_as_many_workers_as_there_are_views(monkeypatch: pyt
 def test_what_does_not_fit_a_worker_is_refused_with_what_would() -> None:
     problem = analytic.problem(views=4)
     shares = ((0, 1), (2, 3))
-    parameters, images = assignment.needed(problem, (0, 1), remembers=True)
+    parameters, images = assignment.needed(problem, (0, 1), has_memory=True)
     room = sum(parameters.values()) + images
-    assignment.check(problem, shares, [("a", room), ("b", 0)], remembers=True)
+    assignment.check(problem, shares, [("a", room), ("b", 0)], has_memory=True)
     with pytest.raises(ur.InputError, match=r"but b has .* 1 would fit: use at least 4 workers"):
-        assignment.check(problem, shares, [("a", room), ("b", room - 1)], remembers=True)
+        assignment.check(problem, shares, [("a", room), ("b", room - 1)], has_memory=True)
     with pytest.raises(ur.InputError, match=r"parameter map \(2 × 2 × 1\) is .*, but a has .*would fit"):
-        assignment.check(problem, shares, [("a", 100), ("b", 100)], remembers=False)
+        assignment.check(problem, shares, [("a", 100), ("b", 100)], has_memory=False)
 
 
 def test_a_grid_that_fits_no_worker_is_refused_with_the_grid_that_would() -> None:
@@ -368,11 +368,11 @@ def test_a_grid_that_fits_no_worker_is_refused_with_the_grid_that_would() -> Non
 
     room = [("a", 10**9), ("b", 10**9)]
     with pytest.raises(ur.InputError) as refused:
-        assignment.check(problem(512, 512, 512, 1), ((0,), (1,)), room, remembers=False)
+        assignment.check(problem(512, 512, 512, 1), ((0,), (1,)), room, has_memory=False)
     assert "parameter smoke.sigma_t.data (512 × 512 × 512 × 1) is 4.29 GB in each worker" in str(refused.value)
     told = re.search(r"but a has 1 GB for it: \((\d+) × (\d+) × (\d+) × 1\) would fit$", str(refused.value))
     assert told is not None
     largest = [int(n) for n in told.groups()]
-    assignment.check(problem(*largest, 1), ((0,), (1,)), room, remembers=False)
+    assignment.check(problem(*largest, 1), ((0,), (1,)), room, has_memory=False)
     with pytest.raises(ur.InputError, match="would fit"):
-        assignment.check(problem(*(n + 1 for n in largest), 1), ((0,), (1,)), room, remembers=False)
+        assignment.check(problem(*(n + 1 for n in largest), 1), ((0,), (1,)), room, has_memory=False)

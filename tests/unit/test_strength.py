@@ -133,7 +133,7 @@ def test_noise_that_gradients_agree_on_is_no_detail(monkeypatch: pytest.MonkeyPa
     assert [fit.share for fit in watched(0.0, 1.0)] == [1.0] * 3
     assert [fit.share for fit in watched(0.7, 1.0)] == [1.0] * 3, "two thirds of it are noise remembered"
     monkeypatch.setattr(fitted_sobolev, "_CONFIRMED", 0.1)
-    monkeypatch.setattr(fitted_sobolev, "_KEPT", 0.1)
+    monkeypatch.setattr(fitted_sobolev, "_REVERTED", 0.1)
     assert watched(0.7, 1.0)[-1].share < 0.1, "without the share that has to be confirmed"
 
 

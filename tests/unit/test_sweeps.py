@@ -131,11 +131,11 @@ def outcome(started: Started) -> RunOutcome:
 
 def carry_out(trials: Trials, workers: int, order: random.Random) -> list[tuple]:
     """As if `workers` finished in a random order; a trial in seven fails."""
-    under_way: list[Started] = []
+    running: list[Started] = []
     while not trials.done:
-        while len(under_way) < workers and (started := trials.next()) is not None:
-            under_way.append(started)
-        one = under_way.pop(order.randrange(len(under_way)))
+        while len(running) < workers and (started := trials.next()) is not None:
+            running.append(started)
+        one = running.pop(order.randrange(len(running)))
         message = "lost" if one.number % 7 == 3 else ""
         runs = [] if message else [outcome(one)]
         trials.end(trial_record(one.number, one.settings, runs, message=message))

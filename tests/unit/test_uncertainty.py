@@ -246,7 +246,7 @@ def test_too_few_probes_or_samples_give_no_map() -> None:
 def test_an_overlap_that_is_not_measured_gives_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """The projections of one probe alone fit into memory. The planted fault is an overlap of 1."""
     made = problem()
-    monkeypatch.setattr(image_sensitivity, "_KEPT", 3 * TEXELS**2)
+    monkeypatch.setattr(image_sensitivity, "_PROJECTIONS", 3 * TEXELS**2)
     assert np.isinf(curvature(made).overlap["wall"])
     found = uncertainty(made, estimate(made))
     assert not found.standard_error

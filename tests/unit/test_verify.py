@@ -443,8 +443,8 @@ def test_light_that_no_unknown_explains_is_told_in_short_runs(steps: int) -> Non
 @pytest.mark.parametrize(
     ("steps", "count"), [(10, 2), *(pytest.param(n, 20, marks=pytest.mark.slow) for n in (10, 24, 48))]
 )
-def test_short_runs_that_converge_or_are_under_way_have_nothing_unexplained(steps: int, count: int) -> None:
-    """Gauss-Newton steps arrive, and those of Adam are under way, also with references whose noise is a tenth of the picture."""
+def test_short_runs_that_converge_or_are_incomplete_have_nothing_unexplained(steps: int, count: int) -> None:
+    """Gauss-Newton steps arrive, and those of Adam are incomplete, also with references whose noise is a tenth of the picture."""
     for seed in range(count):
         problem = smooth(0.0, seed)
         if seed % 2:

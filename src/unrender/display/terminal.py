@@ -15,7 +15,7 @@ from unrender.core.text import visible
 
 __all__ = ["Console", "Group", "Renderable", "echo"]
 
-_KEPT = "\n\t"
+_UNESCAPED = "\n\t"
 
 
 class Console(console.Console):
@@ -33,9 +33,9 @@ class Console(console.Console):
             if segment.control or segment.text.isprintable():
                 yield segment
             else:
-                yield Segment(visible(segment.text, _KEPT), segment.style)
+                yield Segment(visible(segment.text, _UNESCAPED), segment.style)
 
 
 def echo(text: Any) -> None:
     """Print text to standard output, without markup and with control characters escaped."""
-    typer.echo(visible(str(text), _KEPT))
+    typer.echo(visible(str(text), _UNESCAPED))

@@ -33,7 +33,7 @@ LARGEST_ARRAY = 1 << 30
 """Largest array of a run folder in bytes, unpacked."""
 LARGEST_ARCHIVE = 8 << 30
 """Largest total of the arrays of a run folder's archive in bytes, unpacked."""
-LARGEST_GIVEN = 1 << 32
+LARGEST_INPUT = 1 << 32
 """Largest total of the arrays of a problem's input file in bytes."""
 DEEPEST = 32
 """Largest nesting depth of JSON."""
@@ -242,7 +242,7 @@ def read_float_arrays(path: Path, folder: Path) -> dict[str, np.ndarray]:
 
 def read_arrays(
     path: Path,
-    most_bytes: int = LARGEST_GIVEN,
+    most_bytes: int = LARGEST_INPUT,
     check: Callable[[Shape], None] | None = None,
     one: bool = False,
     folder: Path | None = None,
@@ -298,7 +298,7 @@ def read_arrays(
         raise InputError(f"{path}:{field} not an .npz archive that can be read ({_reason(error)})") from error
 
 
-def read_array(path: Path, most_bytes: int = LARGEST_GIVEN, check: Callable[[Shape], None] | None = None) -> np.ndarray:
+def read_array(path: Path, most_bytes: int = LARGEST_INPUT, check: Callable[[Shape], None] | None = None) -> np.ndarray:
     """Read the array of real numbers of an .npy file; see `read_arrays`."""
     try:
         with open_regular(path) as file:

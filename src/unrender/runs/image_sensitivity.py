@@ -23,8 +23,8 @@ MAP_AXES = 3
 """Number of axes from which a parameter is a texture or grid."""
 FEWEST_PROBES = 8
 """Fewest probes from which the curvature and the overlap are known."""
-_KEPT = 1 << 25
-"""Numbers of the probes' projections that are kept for the overlap."""
+_PROJECTIONS = 1 << 25
+"""Numbers of the probes' projections that are stored for the overlap."""
 _INSENSITIVE = 0.05
 """Sensitivity relative to the median below which an element hardly affects the images."""
 
@@ -115,8 +115,8 @@ def curvature(
     squares = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
     noisy = {key: np.zeros_like(square) for key, square in squares.items()} if noise else {}
     maps = [key for key, square in squares.items() if square.ndim >= MAP_AXES]
-    kept: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {key: [] for key in maps}
-    most = min(_PROBES, _KEPT // max(1, sum(squares[key].size for key in maps)))
+    stored: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {key: [] for key in maps}
+    most = min(_PROBES, _PROJECTIONS // max(1, sum(squares[key].size for key in maps)))
     made, until = 0, time.perf_counter() + seconds
     while made == 0 or (made < probes and time.perf_counter() < until):
         one, other = (
@@ -127,10 +127,10 @@ def curvature(
             square += one[key][0] * other[key][0]
             if key in noisy:
                 noisy[key] += one[key][1] * other[key][1]
-            if key in kept and made < most:
-                kept[key].append((one[key][0].astype(np.float32), other[key][0].astype(np.float32)))
+            if key in stored and made < most:
+                stored[key].append((one[key][0].astype(np.float32), other[key][0].astype(np.float32)))
         made += 1
-    overlap = {key: _overlap(squares[key] / made, made, of) for key, of in kept.items()}
+    overlap = {key: _overlap(squares[key] / made, made, of) for key, of in stored.items()}
     means, variances = (
         {
             key: periodic.repeat(np.maximum(x / made, 0.0), problem.unknowns[key].measure.repeated)
@@ -141,14 +141,16 @@ def curvature(
     return Curvature(means, overlap, made, variances)
 
 
-def _overlap(squares: np.ndarray, probes: int, kept: list[tuple[np.ndarray, np.ndarray]]) -> float:
+def _overlap(squares: np.ndarray, probes: int, stored: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """Return Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii² from diagonal elements, whose noise it removes, and the projections of probes.
 
     It is infinite for too few projections, or without a curvature.
     """
-    if len(kept) < FEWEST_PROBES:
+    if len(stored) < FEWEST_PROBES:
         return np.inf
-    pairs = [float(np.vdot(a[0], b[0])) * float(np.vdot(a[1], b[1])) for n, a in enumerate(kept) for b in kept[n + 1 :]]
+    pairs = [
+        float(np.vdot(a[0], b[0])) * float(np.vdot(a[1], b[1])) for n, a in enumerate(stored) for b in stored[n + 1 :]
+    ]
     diagonal = float(np.sum(np.square(squares))) / (1.0 + 2.0 / probes)
     return max(1.0, sum(pairs) / len(pairs) / diagonal) if diagonal > 0.0 else np.inf
 

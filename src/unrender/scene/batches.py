@@ -118,16 +118,16 @@ class PixelBatch:
     def complete_views(self) -> tuple[tuple[slice, tuple[int, int]], ...]:
         """Slice and (height, width) of each view whose pixels are all in this batch, in order, as `pixels.Views` selects them."""
         views, pixels = (arrays.numpy(x).astype(np.int64) for x in (self.sample.views, self.sample.pixels))
-        sizes, views_found, start = self.problem.sizes, [], 0
+        sizes, complete, start = self.problem.sizes, [], 0
         while start < len(views):
             height, width = sizes[views[start]]
             stop = start + height * width
             same = views[start:stop] == views[start]
             if len(same) < height * width or not same.all() or not (np.diff(pixels[start:stop]) == 1).all():
                 break
-            views_found.append((slice(start, stop), (height, width)))
+            complete.append((slice(start, stop), (height, width)))
             start = stop
-        return tuple(views_found)
+        return tuple(complete)
 
     def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
         sensors = [view.sensor for view in self.problem.views]

@@ -56,7 +56,7 @@ _SETTINGS = {"scheme": "uniform", "pixels": _PIXELS, "spp": 4, "beta_2": 0.99, "
 """Settings of the stages: mini-batches of pixels of all photographs, and decaying rates, since the noise does not decrease. A path is
 weighted by the residual of the pixel's three other samples; with fewer samples, noise would dominate this residual."""
 _LIGHT_SIZE = 16, 32
-_WHOLE = 0.999
+_INSIDE = 0.999
 
 
 def cube_of(cameras: np.ndarray) -> tuple[np.ndarray, float]:
@@ -103,7 +103,7 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
         (folder / part).mkdir()
     means, masked = [], []
     for view, stem in zip(views, stems, strict=True):
-        shown = view.shown > _WHOLE
+        shown = view.shown > _INSIDE
         if not view.held_out:
             means.append(float(view.values[shown].mean()))
         write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)

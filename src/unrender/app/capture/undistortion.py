@@ -59,7 +59,7 @@ class Resampling:
         )
 
     @property
-    def _is_whole(self) -> bool:
+    def _has_integer_blocks(self) -> bool:
         """True if each pixel of the result consists of n x n pixels of the photograph."""
         focal = self.parts * self.target.fx
         same = math.isclose(self.source.fx, focal, rel_tol=1e-9) and math.isclose(self.source.fy, focal, rel_tol=1e-9)
@@ -69,7 +69,7 @@ class Resampling:
         """Return the result (h, w, C) of a picture (H, W, C), clamped to at least 0, and the fraction of each pixel inside the
         photograph, (h, w)."""
         height, width, n = self.target.height, self.target.width, self.parts
-        if self._is_whole:
+        if self._has_integer_blocks:
             blocks = values[: n * height, : n * width].reshape(height, n, width, n, -1)
             return blocks.mean((1, 3), dtype=np.float32), np.ones((height, width), np.float32)
         result = np.empty((height, width, values.shape[2]), np.float32)

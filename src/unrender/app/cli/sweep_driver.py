@@ -172,7 +172,7 @@ class _State:
 
     record: SweepRecord
     trials: Trials
-    under_way: dict[int, Started] = field(default_factory=dict)
+    running: dict[int, Started] = field(default_factory=dict)
     began: float = field(default_factory=time.monotonic)
     before: float = 0.0
     stopped: str = ""
@@ -297,7 +297,7 @@ def _drive(console: Console, session: Session, state: _State, executor: Executor
                 run_tasks = _tasks(plan, started)
                 label = ", ".join(f"{name}={value}" for name, value in started.settings.items())
                 display.begin(started.number, label, tuple(session.folder / task.name for task in run_tasks))
-                state.under_way[started.number] = started
+                state.running[started.number] = started
                 executor.start(started.number, job, run_tasks)
             for ended in executor.wait(_POLL_SECONDS):
                 record = _ended(session, state, ended)
@@ -325,7 +325,7 @@ def _advise_on_few_steps(state: _State, record: TrialRecord, display: TaskDispla
 
 def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:
     """Return the record of a completed trial; None if this process is being stopped."""
-    started = state.under_way.pop(ended.key)
+    started = state.running.pop(ended.key)
     runs, message = [], ended.message
     if not message:
         runs, written = ended.value

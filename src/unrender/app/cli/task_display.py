@@ -26,7 +26,7 @@ _MOST_ROWS = 20
 
 
 @dataclass(frozen=True)
-class _UnderWay:
+class _Task:
     """A running task: its label, start time, and possible run folders."""
 
     label: str
@@ -46,7 +46,7 @@ class TaskDisplay:
 
     def __init__(self, console: Console, total: int, what: str, below: Callable[[], Renderable] | None = None):
         self._console, self._total, self._what, self._below = console, total, what, below
-        self._under_way: dict[object, _UnderWay] = {}
+        self._running: dict[object, _Task] = {}
         self._ended = 0
         self._began = time.monotonic()
         self._lock = threading.Lock()
@@ -68,12 +68,12 @@ class TaskDisplay:
     def begin(self, key: object, label: str, folders: tuple[Path, ...]) -> None:
         """Record the start of a task, which uses these run folders in turn."""
         with self._lock:
-            self._under_way[key] = _UnderWay(label, time.monotonic(), folders)
+            self._running[key] = _Task(label, time.monotonic(), folders)
 
     def end(self, key: object, line: str) -> None:
         """Record the end of a task, with its summary line."""
         with self._lock:
-            self._under_way.pop(key, None)
+            self._running.pop(key, None)
             self._ended += 1
         if self._live is None:
             self.say(f"{self._ended}/{self._total} {line}")
@@ -89,12 +89,12 @@ class TaskDisplay:
 
     def _render(self) -> Renderable:
         with self._lock:
-            rows, ended = list(self._under_way.values()), self._ended
+            rows, ended = list(self._running.values()), self._ended
         elapsed = formatting.duration(time.monotonic() - self._began)
-        head = Text(f"{ended} of {self._total} {self._what} ended, {len(rows)} under way, {elapsed}")
+        head = Text(f"{ended} of {self._total} {self._what} ended, {len(rows)} running, {elapsed}")
         table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-        for heading in ("under way", "seed", "step", "loss", "since"):
-            table.add_column(heading, no_wrap=heading != "under way")
+        for heading in ("running", "seed", "step", "loss", "since"):
+            table.add_column(heading, no_wrap=heading != "running")
         for row in rows[:_MOST_ROWS]:
             folder, status = _status(row.folders)
             since = formatting.duration(time.monotonic() - row.since)

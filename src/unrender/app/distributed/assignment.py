@@ -102,38 +102,38 @@ def joined(parts: Sequence[tuple[Batch, DrawStatistics]]) -> DrawStatistics | No
 
 _COPIES = 8
 """Copies of each parameter in a worker: current, previous, both scenes' own, both gradients, sent and received."""
-_REMEMBERED = 24
+_WITH_CONTROL_VARIATE = 24
 """Images per view in the memory of a control variate: itself, its variance and ten statistics, before and after a step."""
 _PLAIN = 4
 """Other images per view: reference, rendering, loss derivative and mask."""
 _FLOAT = 4
 
 
-def needed(problem: Problem, views: Sequence[int], remembers: bool) -> tuple[dict[str, int], int]:
+def needed(problem: Problem, views: Sequence[int], has_memory: bool) -> tuple[dict[str, int], int]:
     """Return the bytes of a worker's memory for each parameter, and for these views.
 
     Args:
         problem: the full problem.
         views: views of the share.
-        remembers: whether the image estimator has memory of views.
+        has_memory: whether the image estimator has memory of views.
     """
     parameters = {key: _COPIES * _FLOAT * math.prod(shape) for key, shape in problem.shapes().items()}
     resolutions = problem.renderer.resolutions()
     pixels = sum(math.prod(resolutions[problem.views[view].sensor]) for view in views)
-    return parameters, pixels * 3 * _FLOAT * (_REMEMBERED + _PLAIN if remembers else _PLAIN)
+    return parameters, pixels * 3 * _FLOAT * (_WITH_CONTROL_VARIATE + _PLAIN if has_memory else _PLAIN)
 
 
-def check(problem: Problem, shares: Sequence[Sequence[int]], free: Sequence[tuple[str, int]], remembers: bool) -> None:
+def check(problem: Problem, shares: Sequence[Sequence[int]], free: Sequence[tuple[str, int]], has_memory: bool) -> None:
     """Raise `InputError` if a share does not fit, stating its size and what would fit.
 
     Args:
         problem: the full problem.
         shares: views of each share.
         free: machine of each share, and its available bytes; 0 for unknown.
-        remembers: see `needed`.
+        has_memory: see `needed`.
     """
     for views, (where, room) in zip(shares, free, strict=True):
-        parameters, images = needed(problem, views, remembers)
+        parameters, images = needed(problem, views, has_memory)
         if not room or sum(parameters.values()) + images <= room:
             continue
         left = room - sum(parameters.values())

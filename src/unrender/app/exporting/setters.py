@@ -41,7 +41,7 @@ def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: 
     elif path == ("data",):
         _map(node.props, value, key.removesuffix(".data"), folder)
     elif path == ("value",):
-        _whole_texture(graph, place.node, value)
+        _replace_texture(graph, place.node, value)
     elif len(path) == 2 and path[1] == "value":
         _colour(graph, place, path[0], value)
     elif len(path) == 3 and path[0] == "bsdf" and path[2] == "value":  # the default material of a shape
@@ -90,7 +90,7 @@ def _map(props: Any, value: np.ndarray, name: str, folder: Path) -> None:
         props["format"] = "variant"  # float32, as recovered
 
 
-def _whole_texture(graph: SceneGraph, index: int, value: np.ndarray) -> None:
+def _replace_texture(graph: SceneGraph, index: int, value: np.ndarray) -> None:
     """Replace a constant texture by its value in each of its parents."""
     for parent in range(len(graph.nodes)):
         for name, child in graph.children(parent).items():

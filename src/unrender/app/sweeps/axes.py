@@ -170,7 +170,7 @@ def _range(name: str, values: str, method: Method) -> Axis | None:
         raise InputError(f"{where}: expected two finite numbers, the lower one first")
     if logarithmic and low <= 0:
         raise InputError(f"{where}: a logarithmic range must begin above 0")
-    integer = _is_whole(name, method)
+    integer = _is_integer(name, method)
     for end in (low, high):
         if integer and end != int(end):
             raise InputError(f"{where}: expected whole numbers, got {end:g}")
@@ -178,7 +178,7 @@ def _range(name: str, values: str, method: Method) -> Axis | None:
     return Axis(name, values, (), low, high, logarithmic, count, integer)
 
 
-def _is_whole(name: str, method: Method) -> bool:
+def _is_integer(name: str, method: Method) -> bool:
     """Return whether the option accepts integers only.
 
     Raises:

@@ -39,7 +39,7 @@ _ROWS = 8
 """Number of independent gradients between two tests; a test uses those of the last two intervals."""
 _LEAST_FRESH_DESCENT, _ERRORS = 0.7, 2.8
 """Smallest accepted descent relative to the best candidate's, and the smallest improvement in standard errors."""
-_CONFIRMED, _KEPT = 0.45, 0.6
+_CONFIRMED, _REVERTED = 0.45, 0.6
 """Confirmed fraction of the agreement of successive gradients that is needed to reduce smoothing, and the fraction below which the
 reduction is reverted."""
 _CLEAR = 0.15
@@ -158,7 +158,7 @@ class StrengthFit:
         first, before = _share(self.sums), self._before
         looked = np.append(products[-self.unjudged :, 1:].mean(axis=0), self.steps - 0.5 * (self.unjudged - 1))
         fit = replace(self, seen=looked, unjudged=0)
-        if self.share < first and sum(_confirmed(rows[-self.unjudged :], 0)) < _KEPT:
+        if self.share < first and sum(_confirmed(rows[-self.unjudged :], 0)) < _REVERTED:
             known = np.interp(math.log(first), np.log(self._shares[::-1]), squares.mean(axis=0)[:0:-1])
             return fit._changed(first, float(known), squares[:, 0].mean())
         descents = products / np.sqrt(squares)

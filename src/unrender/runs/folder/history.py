@@ -25,7 +25,7 @@ LARGEST_LINE = 1 << 20
 """Largest line in bytes."""
 LARGEST = 1 << 30
 """Largest file in bytes."""
-MOST_KEPT = 1 << 26
+THINNED_FROM = 1 << 26
 """Size in bytes from which a run's earlier steps are thinned."""
 _CHUNK = 1 << 20
 _REFINEMENTS = frozenset({"resolution", "faces"})

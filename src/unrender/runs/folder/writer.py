@@ -25,7 +25,7 @@ from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
 from unrender.runs.final_images import render_final_images, warm_up
 from unrender.runs.folder import checkpoint, contents, method_file
-from unrender.runs.folder.history import MOST_KEPT, HistoryFile, thinned
+from unrender.runs.folder.history import THINNED_FROM, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
 from unrender.runs.folder.meshes import FOLDER as MESH_FILES
 from unrender.runs.folder.meshes import write_files
@@ -163,7 +163,7 @@ class RunWriter(Callback):
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """Append the step to the history, and write a checkpoint if due."""
         self.append(record)
-        if self._history.size > max(MOST_KEPT, self._thin_from):
+        if self._history.size > max(THINNED_FROM, self._thin_from):
             self._guarded("history", lambda: self._thin(run.history))
         if self.checkpoint_due(run.step):
             self.write_checkpoint(run)
@@ -284,7 +284,7 @@ class RunWriter(Callback):
         """Remove records of earlier steps, in memory and in the file."""
         thinned_records = thinned(records)
         self._thin_from = (
-            self._history.size + MOST_KEPT // 8
+            self._history.size + THINNED_FROM // 8
         )  # avoids an attempt at every step if thinning has no effect
         if len(thinned_records) < len(records):
             records[:] = thinned_records

@@ -107,7 +107,7 @@
     if (!button) return;
     const { command } = button.dataset;
     const run = button.closest("[data-run]").dataset.run;
-    if (command === "stop" && !confirm("Stop this run? What it has reached is kept.")) return;
+    if (command === "stop" && !confirm("Stop this run? Its results are saved.")) return;
     const answer = await fetch(`control/${run}`, {
       method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ command }),
     }).catch(() => null);
