@@ -358,7 +358,7 @@ def test_references_of_too_many_pixels_for_mean_residuals_leave_no_standard_erro
 ) -> None:
     """Rather than errors of the run's own noise alone. The problem has 20 pixels."""
     monkeypatch.setattr("unrender.runs.verify.Verify.on_result", lambda self, descent, result: result)
-    monkeypatch.setattr(module, "REMEMBERED", most)
+    monkeypatch.setattr(module, "MOST_AVERAGED", most)
     seen, parts = Residuals(), (ur.GaussNewton(4, 4), AveragedNewton())
     whole = ur.optimize(problem(), *parts, steps=14, callbacks=[seen])
     assert seen.kept == {20 * 24 if most == 20 else 0}

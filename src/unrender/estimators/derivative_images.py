@@ -12,7 +12,7 @@ from unrender.core.arrays import Array
 from unrender.statistics import scores
 
 __all__ = [
-    "REMEMBERED",
+    "MOST_AVERAGED",
     "HalvedImage",
     "HalvesMean",
     "LossWeights",
@@ -26,7 +26,7 @@ __all__ = [
     "squared_slope",
 ]
 
-REMEMBERED = 1 << 19
+MOST_AVERAGED = 1 << 19
 """Largest number of pixels, times elements for derivative images, of images that are averaged over steps. Both halves take 12 MiB."""
 _RESIDUAL_ERRORS = 2.0
 """Standard errors of the sum of squared residuals from which on references have noise."""
@@ -225,7 +225,7 @@ def products(
     weights: LossWeights | None,
     residuals: HalvesMean | None = None,
     block: int = 1,
-    remembered: bool = False,
+    shared: bool = False,
     inverse: np.ndarray | None = None,
 ) -> Products:
     """Return the products of two independent halves of J, (m, H, W, 3) each.
@@ -235,7 +235,7 @@ def products(
         weights: derivatives of the loss; None if only `squares` is needed.
         residuals: mean of ℓ' over steps, for `scores`; None for no scores.
         block: side of the blocks of pixels over which all but `squares` are summed.
-        remembered: whether all steps share the derivative images. Their noise times that of the references then moves the solution, and
+        shared: whether all steps share the derivative images. Their noise times that of the references then moves the solution, and
             `scores` include it.
         inverse: inverse of the Hessian, (m, m). `scores` then contain the residuals that each pixel would have in a fit without it, see
             `scores.without_own_pixel`. None for the residuals themselves, which are less than the noise where few pixels decide the fit.
@@ -256,7 +256,7 @@ def products(
             second = _pooled(second, block) / _pooled(np.ones_like(second), block)
         if residuals is not None and inverse is not None:
             at[2:] = _without_own_pixel(at[2:], one, other, inverse, second)
-        both = [0.5 * (one + other)] * 2 if remembered else [one, other]
+        both = [0.5 * (one + other)] * 2 if shared else [one, other]
         of_halves = [(part * of).sum(axis=3) for part, of in zip((one, other, *both), at, strict=False)]
         if residuals is not None:
             total.scores += scores.covariance(of_halves[2], of_halves[3])

@@ -26,7 +26,7 @@ from unrender.estimators.capabilities import (
     Smoothing,
 )
 from unrender.estimators.derivative_images import (
-    REMEMBERED,
+    MOST_AVERAGED,
     HalvedImage,
     HalvesMean,
     LossWeights,
@@ -123,7 +123,7 @@ class GaussNewton:
         remember: whether derivative images are averaged over steps while steps are short relative to the widths. Their noise is then
             small relative to the derivatives also for elements that hardly change the image. Not for large pictures of many elements.
         scores: whether residuals are averaged over steps for `ScoreCovariance`, which standard errors need. Problems of more than
-            `REMEMBERED` pixels in all views have no scores, since the mean takes 24 bytes per pixel. Runs whose optimizer states no
+            `MOST_AVERAGED` pixels in all views have no scores, since the mean takes 24 bytes per pixel. Runs whose optimizer states no
             errors do without.
     """
 
@@ -296,7 +296,7 @@ class _Point:
         self.session: RenderSession = problem.renderer.prepare(list(parameters), None, derivatives=False)
         self.theta = trees.ravel(parameters)
         self.samples = 0
-        self.scores = options.scores and problem.pixels <= REMEMBERED
+        self.scores = options.scores and problem.pixels <= MOST_AVERAGED
         ranges = {key: (unknown.bounds[0], unknown.bounds[1]) for key, unknown in problem.unknowns.items()}
         self.largest = {
             key: min(

@@ -88,7 +88,7 @@ class RecursiveControlVariateState:
         """Return the state with the previous parameters interpolated; images are unchanged."""
         return self if self.parameters is None else replace(self, parameters=upsampler.tree(self.parameters))
 
-    def remembered(self) -> tuple[Tree, tuple[Array, ...]] | None:
+    def control_variates(self) -> tuple[Tree, tuple[Array, ...]] | None:
         """Return the parameters of the control variates, and the control variate of each view; None before the first step."""
         return None if self.parameters is None else (self.parameters, tuple(memory.image for memory in self.views))
 

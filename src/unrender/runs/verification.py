@@ -16,7 +16,15 @@ from unrender.display import formatting
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
-__all__ = ["DIFFERS", "Misfit", "Remembering", "misfit", "misfit_of_numbers", "misfit_of_views", "remembered"]
+__all__ = [
+    "DIFFERS",
+    "HasControlVariates",
+    "Misfit",
+    "control_variates",
+    "misfit",
+    "misfit_of_numbers",
+    "misfit_of_views",
+]
 
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
@@ -128,25 +136,25 @@ def misfit_of_views(
 
 
 @runtime_checkable
-class Remembering(Protocol):
+class HasControlVariates(Protocol):
     """An estimator's state, or a part of it, with control variates of images."""
 
-    def remembered(self) -> tuple[Tree, Sequence[Array]] | None:
+    def control_variates(self) -> tuple[Tree, Sequence[Array]] | None:
         """Return the parameters of the images, and the image (H, W, 3) of each view; None before the first step."""
         ...
 
 
-def remembered(state: Any) -> Iterator[tuple[Tree, Sequence[Array]]]:
+def control_variates(state: Any) -> Iterator[tuple[Tree, Sequence[Array]]]:
     """Yield the control variates in all parts of an estimator's state."""
-    if isinstance(state, Remembering):
-        if (images := state.remembered()) is not None:
+    if isinstance(state, HasControlVariates):
+        if (images := state.control_variates()) is not None:
             yield images
     elif dataclasses.is_dataclass(state) and not isinstance(state, type):
         for field in dataclasses.fields(state):
-            yield from remembered(getattr(state, field.name))
+            yield from control_variates(getattr(state, field.name))
     elif isinstance(state, Mapping):
         for part in state.values():
-            yield from remembered(part)
+            yield from control_variates(part)
     elif isinstance(state, (list, tuple)):
         for part in state:
-            yield from remembered(part)
+            yield from control_variates(part)

@@ -21,7 +21,7 @@ from unrender.runs.number_means import averaged
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
-from unrender.runs.verification import misfit, misfit_of_numbers, remembered
+from unrender.runs.verification import control_variates, misfit, misfit_of_numbers
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
@@ -330,7 +330,7 @@ def _memory(run: Run, pictures: FreshPictures, last: Picture) -> Memory | None:
         state = problem.executor.collect(state)
     memories = [
         compare_memory(pictures, pictures.memory(images), pictures.images(parameters), last)
-        for parameters, images in remembered(state)
+        for parameters, images in control_variates(state)
     ]
     return max(memories, key=lambda memory: (memory.disagrees, memory.score), default=None)
 

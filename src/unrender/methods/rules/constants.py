@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from unrender.estimators.derivative_images import REMEMBERED
+from unrender.estimators.derivative_images import MOST_AVERAGED
 from unrender.preconditioners import Sobolev
 
 __all__ = ["CONSTANTS", "Constants"]
@@ -144,7 +144,7 @@ class Constants:
     noise_limit: float = 3.0
     """Ratio of a pixel's variance to the median from which it has less weight in Gauss-Newton steps. Source: `stage-lights`: error 0.04 of
     the start's instead of 0.29, because the softbox's visible edge is noisier than all else."""
-    remembered: int = REMEMBERED
+    averaged_values: int = MOST_AVERAGED
     """Elements times pixels up to which the derivative images of such steps are averaged over steps. Source: memory, 12 MiB."""
     pose_averaging: float = 3.0
     """`averaging` of poses, whose first models are far from the solution. Source: as for `pose_shift`."""

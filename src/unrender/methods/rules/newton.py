@@ -75,7 +75,7 @@ def few_numbers(traits: Traits) -> Plan | None:
     if not (nonlinear or traits.lights) or mixed or not traits.newton_suits or not _few(traits, keys):
         return None
     estimator = _estimator(traits, keys, constants.pose_images)
-    estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.remembered)
+    estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.averaged_values)
     if traits.poses:
         trial = replace(
             estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None, remember=False, scores=False
