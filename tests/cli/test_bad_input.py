@@ -103,6 +103,15 @@ MISTAKES += [  # options that would be ignored
     (["gallery", "exponential", "--spp", "4"], "gallery: --spp needs --out"),
     (["gallery", "exponential", "--no-cache"], "gallery: --no-cache needs --out or --problem-set"),
     (["gallery", "exponential", "-p", "loss=L1", "--overwrite"], "gallery: --overwrite needs --out"),
+    (
+        ["run", "problem.toml", "--no-cache"],
+        "--no-cache: only the references of gallery problems are cached; leave it out",
+    ),
+    (["compare", "problem.toml", "--no-cache"], "--no-cache: only the references of gallery problems are cached"),
+    (
+        ["export", "problem.toml", "--format", "ply", "--spp", "4"],
+        "--spp: only the format mitsuba writes scene.xml; leave it out",
+    ),
     (["methods", "rcv", "--variant", "auto"], "methods: --variant needs --plan PROBLEM"),
     (["methods", "-s", "spp=2"], "methods: --set needs --plan PROBLEM"),
     (["run", "."], ".: a folder, expected a problem file; did you mean problem.toml?"),

@@ -1,4 +1,4 @@
-"""Coverage of the standard errors of numbers: how often the truth lies within one and two of them, over 100 seeds of three problems.
+"""Coverage of the standard errors of numbers: how often the truth lies within one and two of them, over many seeds of three problems.
 
 Each seed has a reference of its own with noise, and a run of `auto` of a fixed number of steps. The standard errors count the noise of
 both. Runs without a run folder have those of the optimizer. Those with one have a least-squares test at the end, too.

@@ -125,6 +125,8 @@ class Cosine:
 class Steps:
     """`factor` to the power of the integer part of step / `every`.
 
+    A factor above 1 overflows to infinity in the end, which optimizers refuse.
+
     Args:
         every: number of steps, >= 1.
         factor: factor, > 0, usually below 1.
@@ -138,7 +140,10 @@ class Steps:
         checks.number("Steps", "factor", self.factor, above=0.0)
 
     def __call__(self, step: float) -> float:
-        return float(self.factor) ** (step // self.every)
+        try:
+            return float(self.factor) ** (step // self.every)
+        except OverflowError:
+            return math.inf
 
 
 @register(position=6)

@@ -199,7 +199,7 @@ def check_file(name: str) -> None:
         toml_file.check(file)
 
 
-def check_problem(name: str, options: Mapping[str, str]) -> None:
+def check_problem(name: str, options: Mapping[str, str], cached: bool = True) -> None:
     """Raise `InputError` if `open_problem` would fail for reasons that can be checked without Mitsuba."""
     from unrender import gallery
 
@@ -215,6 +215,8 @@ def check_problem(name: str, options: Mapping[str, str]) -> None:
             )
         if options:
             raise InputError(f"--problem-set {next(iter(options))}: only gallery problems have options; edit {name}")
+        if not cached:
+            raise InputError("--no-cache: only the references of gallery problems are cached; leave it out")
         if not Path(name).exists():
             from unrender.io import bounded_files  # imports NumPy
 
@@ -254,7 +256,7 @@ def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> 
         from unrender import gallery
         from unrender.scene.problem import Problem
 
-        check_problem(name, options)
+        check_problem(name, options, cached)
         if _is_file(name):
             return Problem.from_file(name)
         made = gallery.problem(name, **{key: literal(value) for key, value in options.items()})

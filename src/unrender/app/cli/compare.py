@@ -99,7 +99,7 @@ def compare(
     typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
         chosen, settings_ = _methods_and_settings(methods, typed)
-        arguments.check_problem(what[0], options)
+        arguments.check_problem(what[0], options, not no_cache)
         _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
         folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
         try:

@@ -14,6 +14,7 @@ from unrender.display.terminal import Console
 
 
 def export(
+    context: typer.Context,
     directory: Annotated[
         Path,
         typer.Argument(
@@ -48,12 +49,14 @@ def export(
     if is_problem:
         arguments.refuse_stages(str(directory))
     directory = directory if is_problem else arguments.finished_run(directory)
+    chosen = [name.strip() for name in formats.split(",") if name.strip()]
+    if "mitsuba" not in chosen and "--spp" in arguments.typed_options(context):
+        raise InputError("--spp: only the format mitsuba writes scene.xml; leave it out")
     arguments.use_variant(variant)
     from unrender.app.exporting.scene_folder import export as write
 
     default = Path("out", f"{directory.resolve().parent.name}-scene") if is_problem else directory / "scene"
     place = default if out is None else out
-    chosen = [name.strip() for name in formats.split(",") if name.strip()]
     done = write(directory, place, overwrite, spp, chosen)
     for notice in done.notices:
         console.print(f"note: {escape(notice)}", soft_wrap=True)

@@ -92,12 +92,12 @@ def run(
 
             chosen, processes = _method(method_name), distribution.check(workers, compress, insecure)
             if stages.is_stages(problem):
-                stages.refuse_settings(method_name, values, options, workers)
+                stages.refuse_settings(method_name, values, options, workers, no_cache)
                 first = seed if "--seed" in arguments.typed_options(context) else None
                 plan = (steps, seconds), first, out, overwrite, variant, threads, command, checkpoint_every, final_spp
                 return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
             chosen.start(values)
-            arguments.check_problem(problem, options)
+            arguments.check_problem(problem, options, not no_cache)
         folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
         try:
             running = arguments.use_variant(variant, threads)

@@ -74,11 +74,13 @@ def refuse_workers(workers: str | None) -> None:
         raise InputError("--workers: not supported with stages; leave it out")
 
 
-def refuse_settings(method: str, settings: Mapping[str, str], options: Mapping[str, str], workers: str | None) -> None:
+def refuse_settings(
+    method: str, settings: Mapping[str, str], options: Mapping[str, str], workers: str | None, no_cache: bool
+) -> None:
     """Raise `InputError` for command-line options that belong in a file of stages, or that stages do not support."""
     refuse_workers(workers)
     refused = [f"--set {name}" for name in settings] + [f"--problem-set {name}" for name in options]
-    refused += ["--method"] * (method != "auto")
+    refused += ["--method"] * (method != "auto") + ["--no-cache"] * no_cache
     if refused:
         raise InputError(f"{refused[0]}: not supported with stages; set it in the file of stages")
 

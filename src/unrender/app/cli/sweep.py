@@ -230,7 +230,7 @@ def _planned(
     from unrender.runs.folder import schema
 
     steps, seconds = arguments.budget(values["steps"], values["seconds"])
-    arguments.check_problem(values["problem"], values["problem_settings"])
+    arguments.check_problem(values["problem"], values["problem_settings"], values["cached"])
     arguments.check_variant(values["variant"])
     chosen = method(values["method"])
     axes = parse_axes(over, chosen, values["settings"])
