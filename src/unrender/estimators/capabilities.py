@@ -154,6 +154,19 @@ class Smoothing(Capability):
 
 
 @dataclass(frozen=True)
+class DerivativeImages(Capability):
+    """Derivative images of every element, by view.
+
+    Attributes:
+        views: {view: (elements, images, weights)}: the indices of the elements that the view shows, (m,), the derivatives of its image by
+            them, (m, H, W, 3), and the second derivative of the loss by each value of the image, (H, W, 3).
+    """
+
+    name: ClassVar[str] = "derivative_images"
+    views: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
 class BlockEstimate(Capability):
     """Estimate for a subset of the parameters, with their own curvature. The other parameters are fixed at their current values.
 

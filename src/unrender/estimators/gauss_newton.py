@@ -18,6 +18,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
     Capabilities,
+    DerivativeImages,
     Gradient,
     GradientNoise,
     Hessian,
@@ -52,8 +53,6 @@ _OF_RANGE, _BLIND = 0.125, 0.3
 relative to the parameter, or in its units if it is 0."""
 _SETTLED = 0.5
 """Maximum step, in units of the widths, after which the shift is halved."""
-_TRIAL, _LEAST_EIGENVALUE = 3, 0.01
-"""Stream of `explained`, and relative eigenvalue below which its matrix counts as singular."""
 _IMAGE = 2
 """Stream of a view's key for the image. Lower streams are for the two halves of the derivative images."""
 
@@ -198,6 +197,7 @@ class GaussNewton:
                 HessianNoise(sums.noise),
                 GradientNoise(sums.gradient_noise),
                 Smoothing(dict(state.widths)),
+                DerivativeImages(system.weighted),
                 *scores,
             ),
             {"samples": point.samples, "images": system.images},
@@ -231,34 +231,6 @@ class GaussNewton:
         )
 
 
-def explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
-    """Return the fraction of the initial loss that the quadratic model at the start predicts to remove.
-
-    It is near 0 on a plateau, where no derivative image resembles the residual. Noise does not bias it: gradients and images come from
-    two independent estimates. The loss must have a linear derivative, such as L2.
-    """
-    first = problem.initial()
-    state, estimates, losses, images = estimator.init(problem, first), [], [], []
-    for step in range(2):
-        estimate, state = estimator.estimate(problem, first, state, Key(seed, step, stream=_TRIAL))
-        estimates.append(estimate)
-        losses.append(estimate.loss)
-        images.append(estimate.info["images"])
-    mean = sum(
-        arrays.number(problem.loss_value(view, 0.5 * (image + images[1][view]))) for view, image in images[0].items()
-    )
-    loss = 2.0 * mean - 0.5 * sum(losses)
-    hessian = 0.5 * sum(arrays.numpy(estimate.require("explained", Hessian).matrix) for estimate in estimates)
-    one, other = (trees.ravel(estimate.gradient) for estimate in estimates)
-    units = np.sqrt(np.abs(np.diag(hessian)))
-    if loss <= 0.0 or not np.isfinite(hessian).all() or not units.all():
-        return 0.0
-    eigenvalues, directions = np.linalg.eigh(hessian / np.outer(units, units))
-    used = eigenvalues > _LEAST_EIGENVALUE * eigenvalues[-1]  # noise makes small ones negative
-    along = [directions[:, used].T @ (gradient / units) for gradient in (one, other)]
-    return float(0.5 * np.sum(along[0] * along[1] / eigenvalues[used]) / loss)
-
-
 @dataclass
 class _System:
     """Sums over all views, for n elements.
@@ -268,6 +240,7 @@ class _System:
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
         loss: loss at the parameters.
         images: images by view.
+        weighted: derivative images by view, see `DerivativeImages`.
         variances: running mean of the variance of each view's image.
         derivatives: mean derivative images of each view.
         residuals: mean derivatives of the loss of each view.
@@ -277,6 +250,7 @@ class _System:
     slopes: np.ndarray
     loss: float = 0.0
     images: dict[int, Array] = field(default_factory=dict)
+    weighted: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=dict)
     variances: list[np.ndarray] = field(default_factory=list)
     derivatives: list[HalvesMean] = field(default_factory=list)
     residuals: list[HalvesMean] = field(default_factory=list)
@@ -328,6 +302,8 @@ class _Point:
             points, distances = self._points(elements, steps)
             halves = [self._states(points, view, seed.fold(half), self.options.derivative_spp) for half in (0, 1)]
             mean = HalvesMean(differences(halves[0], distances), differences(halves[1], distances))
+            if weights is not None:
+                total.weighted[view] = (elements, 0.5 * (mean.one + mean.other), weights.second)
             if images and self.options.remember:
                 if state.derivatives:
                     mean = state.derivatives[len(total.derivatives)].and_one(mean, moved)

@@ -13,18 +13,30 @@ from unrender.core.registry import register
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
-from unrender.estimators.capabilities import BlockEstimate, Capabilities, Capability, FreshGradient, Gradient, Variance
+from unrender.estimators.capabilities import (
+    BlockEstimate,
+    Capabilities,
+    Capability,
+    DerivativeImages,
+    FreshGradient,
+    Gradient,
+    Variance,
+)
 from unrender.estimators.coordinates import by_coordinates, restricted
+from unrender.estimators.following import Response, advanced
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives, SmoothedState
-from unrender.rendering.partial import HeldParameters, PartialDerivatives
+from unrender.rendering.partial import FollowingParameters, HeldParameters, PartialDerivatives
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler, restarted, upsampled
 
 _PERTURBED = 1 << 33
 """Stream of a step's key for the perturbed renders; path gradients use lower streams."""
+
+_ADJOINTS = 1 << 20
+"""Index of the random numbers of the adjoints of textures that follow."""
 
 _MEAN, _SQUARE = 0.9, 0.999
 """Decays of the running means of the perturbed parameters' gradient and of its square, as in Adam."""
@@ -49,6 +61,7 @@ class HybridState:
         perturbed: state of the second estimator.
         mean, square: running means of the perturbed parameters' gradient, and of its square, not debiased; {} unless `averaged`.
         step: number of estimates since these began.
+        response: response of the textures that follow a block; None without any.
     """
 
     path: Any
@@ -56,6 +69,7 @@ class HybridState:
     mean: Tree = field(default_factory=dict)
     square: Tree = field(default_factory=dict)
     step: int = 0
+    response: Response | None = None
 
     def upsampled(self, upsampler: Upsampler) -> HybridState:
         """Return the state with upsampled states and running means."""
@@ -65,6 +79,7 @@ class HybridState:
             perturbed=upsampled(self.perturbed, upsampler),
             mean=upsampler.tree(self.mean, 1.0),
             square=upsampler.tree(self.square, SQUARES),
+            response=upsampled(self.response, upsampler),
         )
 
     def restarted(self, fresh: HybridState) -> HybridState:
@@ -95,7 +110,9 @@ class HybridGradient:
 
     With `GaussNewton` for `perturbed`, the perturbed parameters form a block (`BlockEstimate`). An optimizer such as `Partitioned(keys,
     AveragedNewton(), others)` solves it, and their gradient is 0 in steps in which they are fixed. `wait` and `every` select the
-    steps in which they move. While textures are far from the solution, images contain little information on poses.
+    steps in which they move. While textures are far from the solution, images contain little information on poses. Textures in
+    `following` are eliminated from the block, see `estimators.following`: a lamp's position beside the texture that it lights, for
+    example, then does not wait for the texture.
 
     The steps of both groups have no common scale: give the perturbed parameters their own learning rates.
 
@@ -113,6 +130,8 @@ class HybridGradient:
             their rates while gradients agree. Requires a variance of `path`.
         wait: number of steps before the first in which a block moves, >= 0. For `GaussNewton` only.
         every: interval of steps in which a block moves, >= 1. For `GaussNewton` only.
+        following: keys of reflectances or radiances that the block eliminates. Each of its steps takes another adjoint for each of its
+            elements. For `GaussNewton` only, and for textures without preconditioner and parameterisation.
     """
 
     path: Estimator = field(default_factory=PathGradient)
@@ -123,6 +142,7 @@ class HybridGradient:
     averaged: bool = False
     wait: int = 0
     every: int = 1
+    following: tuple[str, ...] = ()
 
     def __post_init__(self):
         checks.flags(self)
@@ -139,8 +159,8 @@ class HybridGradient:
         checks.integer("HybridGradient", "every", self.every, at_least=1)
         if self._is_block and self.averaged:
             raise InputError("HybridGradient: averaged requires SmoothedDerivatives, got GaussNewton")
-        if not self._is_block and (self.wait or self.every > 1):
-            raise InputError("HybridGradient: wait and every require GaussNewton, got SmoothedDerivatives")
+        if not self._is_block and (self.wait or self.every > 1 or self.following):
+            raise InputError("HybridGradient: wait, every and following require GaussNewton, got SmoothedDerivatives")
         if not self._is_block and (
             not isinstance(self.perturbed, SmoothedDerivatives) or self.perturbed.order != "gradient"
         ):
@@ -154,10 +174,11 @@ class HybridGradient:
             )
         if isinstance(self.perturbed, GaussNewton):  # no error is stated of a block
             object.__setattr__(self, "perturbed", replace(self.perturbed, scores=False))
-        if self.keys is not None:
-            if isinstance(self.keys, str) or not all(isinstance(key, str) for key in self.keys):
-                raise InputError(f"HybridGradient: keys must be a list of parameters' keys, got {self.keys!r:.80}")
-            object.__setattr__(self, "keys", tuple(self.keys))
+        for name in ("keys", "following") if self.keys is not None else ("following",):
+            keys: Any = getattr(self, name)
+            if isinstance(keys, str) or not all(isinstance(key, str) for key in keys):
+                raise InputError(f"HybridGradient: {name} must be a list of parameters' keys, got {keys!r:.80}")
+            object.__setattr__(self, name, tuple(keys))
 
     @property
     def provides(self) -> Capabilities:
@@ -169,10 +190,18 @@ class HybridGradient:
     def init(self, problem: Problem, parameters: Tree) -> HybridState:
         """Return the state before the first step. Raise `InputError` if one of the two estimators has no parameter, or refuses its own."""
         own = self._perturbed(problem.renderer, parameters)
-        path, perturbed = self._problems(problem, parameters, own)
         part = {key: parameters[key] for key in own}
+        for name in self.following:
+            if name not in parameters or name in own:
+                hint = did_you_mean(name, [other for other in parameters if other not in own])
+                raise InputError(
+                    f"HybridGradient: following names {name}, which is not one of the other parameters{hint}"
+                )
+        response = Response.zero(parameters, self.following, trees.ravel(part).size) if self.following else None
+        path, perturbed = self._problems(problem, parameters, own, response)
         zeros = trees.zeros_like(part) if self.averaged else {}
-        return HybridState(self.path.init(path, parameters), self.perturbed.init(perturbed, part), zeros, zeros)
+        states = self.path.init(path, parameters), self.perturbed.init(perturbed, part)
+        return HybridState(*states, zeros, zeros, response=response)
 
     def estimate(
         self, problem: Problem, parameters: Tree, state: HybridState, key: Key
@@ -180,16 +209,17 @@ class HybridGradient:
         """Return an estimate and the next state. `info`: that of `path`, with "samples" of both, and "perturbed_loss", the loss at the
         parameters with the noise of the perturbed renders."""
         own = self._perturbed(problem.renderer, parameters)
-        path, perturbed = self._problems(problem, parameters, own)
+        path, perturbed = self._problems(problem, parameters, own, state.response)
         path_estimate, path_state = self.path.estimate(path, parameters, state.path, key)
         part = {name: parameters[name] for name in own}
         own_key = key.fold(_PERTURBED)
         if self._is_block:
             compiles = key.stream == WARM_UP and not state.step
-            perturbed_estimate, perturbed_state, samples = self._block(perturbed, part, state, own_key, compiles)
+            problems = path, perturbed
+            perturbed_estimate, state, samples = self._block(problems, parameters, part, state, own_key, compiles)
         else:
-            perturbed_estimate, perturbed_state = self.perturbed.estimate(perturbed, part, state.perturbed, own_key)  # pyright: ignore[reportArgumentType]
-            samples = int(perturbed_estimate.info.get("samples", 0))
+            perturbed_estimate, after = self.perturbed.estimate(perturbed, part, state.perturbed, own_key)  # pyright: ignore[reportArgumentType]
+            state, samples = replace(state, perturbed=after), int(perturbed_estimate.info.get("samples", 0))
         if path_estimate.preconditioned or perturbed_estimate.preconditioned:
             path_estimate, perturbed_estimate = (
                 by_coordinates(path_estimate, problem, parameters),
@@ -212,32 +242,58 @@ class HybridGradient:
             path_estimate, gradient=gradient, capabilities=_merged(path_estimate, perturbed_estimate, own), info=info
         )
         arrays.evaluate(moments.mean, moments.square)
-        return merged, replace(moments, path=path_state, perturbed=perturbed_state)
+        return merged, replace(moments, path=path_state)
 
     @property
     def _is_block(self) -> bool:
         return isinstance(self.perturbed, GaussNewton)
 
     def _block(
-        self, problem: Problem, part: Tree, state: HybridState, key: Key, compiles: bool
-    ) -> tuple[Estimate, GaussNewtonState | SmoothedState, int]:
-        """Return the estimate with a block, the state, and the paths traced. With `compiles`, the block is estimated in any case."""
+        self,
+        problems: tuple[Problem, Problem],
+        parameters: Tree,
+        part: Tree,
+        state: HybridState,
+        key: Key,
+        compiles: bool,
+    ) -> tuple[Estimate, HybridState, int]:
+        """Return the estimate with a block, the state, and the paths traced. With `compiles`, the block is estimated in any case.
+
+        Args:
+            problems: problem of each of the two estimators.
+            parameters, part: all parameters, and those of the block.
+            state, key: state and random numbers.
+            compiles: whether this is the warm-up.
+        """
         fixed = Estimate(0.0, trees.zeros_like(part), (BlockEstimate(tuple(part), None),))
         moves = state.step >= self.wait and (state.step - self.wait) % self.every == 0
         if not (moves or compiles):
-            return fixed, state.perturbed, 0
-        estimate, after = self.perturbed.estimate(problem, part, state.perturbed, key)  # pyright: ignore[reportArgumentType]
-        samples = int(estimate.info.get("samples", 0))
+            return fixed, state, 0
+        estimate, after = self.perturbed.estimate(problems[1], part, state.perturbed, key)  # pyright: ignore[reportArgumentType]
+        samples, response = int(estimate.info.get("samples", 0)), state.response
+        images = estimate.get(DerivativeImages)
+        if response is not None and images is not None and isinstance(self.perturbed, GaussNewton):
+            spp = self.perturbed.derivative_spp
+            response, paths = advanced(response, problems[0], parameters, images, spp, key.fold(_ADJOINTS))
+            samples += paths
         if not moves:
-            return fixed, state.perturbed, samples
-        return replace(estimate, capabilities=(BlockEstimate(tuple(part), estimate),)), after, samples
+            return fixed, state, samples
+        block = BlockEstimate(tuple(part), estimate)
+        return replace(estimate, capabilities=(block,)), replace(state, perturbed=after, response=response), samples
 
-    def _problems(self, problem: Problem, parameters: Tree, own: Sequence[str]) -> tuple[Problem, Problem]:
+    def _problems(
+        self, problem: Problem, parameters: Tree, own: Sequence[str], response: Response | None
+    ) -> tuple[Problem, Problem]:
         """Return the problem of each of the two estimators."""
         held = {key: x for key, x in parameters.items() if key not in own}
+        renderer = HeldParameters(problem.renderer, held)
+        if response is not None:
+            origin = trees.ravel({key: parameters[key] for key in own})
+            bounds = {key: problem.unknowns[key].project for key in response.slopes}
+            renderer = FollowingParameters(problem.renderer, held, origin, response.slopes, bounds)
         return (
             problem.with_parts(renderer=PartialDerivatives(problem.renderer, frozenset(own))),
-            problem.with_parts(renderer=HeldParameters(problem.renderer, held)),
+            problem.with_parts(renderer=renderer),
         )
 
     def _perturbed(self, renderer: Renderer, parameters: Tree) -> tuple[str, ...]:

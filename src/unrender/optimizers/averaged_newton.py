@@ -26,7 +26,7 @@ from unrender.optimizers import rates
 from unrender.optimizers.directions import coordinate_scales
 from unrender.optimizers.newton import trust_region_step
 from unrender.optimizers.transforms.base import checked_keys
-from unrender.statistics.scores import positive_part
+from unrender.statistics.scores import positive_part, scaled_eigh
 
 _FEWEST_MODELS = 8.0
 """Number of models from which their scatter gives a standard error."""
@@ -215,12 +215,11 @@ class AveragedNewton:
         errors = np.full(len(state.matrix), np.inf)
         for block in _blocks(state.matrix != 0.0):
             both = np.ix_(block, block)
-            units = np.sqrt(np.abs(np.diag(state.matrix[both])))
-            if not units.all():
+            if not np.diag(state.matrix[both]).all():
                 continue
-            eigenvalues, directions = np.linalg.eigh(state.matrix[both] / np.outer(units, units))
+            scales, eigenvalues, directions = scaled_eigh(state.matrix[both])
             weak = eigenvalues <= self.damping * eigenvalues.max()
-            inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / np.outer(units, units)
+            inverse = (directions / np.where(weak, np.inf, eigenvalues)) @ directions.T / scales
             middle = state.scatter[both] + positive_part(state.scores[both])
             error = np.sqrt(np.abs(np.diag(inverse @ middle @ inverse)))
             errors[block] = np.where((directions[:, weak] ** 2).sum(axis=1) > _WEAK_SHARE, np.inf, error)

@@ -4,6 +4,7 @@ constant values.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from unrender.core import arrays, trees
 from unrender.core.arrays import Array
+from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, differentiated
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
@@ -72,6 +74,68 @@ class HeldParameters(RendererWrapper):
         everything = [*keys, *(key for key in self.held if key not in keys)]
         session = self.inner.prepare(everything, space, differentiated(keys, derivatives))
         return _HeldSession(_PartialSession(session, frozenset(self.held)), self.held)
+
+
+class FollowingParameters(HeldParameters):
+    """A renderer of the scene in which some fixed parameters follow those of a session along straight lines.
+
+    Args:
+        inner: renderer of the scene.
+        held: {key: array} of the fixed parameters.
+        origin: values of the session's parameters at which the fixed ones are at `held`, (n,).
+        slopes: {key: change per unit of each of the n elements, (n, *shape)} of the fixed parameters that follow.
+        bounds: {key: function from its values to the nearest values within its bounds}.
+    """
+
+    def __init__(
+        self,
+        inner: Renderer,
+        held: Tree,
+        origin: np.ndarray,
+        slopes: Mapping[str, np.ndarray],
+        bounds: Mapping[str, Callable[[np.ndarray], np.ndarray]],
+    ):
+        super().__init__(inner, held)
+        self.origin, self.slopes, self.bounds = origin, slopes, bounds
+
+    def prepare(
+        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+    ) -> RenderSession:
+        if differentiated(keys, derivatives):
+            raise InputError("FollowingParameters: only images are available, no derivatives")
+        everything = [*keys, *(key for key in self.held if key not in keys)]
+        return _FollowingSession(self.inner.prepare(everything, space, derivatives=False), self)
+
+
+class _FollowingSession(SessionWrapper):
+    """A session that adds the fixed parameters of a `FollowingParameters` to each state."""
+
+    def __init__(self, inner: RenderSession, renderer: FollowingParameters):
+        super().__init__(inner)
+        self._renderer = renderer
+
+    def _state(self, parameters: Tree) -> Tree:
+        stacked = {key: arrays.numpy(x)[None] for key, x in parameters.items()}
+        moved = {key: arrays.like(x[0], self._renderer.held[key]) for key, x in self._followed(stacked).items()}
+        return {**self._renderer.held, **moved, **parameters}
+
+    def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
+        count = len(next(iter(parameters.values())))
+        held = {key: np.broadcast_to(x, (count, *x.shape)) for key, x in trees.numpy(self._renderer.held).items()}
+        return self._inner.image_batch({**held, **self._followed(parameters), **parameters}, request)
+
+    def _followed(self, parameters: Tree) -> dict[str, np.ndarray]:
+        """Return the values of the parameters that follow in each state, (B, *shape); {} if all states are at the origin."""
+        flat = [np.asarray(x, np.float64).reshape(len(x), -1) for x in parameters.values()]
+        change = np.concatenate(flat, axis=1) - self._renderer.origin
+        if not change.any():
+            return {}
+        moved = {
+            key: (arrays.numpy(self._renderer.held[key]) + np.tensordot(change, slopes, 1)).astype(np.float32)
+            for key, slopes in self._renderer.slopes.items()
+            if slopes.any()
+        }
+        return {key: self._renderer.bounds[key](values) for key, values in moved.items()}
 
 
 class _HeldSession(SessionWrapper):

@@ -80,24 +80,24 @@ def without_own_pixel(
     return result
 
 
-def positive_inverse(matrix: np.ndarray) -> np.ndarray:
+def positive_inverse(matrix: np.ndarray, least: float = _LEAST_CURVATURE) -> np.ndarray:
     """Return the pseudo-inverse of a symmetric matrix, (n, n).
 
-    The matrix is scaled to unit diagonal. Eigenvalues below 0.001 of the largest then count as 0.
+    The matrix is scaled to unit diagonal. Eigenvalues of at most `least` times the largest then count as 0.
     """
-    scales, eigenvalues, vectors = _scaled_eigh(matrix)
-    used = eigenvalues > _LEAST_CURVATURE * eigenvalues[-1]
+    scales, eigenvalues, vectors = scaled_eigh(matrix)
+    used = eigenvalues > least * eigenvalues[-1]
     inverse = np.divide(1.0, eigenvalues, out=np.zeros_like(eigenvalues), where=used)
     return (vectors * inverse) @ vectors.T / scales
 
 
 def positive_part(matrix: np.ndarray) -> np.ndarray:
     """Return D P D for the symmetric matrix D M D, where D is diagonal, M has a unit diagonal, and P is M without negative eigenvalues."""
-    scales, eigenvalues, vectors = _scaled_eigh(matrix)
+    scales, eigenvalues, vectors = scaled_eigh(matrix)
     return (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T * scales
 
 
-def _scaled_eigh(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def scaled_eigh(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the elements' scales, and eigenvalues and eigenvectors of a symmetric matrix over them, which has a unit diagonal."""
     units = np.sqrt(np.abs(np.diag(matrix)))
     units = np.where(units > 0.0, units, 1.0)

@@ -1,0 +1,123 @@
+"""Variable projection of few numbers: their derivatives are taken along lines on which textures follow.
+
+Where a number x and a texture t explain the same residual, a step of one at a fixed other is short. With the change S of the texture per
+unit of x, the derivative image of x is J = ∂I/∂x + (∂I/∂t) S. S is best where the texture explains nothing of J, (∂I/∂t)ᵀ W J = 0 with the
+second derivatives W of the loss. For a quadratic loss, the minimum by x along such a line is the same for every texture. So the step of x
+does not wait for the texture, whose own optimizer moves it. S is found step by step:
+
+    S ← S − γ L⁻¹ (∂I/∂t)ᵀ W J,        L = (∂I/∂t)ᵀ W (∂I/∂t) s / s.
+
+If no pixel darkens as a texel grows, L is no less than the Hessian of the texture for any s > 0, so these steps converge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from unrender.core import arrays, trees
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.estimators.capabilities import DerivativeImages
+from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.scene.problem import Problem
+from unrender.scene.upsampling import Upsampler
+
+__all__ = ["Response", "advanced"]
+
+_LEAST_GAIN = 0.25
+"""Smallest γ. The first is 1, and the k-th is 1 / k until then."""
+_CHANGE = 0.05
+"""Change of the textures for the derivative along s, relative to s."""
+_UNSEEN = 1e-3
+"""Share of the mean of L that is added to it, so that texels which hardly any pixel sees hardly move."""
+_LAST = 3
+"""Index of the random numbers of the derivative along s."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """Response of textures to a change of few numbers.
+
+    Attributes:
+        slopes: S, {key of a texture: (n, *shape)} for n elements of the numbers.
+        curvature: mean of L over steps, {key: shape}; {} before the first.
+        count: number of steps so far.
+    """
+
+    slopes: dict[str, np.ndarray]
+    curvature: dict[str, np.ndarray] = field(default_factory=dict)
+    count: int = 0
+
+    @classmethod
+    def zero(cls, parameters: Tree, keys: Sequence[str], elements: int) -> Response:
+        """Return the response of textures that do not follow."""
+        return cls({key: np.zeros((elements, *arrays.shape(parameters[key])), np.float32) for key in keys})
+
+    def upsampled(self, upsampler: Upsampler) -> Response:
+        """Return a response at the finer resolution, which restarts at 0."""
+        shapes = {key: np.empty(upsampler.problem.shapes(upsampler.step)[key]) for key in self.slopes}
+        return Response.zero(shapes, tuple(shapes), len(next(iter(self.slopes.values()), ())))
+
+
+def advanced(
+    response: Response, problem: Problem, parameters: Tree, images: DerivativeImages, spp: int, key: Key
+) -> tuple[Response, int]:
+    """Return the response after one step, and the number of paths traced.
+
+    Args:
+        response: response so far.
+        problem: problem with path gradients of the textures.
+        parameters: all parameters.
+        images: derivative images J along the present response.
+        spp: samples per pixel of the adjoints.
+        key: random numbers, independent of those of J.
+    """
+    session = problem.renderer.prepare(list(parameters), None)
+    sizes = {k: float(np.sqrt(np.mean(np.square(arrays.numpy(parameters[k]))))) or 1.0 for k in response.slopes}
+    slopes = {k: np.zeros(x.shape) for k, x in response.slopes.items()}
+    curvature = {k: np.zeros(x.shape[1:]) for k, x in response.slopes.items()}
+    traced = 0
+    for view, (elements, derivatives, weights) in images.views.items():
+        request = SampleRequest(problem.views[view].sensor, spp, key.fold(view).uint32())
+        paths = session.image(parameters, request).paths
+        other = replace(request, seed=key.fold(view).fold(_LAST).uint32())
+        along = _along(session, parameters, sizes, other)
+        for index, image in ((None, along), *zip(elements.tolist(), derivatives, strict=True)):
+            weighted = arrays.add_first_axis(problem.renderer.array((image * weights).astype(np.float32)))
+            gradient = session.adjoint(parameters, paths, weighted)
+            for k in slopes:
+                own = arrays.numpy(gradient[k]).astype(np.float64)
+                if index is None:
+                    curvature[k] += own / sizes[k]
+                else:
+                    slopes[k][index] += own
+        traced += (3 + 1) * spp * weights.shape[0] * weights.shape[1]
+    return _moved(response, slopes, curvature), traced
+
+
+def _along(session: RenderSession, parameters: Tree, sizes: Mapping[str, float], request: SampleRequest) -> np.ndarray:
+    """Return the derivative of the image by the textures along s, (H, W, 3)."""
+    states = {}
+    for key, value in trees.numpy(parameters).items():
+        change = _CHANGE * sizes.get(key, 0.0)
+        ends = np.stack([value + change, value - change]) if change else np.broadcast_to(value, (2, *value.shape))
+        states[key] = ends
+    one, other = arrays.numpy(session.image_batch(states, request)).astype(np.float64)
+    return (one - other) / (2.0 * _CHANGE)
+
+
+def _moved(response: Response, gradients: Mapping[str, np.ndarray], curvature: Mapping[str, np.ndarray]) -> Response:
+    """Return the response after the step for the gradients (∂I/∂t)ᵀ W J."""
+    count = response.count + 1
+    before = response.curvature or curvature
+    mean = {key: (before[key] + (x - before[key]) / count).astype(np.float32) for key, x in curvature.items()}
+    gain, slopes = max(1.0 / count, _LEAST_GAIN), {}
+    for key, own in response.slopes.items():
+        positive = np.maximum(mean[key].astype(np.float64), 0.0)
+        scale = positive + _UNSEEN * float(positive.mean())
+        change = np.divide(gradients[key], scale, out=np.zeros(own.shape), where=scale > 0.0)
+        slopes[key] = (own - gain * change).astype(np.float32)
+    return Response(slopes, mean, count) if all(np.isfinite(x).all() for x in slopes.values()) else response
