@@ -86,7 +86,11 @@ def test_a_colour_profile_other_than_srgb_is_reported(tmp_path: Path):
 
 def test_drops_alpha_and_keeps_grey_as_one_channel(tmp_path: Path):
     rgba = np.concatenate([COLOURS, np.full((6, 8, 1), 0.25, np.float32)], axis=2)
-    np.testing.assert_array_equal(images.read(bitmap(rgba, tmp_path / "a.exr")).values, COLOURS)
+    picture = images.read(bitmap(rgba, tmp_path / "a.exr"))
+    np.testing.assert_array_equal(picture.values, COLOURS)
+    np.testing.assert_array_equal(np.asarray(picture.opacity), rgba[..., 3])
+    rgba[..., 3] = 1
+    assert images.read(bitmap(rgba, tmp_path / "opaque.exr")).opacity is None
     assert images.read(bitmap(COLOURS[..., :1], tmp_path / "g.exr")).values.shape == (6, 8, 1)
 
 

@@ -301,6 +301,17 @@ def test_masks_beside_llffs_photographs_are_not_counted(tmp_path: Path) -> None:
     assert [(photograph.file, photograph.mask) for photograph in found] == list(zip(files, masks, strict=True))
 
 
+def test_the_alpha_of_a_floating_point_photograph_is_its_mask(tmp_path: Path) -> None:
+    mi = pytest.importorskip("mitsuba")
+    unrender.use("llvm_ad_rgb")
+    colours, alpha = np.full((6, 8, 3), 0.6, np.float32), np.linspace(0, 1, 48, dtype=np.float32).reshape(6, 8, 1)
+    mi.Bitmap(np.concatenate([colours * alpha, alpha], axis=2)).write(str(tmp_path / "a.exr"))
+    found = pictures.read(tmp_path / "a.exr")
+    np.testing.assert_allclose(np.asarray(found.alpha), alpha[..., 0])
+    np.testing.assert_allclose(found.values[alpha[..., 0] > 0], 0.6, rtol=1e-5)
+    np.testing.assert_allclose(pictures.read_mask(tmp_path / "a.exr"), alpha[..., 0])
+
+
 def test_broken_exif_is_passed_over(tmp_path: Path) -> None:
     text = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x02\0\x04\0\0\0ab\0\0\0\0\0\0"  # an orientation in letters
     for exif in (text, b"Exif\0\0II*\0\xff\xff\xff\xff"):

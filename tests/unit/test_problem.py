@@ -129,8 +129,18 @@ def test_references_are_float32_and_alpha_is_dropped():
     assert [view.reference.dtype for view in made.views] == [np.float32] * 2  # pyright: ignore
     np.testing.assert_array_equal(made.views[0].reference, REFERENCE)
     np.testing.assert_array_equal(made.views[1].reference, np.repeat(REFERENCE[..., :1], 3, axis=2))
-    (notice,) = made.notices
-    assert notice.startswith("view 1: reference has one channel")
+    assert [notice[:32] for notice in made.notices] == [
+        "view 0: reference has alpha, whi",
+        "view 1: reference has one channe",
+    ]
+
+
+def test_a_black_file_and_alpha_of_floats_say_so(tmp_path):
+    rgba = np.concatenate([REFERENCE, np.ones((HEIGHT, WIDTH, 1))], axis=2)
+    assert problem(views=[View(rgba)]).notices == []
+    np.save(tmp_path / "black.npy", np.zeros((HEIGHT, WIDTH, 3), np.float32))
+    (notice,) = problem(views=[View(tmp_path / "black.npy")]).notices
+    assert notice == "view 0: reference is black everywhere, so it can only darken what it sees"
 
 
 def test_eight_bit_values_are_linearised_and_it_says_so():

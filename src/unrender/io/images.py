@@ -19,6 +19,8 @@ READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".
 """File name extensions that `read` supports."""
 
 _ORIENTATION = 0x0112
+_OPAQUE = 0.999
+"""Least floating-point alpha that counts as 1."""
 
 
 @dataclass(frozen=True)
@@ -30,21 +32,23 @@ class Picture:
         notice: one line about the conversion of the values, "" for none.
         alpha: (H, W) float32 in [0, 1], if it was requested and integer values are not opaque everywhere; else None.
         labelled_xyz: whether the file names its channels X, Y and Z. The values are RGB in any case.
+        opacity: (H, W) alpha of floating-point values, in [0, 1], with which their colours are multiplied; None if it is 1 everywhere.
     """
 
     values: np.ndarray
     notice: str = ""
     alpha: np.ndarray | None = None
     labelled_xyz: bool = False
+    opacity: np.ndarray | None = None
 
 
 def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tuple[int, ...] = (1, 3, 4)) -> Picture:
     """Read an image from a file or an array.
 
     Args:
-        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). The alpha of floating-point values is ignored.
-            Floating-point values are linear. Unsigned integers of 8 and 16 bits are sRGB, and their range is mapped to [0, 1]. Other
-            integers and booleans must be 0 or 1, as in masks.
+        source: a file (`READABLE`), or an array (H, W), (H, W, 1), (H, W, 3) or (H, W, 4). Floating-point values are linear. Unsigned
+            integers of 8 and 16 bits are sRGB, and their range is mapped to [0, 1]. Other integers and booleans must be 0 or 1, as in
+            masks.
         linearise: whether to convert 8- and 16-bit values from sRGB; False for masks.
         alpha: whether to return the alpha of 8- and 16-bit values. Requires `linearise`.
         channels: numbers of channels that arrays may have; the second of 2 channels is alpha.
@@ -174,7 +178,8 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
     values = values.reshape(*values.shape[:2], -1)
     if not linearised:
         labelled = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.XYZ, mi.Bitmap.PixelFormat.XYZA)
-        return Picture(values, labelled_xyz=labelled)
+        opacity = _opacity(stored[..., -1]) if bitmap.has_alpha() and not encoded else None
+        return Picture(values, labelled_xyz=labelled, opacity=opacity)
     coverage = _coverage(stored[..., -1]) if transparent and alpha else None
     note = f", its alpha {'left out' if coverage is None else 'taken as mask'}" if transparent else ""
     return Picture(values, f"{bits}-bit sRGB, linearised{note}", coverage)
@@ -183,6 +188,12 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
 def _coverage(stored: np.ndarray) -> np.ndarray:
     """Return integer alpha as a fraction in [0, 1]."""
     return (stored / np.float32(np.iinfo(stored.dtype).max)).astype(np.float32)
+
+
+def _opacity(alpha: np.ndarray) -> np.ndarray | None:
+    """Return floating-point alpha in [0, 1]; None if it is 1 everywhere up to the rounding of a film's filter."""
+    values = np.clip(np.nan_to_num(alpha.astype(np.float32)), 0, 1)
+    return values if values.min() < _OPAQUE else None
 
 
 def _colour_channels(bitmap: Any) -> np.ndarray:
@@ -219,8 +230,9 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
         raise InputError(
             f"expected uint8 or uint16 (sRGB) or floating-point numbers (linear), got {array.dtype} beyond 0 and 1"
         )
+    opacity = _opacity(array[..., -1]) if array.shape[2] in (2, 4) else None
     with np.errstate(over="ignore"):
-        return Picture(np.ascontiguousarray(values, dtype=np.float32))
+        return Picture(np.ascontiguousarray(values, dtype=np.float32), opacity=opacity)
 
 
 def _check_finite(values: np.ndarray) -> None:

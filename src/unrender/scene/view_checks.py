@@ -10,8 +10,8 @@ References are linear in what the camera saw. Files with 8 and 16 bits per chann
 | `luminance`, `luminance_alpha` | (H, W), (H, W, 1) or (H, W, 2) | with the luminance of the image |
 
 A floating-point file with channels R, G and B is refused for a film of XYZ, since `mi.util.write_bitmap` names XYZ values so. Alpha of
-8- and 16-bit pictures multiplies the view's mask. Alpha of floating-point pictures is left out, since Mitsuba's films multiply colours
-with it. Negative values are refused, unless the film's reconstruction filter has negative lobes.
+8- and 16-bit pictures multiplies the view's mask. Alpha of floating-point pictures is left out with a notice, since Mitsuba's films
+multiply colours with it. Negative values are refused, unless the film's reconstruction filter has negative lobes.
 """
 
 from __future__ import annotations
@@ -99,6 +99,10 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
         notices.append("has one channel, with which red, green and blue of the image are each compared")
     elif grey:
         notices.append("is luminance, with which the image's luminance is compared")
+    if image.opacity is not None:
+        notices.append("has alpha, which is left out; if it is a mask, give it as the view's mask")
+    if isinstance(source, (str, Path)) and not values.any():  # arrays of zeros are placeholders
+        notices.append("is black everywhere, so it can only darken what it sees")
     full = np.array(np.broadcast_to(values, (*values.shape[:2], 3)))
     return Reference(full, image.alpha, bool(image.notice), tuple(notices))
 

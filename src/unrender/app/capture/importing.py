@@ -367,7 +367,8 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
 def _has_masks(capture: Capture) -> bool:
     """Return whether the capture has mask files, or files that can have an alpha channel."""
     return any(
-        p.mask is not None or p.file.suffix.lower() in (".png", ".tif", ".tiff", ".webp") for p in capture.photographs
+        p.mask is not None or p.file.suffix.lower() in (".exr", ".png", ".tif", ".tiff", ".webp")
+        for p in capture.photographs
     )
 
 

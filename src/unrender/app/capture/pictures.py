@@ -35,6 +35,8 @@ _QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 3}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 """{EXIF orientation: counter-clockwise quarter turns}; orientations 2, 4, 5 and 7 are also mirrored."""
 _MIRRORED = (2, 4, 5, 7)
+_LEAST_ALPHA = 1e-3
+"""Least alpha by which colours of floating-point files, which are multiplied with alpha, are divided."""
 _LONGEST_SIDE = 1 << 15
 """Exclusive limit of a side in pixels, set by OpenCV's `remap`."""
 _BROKEN = (OSError, ValueError, SyntaxError, struct.error, Image.DecompressionBombError)
@@ -47,7 +49,7 @@ class Pixels:
 
     Attributes:
         values: (H, W, 3) float32, linear.
-        alpha: (H, W) float32 in [0, 1]; None if the file has none, or if it is 1 everywhere.
+        alpha: (H, W) float32 in [0, 1]; None if the file has none, or if it is 1 everywhere. `values` are not multiplied with it.
     """
 
     values: np.ndarray
@@ -94,7 +96,9 @@ def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
     """
     array = _decode(path)
     if array is None:
-        return Pixels(_turn(_by_mitsuba(path).values, orientation), None)
+        picture = _by_mitsuba(path)
+        alpha = None if picture.alpha is None else _turn(picture.alpha, orientation)
+        return Pixels(_turn(picture.values, orientation), alpha)
     array = _turn(array, orientation)
     largest = np.iinfo(array.dtype).max
     curve = decode(np.arange(largest + 1) / largest, response).astype(np.float32)
@@ -112,8 +116,12 @@ def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
         if values.shape[2] == 4 and values[..., 3].min() < 1:
             return values[..., 3]
         return values[..., :3].mean(2)
-    values = _turn(images.read(path, linearise=False).values, orientation).mean(2)
-    return np.clip(values, 0, 1)
+    picture = images.read(path, linearise=False)
+    return (
+        np.clip(_turn(picture.values, orientation).mean(2), 0, 1)
+        if picture.opacity is None
+        else _turn(picture.opacity, orientation)
+    )
 
 
 def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
@@ -222,9 +230,12 @@ def _decode_opencv(path: Path, header: image_size.Header) -> np.ndarray:
 
 
 def _by_mitsuba(path: Path) -> Pixels:
-    values = images.read(path).values
+    picture = images.read(path)
+    values, alpha = picture.values, picture.opacity
     _check_size(path, values.shape[1], values.shape[0])
-    return Pixels(np.repeat(values, 3, 2) if values.shape[2] == 1 else values, None)
+    if alpha is not None:
+        values = values / np.maximum(alpha, _LEAST_ALPHA)[..., None]
+    return Pixels(np.repeat(values, 3, 2) if values.shape[2] == 1 else values, alpha)
 
 
 def _check_size(path: Path, width: int, height: int) -> None:
