@@ -47,7 +47,7 @@ def main() -> None:
     figure = plt.figure(figsize=(11, 4.1), layout="constrained")
     axes = figure.subplot_mosaic([["reference", "stock", "auto", "curve"], ["truth", "stock texture", "auto texture", "curve"]],
                                  width_ratios=[1, 1, 1, 1.3])  # fmt: skip
-    _show(axes["reference"], problem.given_views[0].reference, "reference")
+    _show(axes["reference"], problem.original_views[0].reference, "reference")
     _show(axes["truth"], problem.truth[KEY], "true texture")
     for name, settings in LOOPS.items():
         recorder = Recorder()

@@ -57,7 +57,7 @@ class Judge:
     def __init__(self, folder: Path, keys: list[str], spp: int):
         given = ur.Problem.from_file(folder / "held-out.toml")
         parameters = [ur.Parameter(key) for key in keys]
-        self.problem = ur.Problem(given.origin["scene"], parameters, given.given_views, max_depth=given.max_depth)
+        self.problem = ur.Problem(given.origin["scene"], parameters, given.original_views, max_depth=given.max_depth)
         self.folder, self.spp = folder, spp
         self.picture = np.zeros(0)
 

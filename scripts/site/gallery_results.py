@@ -17,20 +17,23 @@ import unrender as ur
 from unrender.display.pictures import shown_image
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "images" / "gallery"
-PIXELS, STEPS, SAMPLES, REFERENCE_SAMPLES = 48, 100, 64, 256
+PIXELS, STEPS = 48, 100
+LEAST_SAMPLES = 1024
+"""Fewest samples per pixel of the pictures; problems with noisier light have more samples in their references."""
 ENLARGED, GAP, QUALITY = 2, 4, 80
 
 
 def strip(name: str) -> bytes | None:
     """Return the JPEG of a problem; None for a problem without pictures."""
-    known = {option.name for option in ur.gallery.options(name)}
-    if "resolution" not in known:
+    defaults = {option.name: option.default for option in ur.gallery.options(name)}
+    if "resolution" not in defaults:
         return None
-    options = {"resolution": PIXELS} | ({"reference_spp": REFERENCE_SAMPLES} if "reference_spp" in known else {})
+    samples = max(LEAST_SAMPLES, defaults.get("reference_spp", 0))
+    options = {"resolution": PIXELS} | ({"reference_spp": samples} if "reference_spp" in defaults else {})
     problem = ur.gallery.problem(name, **options)
     result = ur.optimize(problem, steps=STEPS, seed=0, progress=False)
     reference = np.asarray(problem.views[0].reference)
-    pictures = [first_view(ur.render(problem, values, spp=SAMPLES)) for values in (result.initial, result.parameters)]
+    pictures = [first_view(ur.render(problem, values, spp=samples)) for values in (result.initial, result.parameters)]
     shown = [enlarged(shown_image(picture, like=reference)) for picture in (*pictures, reference)]
     gap = np.full((shown[0].shape[0], GAP, 3), 255, np.uint8)
     joined = np.concatenate([shown[0], gap, shown[1], gap, shown[2]], axis=1)

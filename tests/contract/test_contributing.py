@@ -68,7 +68,7 @@ grey = make("Grey", strength=0.5)
 found["grey"] = grey.apply(np.array([[1.0, 3.0]])).tolist()
 asked = problem()
 asked = ur.Problem(
-    asked.renderer, [ur.Parameter("colour", 0.5, preconditioner=grey), ur.Parameter("map", 0.5)], asked.given_views, truth=asked.truth
+    asked.renderer, [ur.Parameter("colour", 0.5, preconditioner=grey), ur.Parameter("map", 0.5)], asked.original_views, truth=asked.truth
 )
 found["preconditioner"] = error(asked, ur.PathGradient(spp=4), sgd)
 sampler = make("Alternating", inner={"type": "Uniform", "count": 8}, every=3)
@@ -105,7 +105,7 @@ def tinted():
     return specification.scene() | {
         "wall": {"type": "rectangle", "bsdf": {"type": "tinted", "tint": {"type": "rgb", "value": [0.6, 0.4, 0.3]}}}
     }
-asked = ur.Problem(tinted, [ur.Parameter("wall.bsdf.tint", 0.5, bounds=(0, 1))], wall.given_views, max_depth=2,
+asked = ur.Problem(tinted, [ur.Parameter("wall.bsdf.tint", 0.5, bounds=(0, 1))], wall.original_views, max_depth=2,
                    truth={"wall.bsdf.tint": [0.6, 0.4, 0.3]})
 found["BSDF"] = error(asked, ur.PathGradient(ur.images.RecursiveControlVariate(), spp=2), adam, 40)
 print(json.dumps(found))

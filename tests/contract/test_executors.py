@@ -33,7 +33,7 @@ class Counting(LocalExecutor):
 
 def distributed(problem: ur.Problem) -> DistributedExecutor:
     shares = assign([16] * VIEWS, 2)
-    parts = [problem.replaced(views=[problem.given_views[view] for view in views]) for views in shares]
+    parts = [problem.replaced(views=[problem.original_views[view] for view in views]) for views in shares]
     hosts = LocalHosts(tuple(ViewShare(part, views) for part, views in zip(parts, shares, strict=True)))
     return DistributedExecutor(problem, shares, hosts)
 

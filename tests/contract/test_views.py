@@ -19,7 +19,7 @@ WEIGHTS = np.array([8.0, 2.0, 1.0, 1.0, 1e-6])
 def weighted() -> ur.Problem:
     """Five views of one picture; the last of hardly any weight, as if it were black."""
     found = problem(views=5, noise=0.3)
-    views = [dataclasses.replace(view, weight=float(w)) for view, w in zip(found.given_views, WEIGHTS, strict=True)]
+    views = [dataclasses.replace(view, weight=float(w)) for view, w in zip(found.original_views, WEIGHTS, strict=True)]
     return ur.Problem(found.renderer, found.parameters, views, found.loss)
 
 

@@ -162,7 +162,7 @@ def test_a_file_names_the_aov_and_a_run_folder_keeps_it(tmp_path: Path) -> None:
         ur.Problem.from_file(tmp_path / "other.toml")
     ur.optimize(made, "plain", steps=1, run_directory=tmp_path / "run")
     again = ur.Problem.from_file(tmp_path / "run" / "problem.toml")
-    assert again.given_views[0].aov == "depth"
+    assert again.original_views[0].aov == "depth"
     assert fingerprint(again) == fingerprint(made)
 
 

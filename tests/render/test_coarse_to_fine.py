@@ -425,7 +425,7 @@ def test_without_noise_coarse_to_fine_finds_the_field() -> None:
     found = ur.Problem(
         renderer, [parameter], [ur.View(renderer.at(smooth.shape).exact({KEY: smooth}))], truth={KEY: smooth}
     )
-    plain = ur.Problem(renderer, [ur.Parameter(KEY, initial=0.5)], found.given_views, truth={KEY: smooth})
+    plain = ur.Problem(renderer, [ur.Parameter(KEY, initial=0.5)], found.original_views, truth={KEY: smooth})
     ends = [
         ur.optimize(each, ur.PathGradient(spp=8), ur.optimizers.Adam(0.02), 180).history[-1]["parameter_error"][KEY]
         for each in (found, plain)

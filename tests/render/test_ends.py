@@ -113,7 +113,7 @@ def test_a_run_that_is_given_up_has_failed(tmp_path: Path) -> None:
 def test_bounds_do_not_hide_a_step_that_is_no_number(tmp_path: Path) -> None:
     """The nearest point inside the bounds to what is no number may be a bound."""
     made = ur.gallery.problem("exponential")
-    problem = ur.Problem(made.renderer, [ur.Parameter(RATE, initial=1.0, bounds=(0.5, 4.0))], made.given_views)
+    problem = ur.Problem(made.renderer, [ur.Parameter(RATE, initial=1.0, bounds=(0.5, 4.0))], made.original_views)
     result = ur.optimize(problem, ur.PathGradient(spp=2), Exploding(since=0), 3)
     np.testing.assert_array_equal(result.parameters[RATE], result.initial[RATE])
     assert result.skipped == 3

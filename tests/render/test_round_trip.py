@@ -72,7 +72,7 @@ def compare(problem: ur.Problem, held_out: ur.Problem, values: dict[str, np.ndar
     judged = ur.Problem(
         held_out.origin["scene"],
         [ur.Parameter(key) for key in shown],
-        held_out.given_views,
+        held_out.original_views,
         max_depth=held_out.max_depth,
     )
     own, other = (

@@ -125,7 +125,7 @@ def test_positive_numbers_move_as_logarithms() -> None:
     ):
         base = problem()
         parameters = [dataclasses.replace(p, **change) if p.key == "gain" else p for p in base.parameters]
-        other = Problem(base.renderer, parameters, base.given_views)
+        other = Problem(base.renderer, parameters, base.original_views)
         assert chosen(other)[1].reparameterised == (), change
 
 

@@ -43,7 +43,7 @@ ESTIMATORS = {
 
 def shares_of(problem: ur.Problem, shares: Sequence[tuple[int, ...]]) -> tuple[ViewShare, ...]:
     def one(views: tuple[int, ...]) -> ViewShare:
-        given = [problem.given_views[view] for view in views]
+        given = [problem.original_views[view] for view in views]
         return ViewShare(ur.Problem(problem.renderer, problem.parameters, given, problem.loss), views)
 
     return tuple(one(views) for views in shares)
@@ -166,7 +166,7 @@ def test_importance_maps_come_from_the_workers() -> None:
 def test_auto_chooses_the_same_whoever_has_the_views() -> None:
     given = analytic.problem(views=VIEWS)
     positive = [ur.Parameter("colour", bounds=(0, float("inf"))), ur.Parameter("map")]
-    problem = ur.Problem(given.renderer, positive, given.given_views, ur.losses.L1())
+    problem = ur.Problem(given.renderer, positive, given.original_views, ur.losses.L1())
     alone, together = (ur.optimize(one, "auto", steps=6, progress=False) for one in (problem, dealt(problem, 2)))
     assert "reparameterised=('colour',)" in alone.settings["optimizer"]
     assert apart(alone, together) < 1e-12
@@ -285,7 +285,7 @@ def test_differences_do_not_add_up() -> None:
 def test_only_what_changed_is_sent() -> None:
     given = analytic.problem(views=2)
     rates = [ur.Parameter("colour", learning_rate=0.02), ur.Parameter("map", learning_rate=1e-30)]
-    problem = dealt(ur.Problem(given.renderer, rates, given.given_views), 1)
+    problem = dealt(ur.Problem(given.renderer, rates, given.original_views), 1)
     executor = problem.executor
     assert isinstance(executor, DistributedExecutor)
     ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(learning_rate=1.0), steps=3, progress=False)

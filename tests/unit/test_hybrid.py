@@ -127,7 +127,7 @@ def test_a_perturbed_texture_with_a_preconditioner_and_a_path_gradient_are_by_th
     asked = ur.Problem(renderer, [a, b], [ur.View(renderer.exact({}))])
     perturbed = smoothed(samples=64, orthogonal=True)
     found = ur.estimate(asked, ur.estimators.HybridGradient(ur.PathGradient(), perturbed, ("a",)))
-    plain = ur.Problem(renderer, [ur.Parameter("a", 0.5), ur.Parameter("b", 0.5)], asked.given_views)
+    plain = ur.Problem(renderer, [ur.Parameter("a", 0.5), ur.Parameter("b", 0.5)], asked.original_views)
     exactly = ur.estimate(plain, ur.PathGradient()).gradient
     assert found.preconditioned
     np.testing.assert_allclose(found.gradient["b"], 0.4 * exactly["b"], rtol=1e-5)  # x = 0.1 + exp u

@@ -172,6 +172,12 @@ def test_a_reference_with_saturated_pixels_says_so():
     assert not any("saturated" in notice for notice in problem(views=View(levels)).notices)
 
 
+def test_the_former_name_of_the_original_views_warns() -> None:
+    problem = Problem(Renderer(), [Parameter("wall.value", 0.5)], [View(np.zeros((HEIGHT, WIDTH, 3)))])
+    with pytest.warns(DeprecationWarning, match=r"given_views is now Problem\.original_views"):
+        assert problem.given_views is problem.original_views
+
+
 def test_one_view_or_parameter_may_be_given_bare():
     made = problem(WALL, VIEW)
     assert (len(made.parameters), len(made.views)) == (1, 1)

@@ -78,7 +78,7 @@ def run(
     def problem(coarse: bool) -> ur.Problem:
         way = ur.scene.CoarseToFine(changes, states="carry") if coarse else None
         parameters = [replace(parameter, coarse_to_fine=way) for parameter in made.parameters]
-        return made.replaced(parameters=parameters, views=[made.given_views[number] for number in seen])
+        return made.replaced(parameters=parameters, views=[made.original_views[number] for number in seen])
 
     def ended(name: str, seed: int, result: ur.Result) -> None:
         if result.warnings:

@@ -73,5 +73,5 @@ def smoothed(made: ur.Problem) -> ur.Problem:
     preconditioner = ur.preconditioners.Sobolev()
     parameters = tuple(replace(parameter, preconditioner=preconditioner) for parameter in made.parameters)
     return ur.Problem(
-        made.renderer, parameters, made.given_views, made.loss, made.max_depth, truth=made.truth, name=made.name
+        made.renderer, parameters, made.original_views, made.loss, made.max_depth, truth=made.truth, name=made.name
     )

@@ -109,7 +109,7 @@ def run(
         "resolution": resolution, "grid_resolution": grid, "views": VIEWS, "reference_spp": reference_spp, "balls": balls
     }  # fmt: skip
     made = ur.gallery.problem("nerf-volume", **options)
-    views = [view for number, view in enumerate(made.given_views) if number not in UNSEEN]
+    views = [view for number, view in enumerate(made.original_views) if number not in UNSEEN]
     problem = made.replaced(views=views)
     if processor:
         dr.set_thread_count(1)

@@ -162,8 +162,8 @@ class AdaptiveCounts:
         values = samples.normalised()
         gain = self._gain(float(counts.mean()))
         if state.pooled:
-            judgements = samples.judged(values, state.pooled)
-            evidence = uniform_share.observed(evidence, judgements, state.density[tile], decay, gain)
+            observed = samples.uniform_evidence(values, state.pooled)
+            evidence = uniform_share.observed(evidence, observed, state.density[tile], decay, gain)
         maps, paths = list(state.maps), state.counts * decay
         for index, value in enumerate(values):
             total, number = samples.summed(value, len(tiles.views))

@@ -279,8 +279,8 @@ class GuidedSampler:
         decay, evidence = _MEMORY**state.since, state.evidence
         values = samples.normalised()
         if self.rule.needs_second_moment and state.denoised:
-            judgements = samples.judged(values, state.denoised)
-            evidence = uniform_share.observed(evidence, judgements, state.density[samples.tile], decay)
+            observed = samples.uniform_evidence(values, state.denoised)
+            evidence = uniform_share.observed(evidence, observed, state.density[samples.tile], decay)
         maps, counts = list(state.maps), [count * decay for count in state.counts]
         for index, value in enumerate(values):
             total, count = samples.summed(value, len(tiles.views))

@@ -252,7 +252,7 @@ class TileSamples:
         sums = [np.bincount(self.tile, value * paths, tiles) for value in values.T]
         return np.stack(sums, axis=1), np.bincount(self.tile, paths, tiles)
 
-    def judged(self, values: Maps, denoised: Maps) -> np.ndarray:
+    def uniform_evidence(self, values: Maps, denoised: Maps) -> np.ndarray:
         """Return y of `uniform_share.observed`, (2, N): each factor of Eq. 12 from the samples, times the other one from the map."""
         factors = [
             (values[index] * denoised[1 - index][self.tile]).sum(axis=1) * self.weights for index in range(FACTORS)

@@ -129,7 +129,7 @@ def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
     made = Problem(
         renderer,
         schedules,
-        problem.views if plain else problem.given_views,
+        problem.views if plain else problem.original_views,
         problem.loss,
         problem.max_depth,
         truth={key: value for key, value in problem.truth.items() if key not in meshes},

@@ -202,8 +202,8 @@ class Verify(Callback):
         difference = misfit(last.residuals, earlier.residuals, references, weights, least, fresh)
         if difference is None:
             return []
-        judged = difference.by_pixel and problem.has_truth
-        if judged and difference.error**2 <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
+        compares_truth = difference.by_pixel and problem.has_truth
+        if compares_truth and difference.error**2 <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
             return []
         cause = "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
         if any(unknown.prior is not None for unknown in problem.unknowns.values()):

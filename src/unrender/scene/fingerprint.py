@@ -86,7 +86,7 @@ def _take(problem: Problem) -> dict[str, str]:
         parts[f"view {index}: mask"] = "none" if view.mask is None else _of_array(np.asarray(view.mask))
     if (layer := expression_layer(problem.renderer)) is not None:
         parts |= {f"expression of {one.key}": one.text or "a function" for one in layer.expressions}
-    for index, view in enumerate(problem.given_views):
+    for index, view in enumerate(problem.original_views):
         known = {} if view.known is None else dict(sorted(view.known.items()))
         fields = {
             f"known {key}": str(x) if isinstance(x, (str, Path)) else _of_array(np.asarray(x, np.float32))

@@ -84,7 +84,7 @@ class Problem(ViewLosses):
         unknowns: {key: `Unknown`}: the parameters with their defaults filled in, in order.
         views: tuple of `View`, with the reference as a float32 array (H, W, 3), and the mask as (H, W) or None. If all references exceed
             512 MiB, they are stored in a temporary file, and `np.asarray` reads one.
-        given_views: tuple of `View`, as passed.
+        original_views: tuple of `View`, as passed to the constructor.
         loss, max_depth, name: as above.
         origin: how to recreate the problem: {"scene": path of the XML}, plus "file", the path of the problem file, if there is one;
             {"gallery": name, "options": {...}}; empty if only the program that made it can recreate it.
@@ -101,7 +101,7 @@ class Problem(ViewLosses):
     renderer: Renderer
     unknowns: Mapping[str, Unknown]
     views: tuple[View, ...]
-    given_views: tuple[View, ...]
+    original_views: tuple[View, ...]
     loss: Loss
     max_depth: int
     name: str
@@ -130,9 +130,9 @@ class Problem(ViewLosses):
         check_max_depth(max_depth)
         checked_loss = check_loss(L2() if loss is None else loss)
         checked_parameters: tuple[Parameter, ...] = check_sequence(parameters, Parameter, "parameters")
-        given_views: tuple[View, ...] = check_sequence(views, View, "views")
+        original_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
-        renderer, located = _opened(scene, max_depth, checked_parameters, given_views, expressions or {})
+        renderer, located = _opened(scene, max_depth, checked_parameters, original_views, expressions or {})
         unknowns = _unknowns(checked_parameters, renderer, truth or {}, surfaces or {})
         checked_views, view_notices = check_views(located, renderer, checked_loss)
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))
@@ -141,7 +141,7 @@ class Problem(ViewLosses):
             renderer=renderer,
             unknowns=unknowns,
             views=checked_views,
-            given_views=given_views,
+            original_views=original_views,
             loss=checked_loss,
             max_depth=max_depth or longest_path(renderer),
             name=name or (path.stem if path else "problem"),
@@ -149,7 +149,7 @@ class Problem(ViewLosses):
             notices=[
                 *renderer_notices(renderer),
                 *unknown_notices,
-                *known_angles(given_views, renderer.parameters()),
+                *known_angles(original_views, renderer.parameters()),
                 *view_notices,
             ],
             references=References(checked_views, renderer.array),
@@ -187,7 +187,7 @@ class Problem(ViewLosses):
         made = Problem(
             self.renderer,
             checked_parameters,
-            self.given_views if views is None else views,
+            self.original_views if views is None else views,
             self.loss if loss is None else loss,
             self.max_depth,
             truth={key: value for key, value in self.truth.items() if key in keys} if truth is None else truth,

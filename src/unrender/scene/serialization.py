@@ -54,7 +54,7 @@ def _described(problem: Problem, folder: Path) -> dict[str, Any]:
     store = _Arrays(folder if rebuilt else None)
     parameters = [_parameter(index, unknown, store) for index, unknown in enumerate(problem.unknowns.values())]
     views = []
-    for index, view in enumerate(problem.given_views):
+    for index, view in enumerate(problem.original_views):
         table: dict[str, Any] = {"sensor": int(view.sensor), "weight": float(view.weight)}
         for name, picture in (("reference", view.reference), ("mask", view.mask)):
             if picture is not None:

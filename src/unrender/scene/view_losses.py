@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import numpy as np
 
@@ -19,10 +20,17 @@ class ViewLosses:
 
     loss: Loss
     views: tuple[View, ...]
+    original_views: tuple[View, ...]
     renderer: Renderer
     references: References
     _references: dict[int, Array]
     _masks: dict[int, Array | None]
+
+    @property
+    def given_views(self) -> tuple[View, ...]:
+        """Former name of `original_views`. Version 0.2 removes it."""
+        warnings.warn("Problem.given_views is now Problem.original_views", DeprecationWarning, stacklevel=2)
+        return self.original_views
 
     def reference(self, view: int) -> Array:
         """Return the view's reference as an array of the renderer, (H, W, 3)."""

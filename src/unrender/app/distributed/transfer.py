@@ -46,10 +46,10 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     Raises:
         InputError: the problem cannot be sent: it has a loaded scene, or a function or object of this process.
     """
-    located_views = [_located(problem.given_views[view], "reference", "mask", "scene") for view in views]
+    located_views = [_located(problem.original_views[view], "reference", "mask", "scene") for view in views]
     parameters = tuple(_located(parameter, "initial") for parameter in problem.parameters)
     sensors = sensors_with_rows(problem.renderer)
-    if sensors is not None and any(view.own_world for view in problem.given_views):
+    if sensors is not None and any(view.own_world for view in problem.original_views):
         raise InputError(
             f"workers: {problem.name} has camera parameters of photographs and views of different scenes, which workers do not "
             "support together; leave --workers out"

@@ -104,21 +104,21 @@ def judge(
     held_out_file = scenes.find(Path(run), problem) if held_out is None else Path(held_out)
     values, truth = _recovered(Path(run), problem, result)
     of_camera = {key: values[key] for key in (VIGNETTING, RESPONSE) if key in values}
-    judged, values, notices = _problem(problem, held_out_file, values, result)
+    target, values, notices = _problem(problem, held_out_file, values, result)
     measured = light is None or held_out is not None
     exposed = any(parameter.key == EXPOSURE for parameter in problem.parameters)
     notices += [*reopen.scene_changes(problem, result), *(_unknown_of_photographs(problem) if measured else [])]
 
     def fill(folder: Path) -> tuple[list[Measures], Albedo | None]:
         with tempfile.TemporaryDirectory() as scratch:
-            images, relit, albedo = _render(judged, values, truth, light, not measured, spp, Path(scratch), folder)
+            images, relit, albedo = _render(target, values, truth, light, not measured, spp, Path(scratch), folder)
         if measured and light is not None:
             images, relit = relit, []
         if measured:
-            images = _photographed(judged, images, of_camera, exposed)
-        measures = _measure(judged, images) if measured else []
-        pictures.write(folder, judged, images, relit, measures)
-        record = _record(judged, measures, albedo, held_out_file, environment, spp, notices)
+            images = _photographed(target, images, of_camera, exposed)
+        measures = _measure(target, images) if measured else []
+        pictures.write(folder, target, images, relit, measures)
+        record = _record(target, measures, albedo, held_out_file, environment, spp, notices)
         (folder / RECORD).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         return measures, albedo
 
@@ -130,7 +130,7 @@ def judge(
         notices.append(metrics.MISSING)
     if not measured:
         notices.append("nothing is measured: the photographs show another light; see --held-out")
-    return Judgement(place, tuple(names_of(judged)), tuple(measures), albedo, tuple(notices))
+    return Judgement(place, tuple(names_of(target)), tuple(measures), albedo, tuple(notices))
 
 
 def _recovered(run: Path, problem: Problem, result: RunFolder) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -175,15 +175,15 @@ def _problem(
     notices = [f"{', '.join(left_out)}: not in the scene of {held_out.name}, left out"] if left_out else []
     bounds = {parameter.key: parameter.bounds for parameter in problem.parameters if parameter.keys is None}
     plain = [Parameter(key, bounds=bounds.get(key)) for key in shared]
-    judged = Problem(other.origin["scene"], plain, other.given_views, max_depth=problem.max_depth, name=other.name)
-    if not isinstance(judged.renderer, MitsubaRenderer):
+    target = Problem(other.origin["scene"], plain, other.original_views, max_depth=problem.max_depth, name=other.name)
+    if not isinstance(target.renderer, MitsubaRenderer):
         raise InputError(f"{held_out}: it is not rendered by Mitsuba")
-    judged = reopen.with_meshes(judged, run)
+    target = reopen.with_meshes(target, run)
     values = {key: parameters[key] for key in shared}
-    for key, shape in judged.shapes().items():
+    for key, shape in target.shapes().items():
         if shape != np.shape(values[key]):
             raise InputError(f"{held_out}: {key} has shape {shape}, the run's {np.shape(values[key])}")
-    return judged, values, notices
+    return target, values, notices
 
 
 def _render(

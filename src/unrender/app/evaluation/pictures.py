@@ -84,7 +84,7 @@ def names_of(problem: Problem) -> list[str]:
     """Return the names of the photographs: file names without extension."""
     return [
         Path(view.reference).stem if isinstance(view.reference, (str, Path)) else f"view {index}"
-        for index, view in enumerate(problem.given_views)
+        for index, view in enumerate(problem.original_views)
     ]
 
 

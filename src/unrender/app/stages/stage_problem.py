@@ -58,7 +58,7 @@ class StagedProblem:
         return cls(
             Path(problem.origin["scene"]),
             parameters,
-            problem.given_views,
+            problem.original_views,
             problem.loss,
             problem.max_depth,
             problem.truth,

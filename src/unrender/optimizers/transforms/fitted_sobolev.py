@@ -128,7 +128,7 @@ class StrengthFit:
             if fresh is not None:
                 newer = _Pair(previous, fresh, self.last, preconditioner.summary(fresh))
                 fit = fit._with_fresh(preconditioner, pair, newer)
-            fit = fit._judged() if fit.unjudged >= _ROWS else fit
+            fit = fit._tested() if fit.unjudged >= _ROWS else fit
         return fit if summary is None else replace(fit, last=summary)
 
     def _with_pair(self, preconditioner: Sobolev, pair: _Pair) -> StrengthFit:
@@ -151,7 +151,7 @@ class StrengthFit:
             return self
         return replace(self, fresh=(*self.fresh, row)[-2 * _ROWS :], unjudged=self.unjudged + 1)
 
-    def _judged(self) -> StrengthFit:
+    def _tested(self) -> StrengthFit:
         """Return the fit after a test by the new gradients."""
         rows = np.stack(self.fresh)
         products, squares = rows[:, 0], rows[:, 1]

@@ -58,8 +58,8 @@ class GradientBlocks(TransformState):
 class LastingAgreement(StepTransform):
     """Estimate how much of the agreement of successive gradients is signal, for estimators that reuse samples.
 
-    Successive gradients share reused noise, which looks like agreement. Gradients that are further apart than the memory of the estimator
-    share the signal alone. Steps are divided into blocks, each a sixth of the steps so far, and at least `shortest`. With the mean
+    Reused noise correlates successive gradients. Gradients that are further apart than the memory of the estimator share the signal
+    alone. Steps are divided into blocks, each a sixth of the steps so far, and at least `shortest`. With the mean
     gradient m_k of block k, the lasting fraction is
 
         m_k · m_{k-2} / ⟨g_t · g_{t-1}⟩,
