@@ -230,9 +230,7 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
             break
         again = numbers.differences(directions, key.fold(_PASSES + 1 + _REPEATS + index))
         directions, length = _directions(again, numbers.limits, change)
-    check = _number_check(
-        numbers, _Fit.of(numbers, *_repeated(numbers, directions, key, until - 2.0 * longest)), widths
-    )
+    check = _checked(numbers, _Fit.of(numbers, *_repeated(numbers, directions, key, until - 2.0 * longest)), widths)
     return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed) if fixed else check
 
 
@@ -348,7 +346,7 @@ def _better(residuals: np.ndarray, before: np.ndarray) -> float:
     return max(float(x.sum()) / max(math.sqrt(float(np.square(x).sum())), 1e-300) for x in (changes, calm))
 
 
-def _number_check(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
+def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     """Return the check of a fit: standard errors, and a line for each number that is undetermined or had not settled."""
     posed = numbers.rigid | (numbers.sizes <= 0.0)
     longest = 2.0 * numbers.limits[: numbers.count]
