@@ -66,7 +66,7 @@ def section(benchmark: Benchmark) -> str | None:
         f"`{record['command']}`, {record['date']}, {hardware['cores']} cores of {hardware['processor']}, "
         f"Mitsuba {versions['mitsuba']}."
     )
-    parts = [f"## {title}", measured, notes, benchmark.table(record)]
+    parts = [f"## {title}", notes, measured, benchmark.table(record)]
     return "\n\n".join(filter(None, [*parts, *on_a_gpu(benchmark)]))
 
 

@@ -22,7 +22,7 @@ AXES = {
     "opencv": np.diag([1.0, -1.0, -1.0]),
     "llff": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
 }
-"""For each convention, its x, y and z axis as columns in the axes right, up, backwards."""
+"""Columns x, y and z of each convention, in the axes right, up, backwards."""
 
 
 def pose(matrix: object, axes: str, world_to_camera: bool, where: str) -> tuple[np.ndarray, float]:

@@ -204,7 +204,7 @@ class _BlackBox:
     options: SamplingOptions
     joint: bool = False
     derivatives: list[JointDerivatives] = field(default_factory=list)
-    """With `joint`, derivatives of each item from the last `first_order`."""
+    """Derivatives of each item from the last `first_order`; [] without `joint`."""
 
     def values(self, phi: np.ndarray) -> np.ndarray:
         return self._evaluate(phi, np.arange(len(phi)))
