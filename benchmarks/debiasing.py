@@ -62,14 +62,12 @@ class DebiasedGradient:
         return ur.protocols.Capabilities(ur.protocols.Gradient)
 
     def init(self, problem: ur.Problem, parameters: Tree) -> PlainState:
-        """See `Estimator.init`."""
         prepare(problem, parameters)
         return PlainState()
 
     def estimate(
         self, problem: ur.Problem, parameters: Tree, state: PlainState, key: Key
     ) -> tuple[Estimate, PlainState]:
-        """See `Estimator.estimate`."""
         session, groups = prepare(problem, parameters), leave_one_out_groups(self.spp)
         size = self.spp - self.spp // groups
         gradients, losses, samples = [], [], 0

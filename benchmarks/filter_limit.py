@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 import unrender as ur
+from benchmarks import markdown
 from benchmarks.internals import mi
 from unrender.gallery.poster import Poster
 
@@ -62,11 +63,8 @@ def limits(filters: tuple[str, ...] = FILTERS, pictures: int = _PICTURES) -> dic
 def main() -> None:
     """Print the table."""
     ur.use()
-    print(
-        "| filter | amplification | deviation of a sample over box | limit of error by box over error |\n|---|---|---|---|"
-    )
-    for name, row in limits().items():
-        print(f"| {name} | {' | '.join(f'{x:.2f}' for x in row)} |")
+    head = "filter | amplification | deviation of a sample over box | limit of error by box over error"
+    print(markdown.table(head, ([name, *(f"{x:.2f}" for x in row)] for name, row in limits().items())))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import Key, PixelSampler
+from benchmarks.internals import Key, PixelSampler, Tree
 
 SCHEMES: dict[str, Callable[..., PixelSampler]] = {
     "uniform": ur.pixels.Uniform,
@@ -26,10 +26,10 @@ def pixels(scheme: str, count: int, **options: Any) -> PixelSampler:
 
 
 def gradients(
-    problem: ur.Problem, estimator: ur.PathGradient, runs: int, seed: int = 0
+    problem: ur.Problem, estimator: ur.PathGradient, runs: int, seed: int = 0, at: Tree | None = None
 ) -> tuple[np.ndarray, int, dict[int, np.ndarray]]:
-    """(runs, n) independent estimates at the start, paths of one, and the pixel probabilities they used."""
-    at = problem.initial()
+    """(runs, n) independent estimates at the start, or at given parameters, paths of one, and the pixel probabilities they used."""
+    at = at or problem.initial()
     state = estimator.init(problem, at)
     first, state = estimator.estimate(problem, at, state, Key(2 * seed))
     rows, samples = [], 0

@@ -88,11 +88,9 @@ class Recorder(ur.protocols.Callback):
         self.since = self.spent = 0.0
 
     def on_start(self, run: Any) -> None:
-        """See `Callback.on_start`."""
         self.since = self.clock() if self.clock else 0.0
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
         self.steps, self.spent = run.step, self.spent + self.clock() - self.since if self.clock else run.clock
         if run.stopped or run.progress() >= self.due:
             self.due = run.progress() + self.every
@@ -195,12 +193,7 @@ def race(
         (rate, tried), recorders = chosen[entrant.name], found[entrant.name]
         runs: Any = {error: [recorder.points[error] for recorder in recorders] for error in recorders[0].points}
         final: Any = {error: median_and_range([run[-1][2] for run in each]) for error, each in runs.items()}
-        entry = {
-            "group": entrant.group,
-            "rate": rate,
-            "tried": tried,
-            "steps": [recorder.steps for recorder in recorders],
-        }
+        entry = {"group": entrant.group, "rate": rate, "tried": tried, "steps": [each.steps for each in recorders]}
         methods[entrant.name] = entry | {"runs": runs.get("", runs), "final": final.get("", final)}
     return methods
 

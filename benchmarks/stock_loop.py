@@ -94,12 +94,6 @@ def stock_loop(
             step += 1
             if not warm and (step % every == 0 or clock >= seconds or step >= steps):
                 now = {key: mi.TensorXf(dr.ravel(dr.detach(optimizer[key])), tuple(start[key].shape)) for key in start}
-                history.append(
-                    {
-                        "step": step - 1,
-                        "seconds": clock,
-                        "loss": value,
-                        "parameter_error": (error or problem.parameter_error)(now),
-                    }
-                )
+                history.append({"step": step - 1, "seconds": clock, "loss": value})
+                history[-1]["parameter_error"] = (error or problem.parameter_error)(now)
     return history

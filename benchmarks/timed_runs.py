@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks.peers.drivers.recorder import BudgetSpentError, Recorder
 from benchmarks.runner.timing import work_time
 
+Point = tuple[float, dict[str, np.ndarray]]
+"""Processor seconds, and parameters."""
 POINTS = 40
 """Of a curve."""
 _PICTURE_SPP = 64
@@ -25,23 +28,23 @@ class Kept(ur.protocols.Callback):
     """
 
     def __init__(self, seconds: float, points: int = POINTS):
-        self.found: list[tuple[float, dict[str, np.ndarray]]] = []
-        self.steps = 0
-        self._seconds, self._every, self._next, self._clock = seconds, seconds / points, 0.0, 0.0
-        self._since: float | None = None
+        self._recorder = Recorder(seconds, points, timer=work_time)
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        """See `Callback.on_step`."""
-        now = work_time()
-        # The first step is only known by what the others take.
-        self._clock += 0.0 if self._since is None else now - self._since
-        self.steps += 1
-        if self._clock >= self._next or self._clock >= self._seconds:
-            self._next = self._clock + self._every
-            self.found.append((self._clock, run.full()))
-        if self._clock >= self._seconds:
+        try:
+            self._recorder.step(run.full)
+        except BudgetSpentError:
             run.stop()
-        self._since = work_time()
+
+    @property
+    def steps(self) -> int:
+        """Number of steps so far."""
+        return self._recorder.steps
+
+    @property
+    def found(self) -> list[Point]:
+        """(processor seconds, parameters) along the run."""
+        return [(seconds, values) for seconds, _, values in self._recorder.kept]
 
 
 def blind(problem: ur.Problem) -> ur.Problem:

@@ -142,12 +142,8 @@ def run(
         paths: of all differences of pictures for J
     """
     for name in problem:
-        if name in FOREIGN:
-            if assets is None:
-                raise ur.InputError(f"{name}: give --assets, the folder of the scenes of others")
-            opened = scenes.problem(name, assets, *FOREIGN[name], _REFERENCE_SPP)
-        else:
-            opened = ur.gallery.problem(name, **GALLERY[name], loss="L2")
+        sizes = (*FOREIGN[name], _REFERENCE_SPP) if name in FOREIGN else ()
+        opened = scenes.problem(name, assets, *sizes, **GALLERY.get(name, {}), loss="L2")
         unbiased, most, rows = information(opened, paths)
         error, runs = error_of(opened), []
         for seed in range(seeds):

@@ -110,9 +110,14 @@ def _ours(task: Task, spp: int, seed: int) -> ur.Renderer:
     return ur.Renderer(task.scene, [task.key], spp=spp, max_depth=task.max_depth, seed=seed, image=image, groups=2)
 
 
-def _stock(task: Task, spp: int, seed: int) -> Callable[[Any], Any]:
+def _loaded(task: Task) -> tuple[Any, Any]:
     scene = mi.load_dict({**task.scene(), "integrator": {"type": "prb", "max_depth": task.max_depth}})
-    params, numbers = mi.traverse(scene), itertools.count(seed * 1_000_003)
+    return scene, mi.traverse(scene)
+
+
+def _stock(task: Task, spp: int, seed: int) -> Callable[[Any], Any]:
+    scene, params = _loaded(task)
+    numbers = itertools.count(seed * 1_000_003)
 
     def render(optimizer: Any) -> Any:
         params.update(optimizer)
@@ -122,8 +127,8 @@ def _stock(task: Task, spp: int, seed: int) -> Callable[[Any], Any]:
 
 
 def _wrapped(task: Task, spp: int, seed: int) -> Callable[[Any], Any]:
-    scene = mi.load_dict({**task.scene(), "integrator": {"type": "prb", "max_depth": task.max_depth}})
-    params, numbers = mi.traverse(scene), itertools.count(seed * 1_000_003, 2)
+    scene, params = _loaded(task)
+    numbers = itertools.count(seed * 1_000_003, 2)
 
     @dr.wrap(source="torch", target="drjit")
     def render(texture: Any, number: int) -> Any:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -60,15 +61,14 @@ def contenders() -> dict[str, Callable[..., None]]:
 
 def tune(loop: Callable[..., None], task: Task, loss: str, seconds: float, spp: Any, rates: Any) -> dict[str, Any]:
     """The samples per pixel and the learning rate of least error at the end."""
-    best: dict[str, Any] = {"error": math.inf}
-    for samples in spp:
-        for rate in rates:
-            clock = Clock(seconds, task.error)
-            loop(task, samples, rate, loss, TUNING_SEED, clock)
-            print(f"  {loss} {samples} spp, rate {rate:g}: {clock.history[-1][1]:.4f} in {clock.steps}", flush=True)
-            if clock.history[-1][1] < best["error"]:
-                best = {"spp": samples, "rate": rate, "error": clock.history[-1][1]}
-    return best
+    tried = []
+    for samples, rate in itertools.product(spp, rates):
+        clock = Clock(seconds, task.error)
+        loop(task, samples, rate, loss, TUNING_SEED, clock)
+        error = clock.history[-1][1]
+        tried.append({"spp": samples, "rate": rate, "error": error if math.isfinite(error) else math.inf})
+        print(f"  {loss} {samples} spp, rate {rate:g}: {tried[-1]['error']:.4f} in {clock.steps}", flush=True)
+    return min(tried, key=lambda found: found["error"])
 
 
 def run(

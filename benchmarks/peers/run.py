@@ -91,10 +91,6 @@ class Judge:
         """The mean over textures."""
         return float(np.mean(list(self.each(values).values())))
 
-    def pictures(self, values: dict[str, np.ndarray]) -> float:
-        """Of held-out pictures."""
-        return self._others(values) / self._begin
-
     def _others(self, values: dict[str, np.ndarray]) -> float:
         for key, value in values.items():
             self._parameters[key] = mi.TensorXf(np.ascontiguousarray(value.reshape(self._truth[key].shape)))
@@ -111,13 +107,13 @@ class Judge:
     def run(self, found: Points, steps: int) -> dict[str, Any]:
         """The record of a run."""
         last = {key: found[-1][1][key] for key in self.case.keys}
-        return {
-            "curve": [[seconds, self.textures(values)] for seconds, values in found],
+        curve = [[seconds, self.textures(values)] for seconds, values in found]
+        errors = {
             "textures": self.textures(last),
             "each": self.each(last),
-            "pictures": self.pictures(last),
-            "steps": steps,
+            "pictures": self._others(last) / self._begin,
         }
+        return {"curve": curve, **errors, "steps": steps}
 
 
 def ours(judge: Judge, seconds: float, seed: int) -> dict[str, Any]:
@@ -128,51 +124,15 @@ def ours(judge: Judge, seconds: float, seed: int) -> dict[str, Any]:
     return judge.run(kept.found, kept.steps)
 
 
-class Peer:
-    """A pipeline of others, in a process of its own.
-
-    Args:
-        driver: the file under drivers/.
-        python: of its environment.
-        path: what its modules are imported from.
-    """
-
-    def __init__(self, driver: str, python: Path, path: Path):
-        self._driver, self._python, self._path = Path(__file__).parent / f"drivers/{driver}.py", python, path
-
-    def run(
-        self, judge: Judge, scene: str, seconds: float, seed: int, settings: dict[str, Any], check: bool
-    ) -> dict[str, Any]:
-        """One run with the given settings."""
-        folder = judge.case.folder.resolve()
-        asked = {
-            "scene": str(folder / scene), "references": str(folder / "references.npz"), "out": str(folder / "found.npz"),
-            "folder": str(folder), "keys": judge.case.keys, "material": scenes.MATERIAL, "depth": scenes.DEPTH,
-            "seconds": seconds, "points": _POINTS, "seed": seed, "settings": settings, "check": check,
-        }  # fmt: skip
-        (folder / "task.json").write_text(json.dumps(asked))
-        command = [str(self._python.absolute()), str(self._driver), str(folder / "task.json")]
-        environment = {**os.environ, "PYTHONPATH": str(self._path.resolve()), "MPLBACKEND": "Agg"}
-        environment["HOME"] = str(scratch(f"peers/kernels-{self._driver.stem}"))  # older Dr.Jit keeps its kernels there
-        done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
-        if done.returncode:
-            (folder / "failed.txt").write_text(done.stdout + done.stderr)
-            last = (done.stderr.strip() or "no message").splitlines()[-1]
-            sys.exit(f"{self._driver.name} failed in {self._python}: {last} (more in {folder / 'failed.txt'})")
-        with np.load(folder / "found.npz") as found:
-            textures = {key: found[f"texture/{key}"] for key in judge.case.keys}
-            points = [(float(s), {key: textures[key][n] for key in textures}) for n, s in enumerate(found["seconds"])]
-            seen = {"check": float(found["check"])} if check else {}
-            return {**judge.run(points, int(found["steps"][-1])), **seen}
-
-
 @dataclass(frozen=True)
 class Entrant:
-    """A peer with the settings that its authors published.
+    """A pipeline of others, in a process of its own, with the settings that its authors published.
 
     Attributes:
         name: in the record.
-        peer: what runs it.
+        driver: the file under drivers/.
+        python: of its environment.
+        path: what its modules are imported from.
         scene: the file it reads.
         settings: as published.
         rate: the name of the learning rate among them.
@@ -180,7 +140,9 @@ class Entrant:
     """
 
     name: str
-    peer: Peer
+    driver: str
+    python: Path
+    path: Path
     scene: str
     settings: dict[str, Any]
     rate: str
@@ -191,7 +153,25 @@ class Entrant:
     ) -> dict[str, Any]:
         """One run, at the published rate where none is given; `check` has its rendering of the true scene compared with the references."""
         settings = self.settings if rate is None else {**self.settings, self.rate: rate}
-        found = self.peer.run(judge, self.scene, seconds, seed, settings, check)
+        folder, driver = judge.case.folder.resolve(), Path(__file__).parent / f"drivers/{self.driver}.py"
+        asked = {
+            "scene": str(folder / self.scene), "references": str(folder / "references.npz"), "folder": str(folder),
+            "out": str(folder / "found.npz"), "keys": judge.case.keys, "material": scenes.MATERIAL, "depth": scenes.DEPTH,
+            "seconds": seconds, "points": _POINTS, "seed": seed, "settings": settings, "check": check,
+        }  # fmt: skip
+        (folder / "task.json").write_text(json.dumps(asked))
+        command = [str(self.python.absolute()), str(driver), str(folder / "task.json")]
+        environment = {**os.environ, "PYTHONPATH": str(self.path.resolve()), "MPLBACKEND": "Agg"}
+        environment["HOME"] = str(scratch(f"peers/kernels-{self.driver}"))  # older Dr.Jit keeps its kernels there
+        done = subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, check=False)
+        if done.returncode:
+            (folder / "failed.txt").write_text(done.stdout + done.stderr)
+            last = (done.stderr.strip() or "no message").splitlines()[-1]
+            sys.exit(f"{driver.name} failed in {self.python}: {last} (more in {folder / 'failed.txt'})")
+        with np.load(folder / "found.npz") as kept:
+            textures = {key: kept[f"texture/{key}"] for key in judge.case.keys}
+            points = [(float(s), {key: textures[key][n] for key in textures}) for n, s in enumerate(kept["seconds"])]
+            found = judge.run(points, int(kept["steps"][-1])) | ({"check": float(kept["check"])} if check else {})
         line = f"rate {settings[self.rate]:g} seed {seed}: {found['textures']:.4f} in {found['steps']} steps"
         print(f"  {judge.case.problem.name} {self.name} {line}", flush=True)
         return found
@@ -208,12 +188,12 @@ def entrants(
     """Of the peers that are given."""
     found = []
     if svbrdf is not None and svbrdf_python is not None:
-        peer, loop = Peer("svbrdf", svbrdf_python, svbrdf), {**LOOP, "texture_res": texture}
-        found.append(Entrant("svbrdf_uncertainty", peer, "scene.xml", loop, "learning_rate"))
+        own, loop = ("svbrdf", svbrdf_python, svbrdf, "scene.xml"), {**LOOP, "texture_res": texture}
+        found.append(Entrant("svbrdf_uncertainty", *own, loop, "learning_rate"))
     if weier is not None and weier_python is not None:
-        peer = Peer("weier", weier_python, weier / "python")
-        found.append(Entrant("Weier et al.", peer, "mipmaps.xml", PYRAMID, "base_learning_rate"))
-        found.append(Entrant("filter, by Weier et al.", peer, "mipmaps.xml", FILTER, "base_learning_rate", tuned=False))
+        own = "weier", weier_python, weier / "python", "mipmaps.xml"
+        found.append(Entrant("Weier et al.", *own, PYRAMID, "base_learning_rate"))
+        found.append(Entrant("filter, by Weier et al.", *own, FILTER, "base_learning_rate", tuned=False))
     if not found:
         sys.exit(NOTHING_GIVEN)
     return found

@@ -25,12 +25,11 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.internals import StagedProblem, dr, stages_file
+from benchmarks.internals import StagedProblem, dr, method, stages_file
 from benchmarks.photographs.projection import Projection
 from benchmarks.runner.records import Record, scratch
 from benchmarks.stock_loop import stock_loop
 from benchmarks.timed_runs import Kept
-from unrender import methods
 from unrender.app.capture import importing
 from unrender.app.evaluation.measures import measure
 
@@ -89,18 +88,10 @@ def stock(
 
     With `falling`, the rate falls exponentially, to a twentieth at the end.
     """
-    (end,) = stock_loop(
-        problem,
-        spp,
-        rate,
-        seconds,
-        seed=seed,
-        every=sys.maxsize,
-        fall=(lambda done: LAST_RATE**done) if falling else None,
-        error=lambda values: {key: np.array(value) for key, value in values.items()},
-        timer=time.process_time,
-        views=views,
-    )
+    options: dict[str, Any] = {"fall": (lambda done: LAST_RATE**done) if falling else None, "views": views}
+    options["error"] = lambda values: {key: np.array(value) for key, value in values.items()}
+    options["timer"] = time.process_time
+    (end,) = stock_loop(problem, spp, rate, seconds, seed=seed, every=sys.maxsize, **options)
     return end["parameter_error"], end["step"] + 1
 
 
@@ -113,28 +104,12 @@ def in_stages(folder: Path, seconds: float, seed: int) -> tuple[dict[str, np.nda
     steps = 0
     for index, (stage, share) in enumerate(zip(stages.stages, shares, strict=True)):
         problem = whole.of_stage(stage, values, folder / "scenes" / stage.name)
-        plan = plan_of(stage.method or stages.method, problem, stages.settings_of(stage))
+        plan = method(stage.method or stages.method).plan(problem, stages.settings_of(stage))
         clock = Kept(share, points=1)
         result = ur.optimize(problem, plan, steps=1_000_000, seed=seed + index, callbacks=[clock])
         values |= {key: np.asarray(value) for key, value in result.parameters.items()}
         steps += clock.steps
     return values, steps
-
-
-def prepare(
-    photographs: Path,
-    folder: Path,
-    resolution: int,
-    texture: int,
-    faces: int,
-    unknowns: tuple[str, ...] | None,
-    spp: int,
-) -> tuple[ur.Problem, Judge]:
-    """Import the photographs; the problem, and the judge of its results by pictures of `spp` samples per pixel."""
-    options = importing.ImportOptions(resolution=resolution, texture=texture, faces=faces, unknowns=unknowns)
-    importing.import_capture(photographs, folder, options, overwrite=True)
-    problem = ur.Problem.from_file(folder / "problem.toml")
-    return problem, Judge(folder, [parameter.key for parameter in problem.parameters], spp)
 
 
 def run(
@@ -177,9 +152,12 @@ def run(
         if kind not in imports:
             # The others' scenes would be in all kernels.
             imports.clear()
-            imports[kind] = prepare(
-                given, folder / kind, resolution, texture, faces, FLAT if kind == "flat" else None, final_spp
-            )
+            unknowns = FLAT if kind == "flat" else None
+            options = importing.ImportOptions(resolution=resolution, texture=texture, faces=faces, unknowns=unknowns)
+            importing.import_capture(given, folder / kind, options, overwrite=True)
+            problem = ur.Problem.from_file(folder / kind / "problem.toml")
+            keys = [parameter.key for parameter in problem.parameters]
+            imports[kind] = problem, Judge(folder / kind, keys, final_spp)
         problem, judge = imports[kind]
         found: dict[str, Any] = {"psnr": [], "steps": []}
         if who == "start":
@@ -195,7 +173,7 @@ def run(
                     values, steps = in_stages(judge.folder, seconds, 100 * seed)
                 else:
                     clock = Kept(seconds, points=1)
-                    plan = plan_of(who, problem, METHODS[who])
+                    plan = method(who).plan(problem, METHODS[who])
                     result = ur.optimize(problem, plan, steps=1_000_000, seed=seed, callbacks=[clock])
                     values, steps = result.parameters, clock.steps
                 found["psnr"].append(judge.of(values))
@@ -204,18 +182,12 @@ def run(
             found["settings"] = METHODS.get(who, {})
         print(who, np.mean(found["psnr"]), flush=True)
         race = f"{name}, {resolution}, {seconds:g}"
-        conditions = {
-            "views": len(problem.views),
-            "held_out": len(judge.problem.views),
-            "pixels": problem.pixels,
-            "seconds": seconds,
-        }
+        conditions = {"views": len(problem.views), "held_out": len(judge.problem.views)}
+        conditions |= {"pixels": problem.pixels, "seconds": seconds}
         part: dict[str, Any] = {"races": {race: {**conditions, "found": {who: found}}}}
         if own:
-            maps |= {
-                "photograph": judge.cut(np.asarray(judge.problem.views[0].reference)),
-                who: judge.cut(judge.picture),
-            }
+            maps["photograph"] = judge.cut(np.asarray(judge.problem.views[0].reference))
+            maps[who] = judge.cut(judge.picture)
             part["maps"] = maps
         yield part
     shutil.rmtree(folder)
@@ -241,11 +213,6 @@ def tuned(
         found["psnr"].append(judge.of(values))
         found["steps"].append(steps)
     return found
-
-
-def plan_of(name: str, problem: ur.Problem, settings: dict[str, Any]) -> Any:
-    """Return the plan of a method for the problem."""
-    return methods.method(name).plan(problem, settings)
 
 
 def table(record: Record) -> str:

@@ -16,6 +16,7 @@ import unrender as ur
 from benchmarks import markdown
 from benchmarks.internals import Key, SampleRequest, dr, mi, prepare, project, stock_scene
 from benchmarks.paths import truth
+from benchmarks.pixel_schemes import gradients, spread
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import percentiles, turns
 from benchmarks.stock_loop import stock_loop
@@ -61,19 +62,13 @@ def primal_costs(problem: ur.Problem, spp: int) -> dict[str, Any]:
         with dr.suspend_grad():
             dr.eval(prb.render(scene, sensor=0, spp=spp, seed=n))
 
-    times = turns(
-        {
-            "plain": lambda n: dr.eval(session.image(now, SampleRequest(0, spp, n, 2)).images),
-            "pair": pair,
-            "mitsuba_prb": stock,
-        }
-    )
+    def plain(n: int) -> None:
+        dr.eval(session.image(now, SampleRequest(0, spp, n, 2)).images)
+
+    times = turns({"plain": plain, "pair": pair, "mitsuba_prb": stock})
     found: dict[str, Any] = {name: percentiles(values) for name, values in times.items()}
-    ratios = {
-        "pair/plain": found["pair"][0] / found["plain"][0],
-        "pair/prb": found["pair"][0] / found["mitsuba_prb"][0],
-    }
-    return found | ratios
+    others = {"pair/plain": "plain", "pair/prb": "mitsuba_prb"}
+    return found | {name: found["pair"][0] / found[other][0] for name, other in others.items()}
 
 
 def gradient_variance(problem: ur.Problem, spp: int, count: int = 24) -> dict[str, Any]:
@@ -88,13 +83,9 @@ def gradient_variance(problem: ur.Problem, spp: int, count: int = 24) -> dict[st
     estimators = {"leave-one-out": ur.PathGradient(spp=spp), "own paths": ur.PathGradient(spp=spp, adjoint_spp=spp)}
     found: dict[str, Any] = {}
     for place, point in (("start", start), ("near the truth", near)):
-        variances = {}
-        for name, estimator in estimators.items():
-            state, rows = estimator.init(problem, point), []
-            for number in range(count):
-                gradient = estimator.estimate(problem, point, state, Key(7, number))[0].gradient
-                rows.append(np.concatenate([np.ravel(np.array(g)) for g in gradient.values()]))
-            variances[name] = float(np.var(np.stack(rows).astype(np.float64), axis=0, ddof=1).sum())
+        variances = {
+            name: spread(gradients(problem, estimator, count, 7, point)[0])[0] for name, estimator in estimators.items()
+        }
         found[place] = {**variances, "ratio": variances["leave-one-out"] / variances["own paths"]}
     return found
 
@@ -126,14 +117,11 @@ def run(problem: tuple[str, ...] = PROBLEMS, resolution: int = 128, spp: int = 1
 def table(record: Record) -> str:
     """Costs as ratios."""
     primal, steps, ratios = record["primal_ms"], record["step_ms"], record["step_ratios"]
+    over_plain, over_prb = primal["pair/plain"], primal["pair/prb"]
     images = [
         ["plain, this kernel", f"{primal['plain'][0]:.1f}", "1"],
-        [
-            "Mitsuba's prb, primal",
-            f"{primal['mitsuba_prb'][0]:.1f}",
-            f"{primal['pair/plain'] / primal['pair/prb']:.2f}",
-        ],
-        ["**pair**", f"{primal['pair'][0]:.1f}", f"**{primal['pair/plain']:.2f}** ({primal['pair/prb']:.2f} of prb)"],
+        ["Mitsuba's prb, primal", f"{primal['mitsuba_prb'][0]:.1f}", f"{over_plain / over_prb:.2f}"],
+        ["**pair**", f"{primal['pair'][0]:.1f}", f"**{over_plain:.2f}** ({over_prb:.2f} of prb)"],
     ]
     whole = [["stock loop", f"{steps['stock']:.1f}", "1"]]
     for key, name in {"leave-one-out": "plain, leave-one-out groups", "rcv": "control variate"}.items():

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from statistics import geometric_mean
 from typing import Any
@@ -98,15 +98,9 @@ def loop(
     setting: dict[str, Any],
 ) -> Points:
     """A run of the stock loop."""
+    fall = ur.schedules.Cosine(1) if setting["falling"] else None
     history = stock_loop(
-        problem,
-        setting["spp"],
-        setting["rate"],
-        seconds,
-        seed=seed,
-        every=every,
-        fall=ur.schedules.Cosine(1) if setting["falling"] else None,
-        error=error,
+        problem, setting["spp"], setting["rate"], seconds, seed=seed, every=every, fall=fall, error=error
     )
     return [(h["seconds"], h["parameter_error"]) for h in history]
 
@@ -120,9 +114,7 @@ def tune(
         setting = {"spp": samples, "rate": rate, "falling": falling}
         end = loop(problem, error, seconds, TUNING_SEED, every, setting)[-1][1]
         tried.append({**setting, "error": end if math.isfinite(end) else 1e9})
-        print(
-            f"  {problem.name}: loop {samples} spp, rate {rate:g}{' falling' if falling else ''}: {end:.4f}", flush=True
-        )
+        print(f"  {problem.name}: loop {setting_text(setting)}: {end:.4f}", flush=True)
     best = min(tried, key=lambda found: found["error"])
     return {key: best[key] for key in ("spp", "rate", "falling")}, tried
 
@@ -170,14 +162,8 @@ def compare(theirs: list[Points], found: list[Points], seconds: float) -> dict[s
     best = float(loop_curve.min())
     when = (int(np.argmin(loop_curve)) + 1) / len(loop_curve) * seconds
     first = _reached(our_curve, best, seconds)
-    return {
-        "loop": tenths(loop_curve),
-        "auto": tenths(our_curve),
-        "best_of_loop": best,
-        "seconds_of_loop": when,
-        "seconds_of_auto": first,
-        "speed": when / first if first else None,
-    }
+    curves = {"loop": tenths(loop_curve), "auto": tenths(our_curve), "best_of_loop": best}
+    return curves | {"seconds_of_loop": when, "seconds_of_auto": first, "speed": when / first if first else None}
 
 
 def _ours_of(compared: dict[str, Any]) -> dict[str, Any]:
@@ -234,19 +220,14 @@ def run(
         raise ur.InputError(f"--without {', '.join(unknown)}: expected {', '.join(ablation.PARTS)}")
     record = None if retune else records.read(Path(__file__).parent)
     known = record["problems"] if record else {}
-    made: dict[str, Callable[[], ur.Problem]] = {}
     given = {"reference_spp": gallery_reference_spp, "resolution": gallery_resolution}
     options = {key: value for key, value in given.items() if value is not None}
-    for name in problem:
-        made[name] = lambda name=name: ur.gallery.problem(name, **options)
-    if assets is not None:
-        for name in foreign or FOREIGN:
-            made[name] = lambda name=name: scenes.problem(name, assets, resolution, texture, reference_spp)
-    if lacking := [] if retune else [name for name in made if name not in known]:
+    names = (*problem, *(() if assets is None else foreign or FOREIGN))
+    if lacking := [] if retune else [name for name in names if name not in known]:
         raise ur.InputError(f"--no-retune: the record has no setting of the loop for {', '.join(lacking)}")
     found: dict[str, Any] = {"problems": {}}
-    for name, make in made.items():
-        opened = make()
+    for name in names:
+        opened = scenes.problem(name, assets, resolution, texture, reference_spp, **options)
         error = error_of(opened)
         if retune:
             setting, tried = tune(opened, error, seconds, every, spp, rates)
@@ -335,14 +316,9 @@ def table(record: Record) -> str:
         speed, first = "below 1", "never"
         if entry["speed"] is not None:
             speed, first = f"**{entry['speed']:.2g}**", f"{entry['seconds_of_auto']:.2g} s"
-        rows.append([name, _setting(entry), ends["loop"], ends["auto"], ends.get("fixed_point", "")])
-        rows[-1] += [
-            f"{entry['seconds_of_loop']:.2g} s",
-            first,
-            speed,
-            _tuned(entry),
-            f"{entry['compile_seconds']:.1f} s",
-        ]
+        rows.append([name, setting_text(entry["setting"]), ends["loop"], ends["auto"], ends.get("fixed_point", "")])
+        rows[-1] += [f"{entry['seconds_of_loop']:.2g} s", first, speed, _tuned(entry)]
+        rows[-1].append(f"{entry['compile_seconds']:.1f} s")
     head = (
         "problem | the loop's best setting | loop, half and end | auto, half and end | fixed point | loop at its best"
     )
@@ -361,9 +337,9 @@ def table(record: Record) -> str:
     )
 
 
-def _setting(entry: Record) -> str:
-    falling = ", falling" if entry["setting"]["falling"] else ""
-    return f"{entry['setting']['spp']} spp, {entry['setting']['rate']:g}{falling}"
+def setting_text(setting: Mapping[str, Any]) -> str:
+    """Return a setting of the loop in words."""
+    return f"{setting['spp']} spp, {setting['rate']:g}{', falling' if setting['falling'] else ''}"
 
 
 def plot(record: Record) -> figures.Figure:

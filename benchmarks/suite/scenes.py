@@ -26,9 +26,17 @@ def photograph(path: Path, size: int = TEXTURE) -> np.ndarray:
     return np.clip(small, 0.02, 0.95).astype(np.float32)
 
 
+def scene_text(file: Path) -> str:
+    """Return the text of a scene file, its names of textures and meshes absolute."""
+    text = file.read_text()
+    for kind in ("textures", "meshes"):
+        text = text.replace(f'"{kind}/', f'"{file.parent / kind}/')
+    return text
+
+
 def cornell_box(assets: Path, resolution: int) -> str:
     """The tutorials' cbox.xml, with pixels whose samples are their own."""
-    text = (assets / "tutorials/cbox.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
+    text = scene_text(assets / "tutorials/cbox.xml")
     text = text.replace('name="res" value="256"', f'name="res" value="{resolution}"')
     return text.replace('<rfilter type="tent"/>', '<rfilter type="box"/>')
 
@@ -72,12 +80,11 @@ def _tray(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[st
     """The lacquered tray of Gu and Moon 2025, its base colour unknown; no normal map and another environment, since theirs is not here."""
     tray = assets / "problems/tray"
     mi.Bitmap(photograph(tray / "textures" / _BASE, texture)).write(str(folder / "truth.exr"))
-    text = (tray / "scene.xml").read_text()
+    text = scene_text(tray / "scene.xml")
     opening = r'<bsdf type="normalmap" id="bsdf_tray">.*?<bsdf type="principled">'
     text = re.sub(opening, '<bsdf type="principled" id="bsdf_tray">', text, flags=re.DOTALL)
     text = text.replace("</bsdf>\n</bsdf>", "</bsdf>", 1)
-    text = text.replace("textures/warm_bar_2k.exr", str(assets / "problems/plates/textures/envmap.exr"))
-    text = text.replace('"textures/', f'"{tray}/textures/').replace('"meshes/', f'"{tray}/meshes/')
+    text = text.replace(f"{tray}/textures/warm_bar_2k.exr", str(assets / "problems/plates/textures/envmap.exr"))
     for side in ("resx", "resy"):
         text = text.replace(f'name="{side}" value="1024"', f'name="{side}" value="{resolution}"')
     text = text.replace("</film>", '<rfilter type="box"/></film>')
@@ -94,14 +101,14 @@ def _painting(assets: Path, folder: Path, resolution: int, texture: int) -> tupl
     """
     painting = assets / "problems/painting/mts_scene"
     mi.Bitmap(photograph(painting / "textures" / _CANVAS, texture)).write(str(folder / "truth.exr"))
-    text = (painting / "painting.xml").read_text()
+    text = scene_text(painting / "painting.xml")
     nested = r'<texture type="mipmap_flat" name="(\w+)">\s*<texture type="bitmap" name="nested_bitmap">(.*?)</texture>\s*</texture>'
     text = re.sub(nested, r'<texture type="bitmap" name="\1">\2</texture>', text, flags=re.DOTALL)
     text = text.replace("normalmap_flip", "normalmap").replace('<boolean name="safe_flip" value="true"/>', "")
     text = text.replace('<string name="format" value="variant"/>', "")
-    text = text.replace(f'value="textures/{_CANVAS}"/>', 'value="truth.exr"/><boolean name="raw" value="true"/>')
-    text = text.replace("textures/hotel_room_2k.exr", str(assets / "textures/museum.exr"))
-    text = text.replace('"textures/', f'"{painting}/textures/').replace('"meshes/', f'"{painting}/meshes/')
+    textures = painting / "textures"
+    text = text.replace(f'value="{textures / _CANVAS}"/>', 'value="truth.exr"/><boolean name="raw" value="true"/>')
+    text = text.replace(str(textures / "hotel_room_2k.exr"), str(assets / "textures/museum.exr"))
     text = re.sub(r'(name="res[xy]" value=)"1024"', rf'\1"{resolution}"', text)
     (folder / "scene.xml").write_text(text.replace("</film>", '<rfilter type="box"/></film>'))
     return PAINTING, 2
@@ -146,8 +153,7 @@ def _plates(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[
     plates = assets / "problems/plates"
     truth = photograph(plates / "textures/textured_roughness.jpg", texture).mean(axis=-1, keepdims=True)
     mi.Bitmap(truth).write(str(folder / "truth.exr"))
-    text = (plates / "scene.xml").read_text().replace("textures/textured_roughness.jpg", "truth.exr")
-    text = text.replace('"textures/', f'"{plates}/textures/').replace('"meshes/', f'"{plates}/meshes/')
+    text = scene_text(plates / "scene.xml").replace(f"{plates}/textures/textured_roughness.jpg", "truth.exr")
     text = text.replace('name="res" value="1536"', f'name="res" value="{resolution}"')
     (folder / "scene.xml").write_text(text.replace('<rfilter type="gaussian"/>', '<rfilter type="box"/>'))
     return {"plane.bsdf.alpha.data": (0.3, truth)}, 1
@@ -175,8 +181,7 @@ def _light(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[d
 def _lamps(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[dict[str, tuple[float, Any]], int]:
     """The tutorials' simple.xml, but that its teapot is not black in blue: the intensities of the two lamps above it unknown."""
     del texture
-    text = (assets / "tutorials/simple.xml").read_text().replace('"meshes/', f'"{assets / "tutorials/meshes"}/')
-    text = text.replace('value="0.9 0.9 0.0"', 'value="0.9 0.9 0.3"')
+    text = scene_text(assets / "tutorials/simple.xml").replace('value="0.9 0.9 0.0"', 'value="0.9 0.9 0.3"')
     (folder / "scene.xml").write_text(text.replace('name="res" value="256"', f'name="res" value="{resolution}"'))
     return {f"light{n}.intensity.value": (20.0, [100.0, 100.0, 100.0]) for n in (1, 2)}, 1
 
@@ -204,17 +209,9 @@ def _cloud(assets: Path, folder: Path, resolution: int, texture: int) -> tuple[d
 
 
 SCENES: dict[str, Any] = {
-    "cbox": cbox,
-    "spot": spot,
-    "tray": _tray,
-    "maps": _maps,
-    "painting": _painting,
-    "plates": _plates,
-    "light": _light,
-    "lamps": _lamps,
-    "cloud": _cloud,
-    "numbers": _numbers,
-}
+    "cbox": cbox, "spot": spot, "tray": _tray, "maps": _maps, "painting": _painting, "plates": _plates,
+    "light": _light, "lamps": _lamps, "cloud": _cloud, "numbers": _numbers,
+}  # fmt: skip
 """Each writes scene.xml, and returns the key of a texture, whose truth it wrote as truth.exr, or {key: (initial, truth)}; and the number of
 views."""
 LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
@@ -237,9 +234,18 @@ def references(file: Path, kept: Path, spp: int, depth: int) -> list[np.ndarray]
         return [found[f"arr_{sensor}"].astype(np.float32) for sensor in range(len(found.files))]
 
 
-def problem(name: str, assets: Path, resolution: int, texture: int, spp: int) -> ur.Problem:
-    """The problem of a name such as "cbox, L2"; references of `spp` samples per pixel are rendered by Mitsuba and kept."""
-    scene, loss = name.split(", ")
+def problem(
+    name: str, assets: Path | None, resolution: int = 64, texture: int = 64, spp: int = 4096, **options: Any
+) -> ur.Problem:
+    """Return the problem of a name of the gallery, made with `options`, or of another's such as "cbox, L2".
+
+    References of the latter, of `spp` samples per pixel, are rendered by Mitsuba and kept. Raises `InputError` for one without `assets`.
+    """
+    scene, _, loss = name.partition(", ")
+    if loss not in LOSSES:
+        return ur.gallery.problem(name, **options)
+    if assets is None:
+        raise ur.InputError(f"{name}: give --assets, the folder of the scenes of others")
     folder = scratch(f"suite/{scene}-{resolution}-{texture}")
     folder.mkdir(parents=True, exist_ok=True)
     unknown, views = SCENES[scene](assets.resolve(), folder, resolution, texture)

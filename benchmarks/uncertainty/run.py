@@ -7,6 +7,7 @@ of an element (`Result.data_share`). "wall, noisy" has references of 8 samples p
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from benchmarks.suite import scenes
 MERGE = ("problems.*",)
 QUICK: dict[str, Any] = {"problems": ("wall",), "seeds": 1, "steps": (4,)}
 _WALL = {"resolution": 40, "texture_resolution": 20}
-_QUANTILES = 41
+LEVELS = (np.arange(41) + 0.5) / 41
+"""Of the quantiles of scores."""
 
 
 def problem(name: str, assets: Path) -> ur.Problem:
@@ -62,9 +64,8 @@ def run(
         z = z[np.isfinite(z)]
         entry: dict[str, Any] = {"count": len(z)}
         if len(z):
-            levels = (np.arange(_QUANTILES) + 0.5) / _QUANTILES
             entry |= {"std": float(z.std()), "mean": float(z.mean()), "beyond_2": float(np.mean(np.abs(z) > 2))}
-            entry |= {"decided": float(np.mean(shares)), "quantiles": np.quantile(z, levels).tolist()}
+            entry |= {"decided": float(np.mean(shares)), "quantiles": np.quantile(z, LEVELS).tolist()}
         found[f"{name}, {count} steps"] = entry
         print(name, count, {k: x for k, x in entry.items() if k != "quantiles"}, flush=True)
     return {"problems": found}
@@ -86,13 +87,15 @@ def table(record: Record) -> str:
 
 def plot(record: Record) -> figures.Figure:
     """Quantiles of the scores over those of the normal distribution."""
-    panels = {}
-    for name, entry in record["problems"].items():
-        if entry["count"]:
-            n = len(entry["quantiles"])
-            normal = stats.norm.ppf((np.arange(n) + 0.5) / n)
-            panels[name] = {
-                "measured": [(normal.tolist(), entry["quantiles"])],
-                "calibrated": [(normal.tolist(), normal.tolist())],
-            }
+    return quantiles({name: {"measured": entry} for name, entry in record["problems"].items() if entry["count"]})
+
+
+def quantiles(problems: Mapping[str, Mapping[str, Any]]) -> figures.Figure:
+    """Draw quantiles of each problem's scores, by kind, over those of the normal distribution."""
+    normal = stats.norm.ppf(LEVELS).tolist()
+    panels = {
+        name: {kind: [(normal, entry["quantiles"])] for kind, entry in kinds.items()}
+        | {"calibrated": [(normal, normal)]}
+        for name, kinds in problems.items()
+    }
     return figures.curves(panels, "quantile of the normal distribution", "quantile of z", log="")

@@ -1,6 +1,6 @@
-"""What both drivers share: a clock of the processor's time that keeps textures as a descent goes, and ends it.
+"""A clock of the processor's time that keeps parameters as a descent goes, and ends it.
 
-It runs in the peer's environment and knows nothing of `unrender`.
+Both drivers import this in the peer's environment, so it knows nothing of `unrender`.
 """
 
 from __future__ import annotations
@@ -20,23 +20,27 @@ class BudgetSpentError(Exception):
 
 
 class Recorder:
-    """Textures along a descent, over the processor time of its steps, of all threads; the first step is not counted.
+    """Parameters along a descent, over the processor time of its steps, of all threads; the first step is not counted.
 
     Args:
         seconds: of the processor.
-        points: how many times textures are kept.
+        points: how many times parameters are kept.
         steps: raise after so many steps at the latest; None for no limit.
+        timer: counts the seconds.
     """
 
-    def __init__(self, seconds: float, points: int, steps: int | None = None):
+    def __init__(
+        self, seconds: float, points: int, steps: int | None = None, timer: Callable[[], float] = time.process_time
+    ):
         self.clock, self.steps = 0.0, 0
         self.kept: list[tuple[float, int, dict[str, np.ndarray]]] = []
         self._seconds, self._every, self._next, self._limit = seconds, seconds / points, 0.0, steps
         self._since: float | None = None
+        self._timer = timer
 
     def step(self, values: Callable[[], dict[str, np.ndarray]]) -> None:
-        """After each step: `values` makes {key: (H, W, C)}, which is no part of the time."""
-        now = time.process_time()
+        """After each step: `values` makes {key: array}, which is no part of the time."""
+        now = self._timer()
         self.clock += 0.0 if self._since is None else now - self._since
         self.steps += 1
         done = self.clock >= self._seconds or (self._limit is not None and self.steps >= self._limit)
@@ -45,7 +49,7 @@ class Recorder:
             self.kept.append((self.clock, self.steps, values()))
         if done:
             raise BudgetSpentError
-        self._since = time.process_time()
+        self._since = self._timer()
 
     def write(self, path: Path, **others: Any) -> None:
         """All that was kept, and `others`, as an .npz file."""

@@ -24,7 +24,7 @@ from benchmarks.races import TUNING_SEED, first_at, search
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import backward
-from benchmarks.timed_runs import POINTS, Kept, blind, measured
+from benchmarks.timed_runs import POINTS, Kept, Point, blind, measured
 
 QUICK: dict[str, Any] = {
     "seconds": 0.5, "seeds": 1, "problems": ["sphere-to-bunny"], "resolution": 8, "subdivisions": 1, "views": 2, "rates": [0.01],
@@ -53,70 +53,59 @@ class Setting:
     strength: float = 19.0
 
 
-class StockShapes:
-    """The stock loop on a problem whose unknowns are the vertices of one mesh, and maybe textures."""
+def stock_shapes(problem: ur.Problem, setting: Setting, seconds: float, seed: int) -> list[Point]:
+    """Take the steps of the stock loop on a problem whose unknowns are the vertices of one mesh, and maybe textures.
 
-    def __init__(self, problem: ur.Problem, setting: Setting):
-        self.problem, self.setting = problem, setting
-        self.scene, self.parameters = stock_scene(problem)
-        (self.mesh,) = problem.faces
-        counts = {"sppc": setting.spp, "sppp": setting.spp, "sppi": setting.indirect, "guiding": "none"}
-        self._integrator = mi.load_dict({"type": "prb_projective", "max_depth": problem.max_depth, **counts})
-
-    def run(self, seconds: float, seed: int) -> list[tuple[float, dict[str, np.ndarray]]]:
-        """(processor seconds, parameters) along a run; two steps of warm-up and the keeping of parameters are left out of the clock."""
-        self._steps(0.0, seed, 2)
-        return self._steps(seconds, seed, None)
-
-    def _steps(self, seconds: float, seed: int, steps: int | None) -> list[tuple[float, dict[str, np.ndarray]]]:
-        start = self.problem.initial()
+    Return (processor seconds, parameters) along the run. Two steps of warm-up and the keeping of parameters are left out of the clock.
+    """
+    scene, parameters = stock_scene(problem)
+    (mesh,) = problem.faces
+    counts = {"sppc": setting.spp, "sppp": setting.spp, "sppi": setting.indirect, "guiding": "none"}
+    integrator = mi.load_dict({"type": "prb_projective", "max_depth": problem.max_depth, **counts})
+    start, views = problem.initial(), range(len(problem.views))
+    found = []
+    for limit in (2, None):
         for key, value in start.items():
-            self.parameters[key] = from_tensor(value, self.parameters[key])
-        self.parameters.update()
+            parameters[key] = from_tensor(value, parameters[key])
+        parameters.update()
         large = None
-        if self.setting.kind == "LargeSteps":
-            faces = self.parameters[f"{self.mesh.rpartition('.')[0]}.faces"]
-            large = mi.ad.LargeSteps(self.parameters[self.mesh], faces, self.setting.strength)
-        vertices = mi.ad.Adam(lr=self.setting.rate, uniform=large is not None)
-        vertices["u"] = (
-            self.parameters[self.mesh] if large is None else large.to_differential(self.parameters[self.mesh])
-        )
+        if setting.kind == "LargeSteps":
+            faces = parameters[f"{mesh.rpartition('.')[0]}.faces"]
+            large = mi.ad.LargeSteps(parameters[mesh], faces, setting.strength)
+        vertices = mi.ad.Adam(lr=setting.rate, uniform=large is not None)
+        vertices["u"] = parameters[mesh] if large is None else large.to_differential(parameters[mesh])
         others = mi.ad.Adam(lr=_TEXTURE_RATE)
-        for key in start:
-            if key != self.mesh:
-                others[key] = self.parameters[key]
-        clock, step, next_at, found = 0.0, 0, 0.0, []
-        while step < steps if steps is not None else clock < seconds:
+        for key in start.keys() - {mesh}:
+            others[key] = parameters[key]
+        clock, step, next_at = 0.0, 0, 0.0
+        while step < limit if limit is not None else clock < seconds:
             began = work_time()
-            self.parameters[self.mesh] = vertices["u"] if large is None else large.from_differential(vertices["u"])
+            parameters[mesh] = vertices["u"] if large is None else large.from_differential(vertices["u"])
             for key in others.keys():  # noqa: SIM118 (iterating gives pairs)
-                low, high = self.problem.unknowns[key].bounds
-                others[key] = project(others[key], low, high)
-                self.parameters[key] = others[key]
-            self.parameters.update()
-            views = range(len(self.problem.views))
-            backward(self.problem, self.scene, self.parameters, self._integrator, seed, step, views)
+                others[key] = project(others[key], *problem.unknowns[key].bounds)
+                parameters[key] = others[key]
+            parameters.update()
+            backward(problem, scene, parameters, integrator, seed, step, views)
             vertices.step()
             others.step()
             dr.eval(vertices["u"])
             dr.sync_thread()
             clock += work_time() - began
             step += 1
-            if steps is None and (clock >= next_at or clock >= seconds):
+            if limit is None and (clock >= next_at or clock >= seconds):
                 next_at = clock + seconds / POINTS
-                now = dr.detach(vertices["u"] if large is None else large.from_differential(vertices["u"]))
-                kept = {self.mesh: np.array(now)}
-                kept |= {key: np.array(dr.detach(others[key])) for key in start if key != self.mesh}
-                found.append((clock, {key: kept[key].reshape(start[key].shape).astype(np.float32) for key in start}))
-        return found
+                now = {mesh: vertices["u"] if large is None else large.from_differential(vertices["u"])}
+                now |= {key: others[key] for key in start.keys() - {mesh}}
+                kept = {key: np.array(dr.detach(now[key])).reshape(value.shape) for key, value in start.items()}
+                found.append((clock, {key: value.astype(np.float32) for key, value in kept.items()}))
+    return found
 
 
 def ours(problem: ur.Problem, seconds: float, seed: int) -> dict[str, Any]:
     """`auto`, no option given."""
     kept = Kept(seconds)
-    ur.optimize(
-        blind(problem), seconds=100 * seconds, seed=seed, callbacks=[kept]
-    )  # a limit of the clock, never reached
+    limit = 100 * seconds  # of the clock, never reached
+    ur.optimize(blind(problem), seconds=limit, seed=seed, callbacks=[kept])
     return measured(problem, kept.found)
 
 
@@ -127,7 +116,7 @@ def tuned(
     (key,) = problem.faces
 
     def final(setting: Setting) -> float:
-        return problem.parameter_error(StockShapes(problem, setting).run(seconds, TUNING_SEED)[-1][1])[key]
+        return problem.parameter_error(stock_shapes(problem, setting, seconds, TUNING_SEED)[-1][1])[key]
 
     best = Setting(kind)
     rate, tried = search(tuple(rates), lambda rate: final(replace(best, rate=rate)))
@@ -143,26 +132,19 @@ def tuned(
 
 
 def race(
-    problem: ur.Problem,
-    seconds: float,
-    seeds: int,
-    rates: Sequence[float],
-    indirect: Sequence[int],
-    spp: Sequence[int],
-    strengths: Sequence[float],
+    problem: ur.Problem, seconds: float, seeds: int, rates: Sequence[float], others: Mapping[str, Sequence[float]]
 ) -> dict[str, Any]:
     """All methods on one problem, the stock loops tuned first."""
     found: dict[str, Any] = {"auto": {"runs": []}}
     settings = {}
     for kind in STOCK:
-        settings[kind] = tuned(problem, kind, seconds, rates, {"indirect": indirect, "spp": spp, "strength": strengths})
+        settings[kind] = tuned(problem, kind, seconds, rates, others)
         found[kind] = {**asdict(settings[kind]), "runs": []}
         print(settings[kind], flush=True)
     for seed in range(seeds):
         found["auto"]["runs"].append(ours(problem, seconds, seed))
         for kind in STOCK:
-            loop = StockShapes(problem, settings[kind])
-            found[kind]["runs"].append(measured(problem, loop.run(seconds, seed)))
+            found[kind]["runs"].append(measured(problem, stock_shapes(problem, settings[kind], seconds, seed)))
     best_final = min(float(np.median([run["surface"] for run in found[kind]["runs"]])) for kind in STOCK)
     reached = (first_at(run["curve"], best_final) for run in found["auto"]["runs"])
     found["seconds to the stock loops' best"] = [at if math.isfinite(at) else None for at in reached]
@@ -195,10 +177,10 @@ def run(
         spp: samples per pixel of the stock loops, beside 2
         strengths: λ of the stock loop of large steps, beside 19
     """
-    found = {}
+    found, others = {}, {"indirect": indirect, "spp": spp, "strength": strengths}
     for name in problems:
         problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, views=views)
-        found[name] = race(problem, seconds, seeds, rates, indirect, spp, strengths)
+        found[name] = race(problem, seconds, seeds, rates, others)
         print(name, found[name]["seconds to the stock loops' best"], flush=True)
         yield {"problems": found}
 

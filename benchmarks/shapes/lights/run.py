@@ -14,8 +14,9 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.internals import dr, mi, parts
+from benchmarks.internals import mi, parts
 from benchmarks.runner.records import Record
+from benchmarks.stock_loop import backward
 
 MERGE = ("cases.*",)
 QUICK: dict[str, Any] = {"cases": ("spot",), "views": (1,), "seeds": 1, "steps": 2, "reference_spp": 4}
@@ -37,15 +38,12 @@ def light(name: str) -> dict[str, Any]:
         case "spot":
             return {"type": "spot", "to_world": down, "intensity": 12.0, "cutoff_angle": 25.0}
         case "projector":
-            return {"type": "projector", "to_world": down, "irradiance": _bitmap(picture), "fov": 35.0, "scale": 9.0}
+            irradiance = {"type": "bitmap", "bitmap": picture, "raw": True}
+            return {"type": "projector", "to_world": down, "irradiance": irradiance, "fov": 35.0, "scale": 9.0}
         case "area":
             place = mi.ScalarTransform4f().translate([0.4, 2.2, 0.3]).rotate([1, 0, 0], 90).scale(0.3)
             return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": parts.colour(12.0)}}
     return {"type": "envmap", "bitmap": picture}
-
-
-def _bitmap(picture: Any) -> dict[str, Any]:
-    return {"type": "bitmap", "bitmap": picture, "raw": True}
 
 
 def scene(name: str, views: int, resolution: int) -> dict[str, Any]:
@@ -92,12 +90,7 @@ def loop(made: ur.Problem, seconds: float, rate: float, seed: int, resolution: i
             break
         parameters["lamp.to_world"] = mi.Transform4f().translate(adam["shift"]) @ first
         parameters.update()
-        total: Any = 0.0
-        for view in range(len(made.views)):
-            number = 2 * (seed * 1_000_003 + step * 8 + view) % 2**31
-            image = mi.render(loaded, parameters, sensor=view, integrator=integrator, seed=number)
-            total += made.loss_value(view, image)
-        dr.backward(total)
+        backward(made, loaded, parameters, integrator, seed, step, range(len(made.views)))
         adam.step()
     return float(np.abs(np.array(adam["shift"])).max())
 
@@ -141,16 +134,18 @@ def run(
     return {"cases": found}
 
 
+def _middle(errors: list[float]) -> tuple[float, float]:
+    return float(np.median(errors)), max(errors)
+
+
 def table(record: Record) -> str:
     """Errors at the end, by light and number of pictures."""
     rows = []
     for name, counts in record["cases"].items():
         for count, entry in counts.items():
             for key, errors in entry["errors"].items():
-                loop = (
-                    f"{np.median(entry['loop']):.2g} ({max(entry['loop']):.2g})" if "loop" in entry else "no derivative"
-                )
-                cells = f"{np.median(errors):.2g}", f"{max(errors):.2g}", f"{entry['seconds']:.2f}", loop
+                loop = "{:.2g} ({:.2g})".format(*_middle(entry["loop"])) if "loop" in entry else "no derivative"
+                cells = *(f"{x:.2g}" for x in _middle(errors)), f"{entry['seconds']:.2f}", loop
                 rows.append([name, count, key, *cells])
     head = "light | pictures | unknown | median error | largest | seconds of `auto` | Mitsuba's loop in three times these: median (largest)"
     settings = "{seeds} starts, {steps} steps, pictures of {resolution}². Errors are largest absolute ones, in scene units or radians."

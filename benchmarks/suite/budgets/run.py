@@ -16,7 +16,7 @@ from benchmarks.internals import dr
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
 from benchmarks.suite import scenes
-from benchmarks.suite.run import FOREIGN, GALLERY, compare, error_of, loop, middle, ours
+from benchmarks.suite.run import FOREIGN, GALLERY, compare, error_of, loop, middle, ours, setting_text
 
 PROBLEMS = ("wall", "smoke")
 MERGE = ("entries.*",)
@@ -65,13 +65,8 @@ def run(
     """
     options = {} if gallery_reference_spp is None else {"reference_spp": gallery_reference_spp}
     for name in (*problem, *foreign):
-        if name in foreign and assets is None:
-            raise ur.InputError(f"{name}: give --assets, the folder of the scenes of others")
         chosen = best_settings(name, settings)
-        if name in foreign:
-            opened = scenes.problem(name, Path(assets or "."), resolution, texture, reference_spp)
-        else:
-            opened = ur.gallery.problem(name, **options)
+        opened = scenes.problem(name, assets, resolution, texture, reference_spp, **options)
         error = error_of(opened)
         for budget in seconds:
             theirs = [[loop(opened, error, budget, seed, every, given) for seed in range(seeds)] for given in chosen]
@@ -90,10 +85,9 @@ def table(record: Record) -> str:
     """Errors of both sides at tenths of the time."""
     rows = []
     for entry in record["entries"].values():
-        falling = ", falling" if entry["setting"]["falling"] else ""
-        words = f"{{problem}} | {{seconds:g}} s | {{setting[spp]}} spp, {{setting[rate]:g}}{falling}"
+        words = markdown.fill("{problem} | {seconds:g} s", entry)
         errors = (" ".join(f"{error:.3f}" for error in entry[side]) for side in ("loop", "auto"))
         speed = f"**{entry['speed']:.2g}**" if entry["speed"] else "below 1"
-        rows.append([markdown.fill(words, entry), *errors, speed, entry["seeds"]])
+        rows.append([words, setting_text(entry["setting"]), *errors, speed, entry["seeds"]])
     head = "problem | budget | the loop's setting | loop, at tenths | auto, at tenths | speed-up | seeds"
     return markdown.table(head, rows)

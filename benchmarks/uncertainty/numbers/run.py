@@ -10,18 +10,17 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import parts
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
+from benchmarks.uncertainty.run import LEVELS, quantiles
 
 MERGE = ("problems",)
 QUICK: dict[str, Any] = {"problems": ("lamp",), "seeds": 2, "folder_seeds": 1, "steps": 10}
 _SIZE, _DEPTH = 16, 4
-_QUANTILES = 41
 _LIMITS = (1.0, 2.0)
 """Numbers of standard errors of which coverage is counted."""
 
@@ -102,7 +101,7 @@ def _coverage(scores: list[list[float]], seeds: int) -> dict[str, Any]:
         "inside": {limit: float(x.mean()) for limit, x in inside.items()},
         "error": {limit: float(x.std() / np.sqrt(len(x))) for limit, x in inside.items()},
         "std": float(np.std(scores)),
-        "quantiles": np.quantile(scores, (np.arange(_QUANTILES) + 0.5) / _QUANTILES).tolist(),
+        "quantiles": np.quantile(scores, LEVELS).tolist(),
     }
 
 
@@ -152,10 +151,4 @@ def table(record: Record) -> str:
 
 def plot(record: Record) -> figures.Figure:
     """Quantiles of the scores over those of the normal distribution."""
-    normal = stats.norm.ppf((np.arange(_QUANTILES) + 0.5) / _QUANTILES).tolist()
-    panels = {
-        name: {kind: [(normal, entry["quantiles"])] for kind, entry in kinds.items()}
-        | {"calibrated": [(normal, normal)]}
-        for name, kinds in record["problems"].items()
-    }
-    return figures.curves(panels, "quantile of the normal distribution", "quantile of z", log="")
+    return quantiles(record["problems"])
