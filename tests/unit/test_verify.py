@@ -428,6 +428,20 @@ def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, count: in
         assert result.status == "finished"
 
 
+UNFINISHED = "and still improves: its loss has fallen by"
+
+
+@pytest.mark.parametrize(
+    ("steps", "rate", "stopped"), [(16, 0.1, True), (100, 0.1, True), (16, 0.5, False), (100, 2.0, False)]
+)
+def test_a_run_that_stopped_on_its_way_is_told(steps: int, rate: float, stopped: bool) -> None:
+    for seed in range(2):
+        optimizer = ur.optimizers.Adam(rate / steps)
+        result = ur.optimize(smooth(0.0, seed), ur.PathGradient(spp=4096 // steps), optimizer, steps=steps, seed=seed)
+        assert any(UNFINISHED in line for line in result.warnings) is stopped, (result.warnings, result.verification)
+        assert result.status == "finished"
+
+
 SHORT = "has hardly improved since step"
 
 

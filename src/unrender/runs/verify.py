@@ -16,6 +16,7 @@ from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
+from unrender.runs.earlier_image import FIRST_CANDIDATE, EarlierImage, unfinished
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.number_means import averaged
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
@@ -48,15 +49,8 @@ _OF_TRUTH = 4.0
 """Smallest mean square of a residual judged pixel by pixel, relative to that at the true values, if these are known."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
-_FIRST_CANDIDATE = 64
-"""Step after which the first candidate is taken; the interval doubles each time."""
-_EARLIER, _STILL = 0.75, 0.85
-"""Fraction of the steps up to which an earlier image counts; ratio of the last loss to its loss above which a run no longer improves."""
 _FIRST_EARLIER, _COST = 4, 0.02
 """Step from which images of earlier steps are taken for short runs, if their paths are at most this fraction of the steps' paths."""
-_EARLIER_SHORT, _STILL_SHORT, _SURE, _OF_PICTURE_SHORT = 0.5, 0.9, 2.0, 0.05
-"""The same limits as above for runs whose earlier image is of a step before 64: fraction of the steps; ratio of the losses, with the number
-of standard errors by which it must be exceeded; smallest size of the residual relative to the image."""
 _CANDIDATES, _END, _AGAIN = 1, 2, 3
 """Indices of the sets of random numbers."""
 
@@ -97,7 +91,7 @@ class Verify(Callback):
     """
 
     _pictures: FreshPictures | None = field(default=None, init=False)
-    _earlier: list[_Earlier] = field(default_factory=list, init=False)
+    _earlier: list[EarlierImage] = field(default_factory=list, init=False)
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Compile the kernels of fresh pictures, so that nothing compiles after the last step."""
@@ -112,11 +106,11 @@ class Verify(Callback):
             return
         if self._pictures is None:
             self._pictures = FreshPictures(run.problem, run.seed, 0, _CANDIDATES)
-        short = run.step < _FIRST_CANDIDATE
+        short = run.step < FIRST_CANDIDATE
         if short and self._pictures.paths > _COST * run.state.samples:
             return
         values = run.full()
-        earlier = _Earlier.of(run.step, self._pictures, values)
+        earlier = EarlierImage.of(run.step, self._pictures, values)
         self._earlier = [*self._earlier[-1:], earlier]
         if short:
             return
@@ -181,7 +175,7 @@ class Verify(Callback):
         )
 
     def _residual(self, problem: Problem, result: Result, pictures: FreshPictures, end: Picture) -> list[str]:
-        """Return a warning if the images no longer improve, and still differ from the references by more than noise.
+        """Return a warning if the images differ from the references by more than noise, and no longer improve or improve fast.
 
         Args:
             problem: problem of the run.
@@ -192,14 +186,13 @@ class Verify(Callback):
         earlier = next((one for one in reversed(self._earlier) if one.is_compared(result.steps)), None)
         if self._pictures is None or earlier is None:
             return []
-        last = _Earlier.of(result.steps, self._pictures, result.parameters)
+        last = EarlierImage.of(result.steps, self._pictures, result.parameters)
         if not last.is_still(earlier):
-            return []
-        least = _OF_PICTURE_SHORT if earlier.is_short else _OF_PICTURE
+            return unfinished(last, earlier, result.steps, self._pictures)
         references, weights = self._pictures.references, self._pictures.weights
         sampled = pictures.sampled or self._pictures.sampled  # each has other pixels then
         fresh = None if sampled else pictures.differences(end.images)
-        difference = misfit(last.residuals, earlier.residuals, references, weights, least, fresh)
+        difference = misfit(last.residuals, earlier.residuals, references, weights, earlier.least, fresh)
         if difference is None:
             return []
         compares_truth = difference.by_pixel and problem.has_truth
@@ -213,44 +206,6 @@ class Verify(Callback):
             still = f"has hardly improved since step {earlier.step} of {result.steps}"
             cause = f"it may need more steps, or {cause}"
         return [f"{difference.describe()}, and {still}: {cause}"]
-
-
-@dataclass(frozen=True)
-class _Earlier:
-    """A new image of an earlier step.
-
-    Attributes:
-        step: number of completed steps.
-        loss, loss_error: loss without noise, and its standard error.
-        residuals: independent images minus the references, (K, N, 3).
-    """
-
-    step: int
-    loss: float
-    loss_error: float
-    residuals: np.ndarray
-
-    @property
-    def is_short(self) -> bool:
-        """Return whether it is of one of the first steps."""
-        return self.step < _FIRST_CANDIDATE
-
-    def is_compared(self, steps: int) -> bool:
-        """Return whether it is early enough for a comparison with the end of a run of that many steps."""
-        return self.step <= (_EARLIER_SHORT if self.is_short else _EARLIER) * steps
-
-    def is_still(self, earlier: _Earlier) -> bool:
-        """Return whether the loss has hardly fallen since an earlier step."""
-        if not earlier.is_short:
-            return _STILL * earlier.loss < self.loss < math.inf
-        noise = math.hypot(self.loss_error, _STILL_SHORT * earlier.loss_error)
-        return _STILL_SHORT * earlier.loss + _SURE * noise < self.loss < math.inf
-
-    @classmethod
-    def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> _Earlier:
-        """Render the parameters of a step."""
-        picture = pictures.picture(values)
-        return cls(step, *picture.loss, pictures.differences(picture.images))
 
 
 def _ends(run: Run, result: Result) -> tuple[FreshPictures, Picture, Result, Picture, bool]:

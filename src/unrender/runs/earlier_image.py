@@ -1,0 +1,87 @@
+"""New images of earlier steps of a run: does it no longer improve, or has it not ended?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.runs.verification import misfit
+
+FIRST_CANDIDATE = 64
+"""Step after which the first candidate is taken; the interval doubles each time."""
+_EARLIER, _STILL = 0.75, 0.85
+"""Fraction of the steps up to which an earlier image counts; ratio of the last loss to its loss above which a run no longer improves."""
+_OF_PICTURE = 0.02
+"""Smallest size of the residual at the end, relative to the image."""
+_EARLIER_SHORT, _STILL_SHORT, _SURE, _OF_PICTURE_SHORT = 0.5, 0.9, 2.0, 0.05
+"""The same limits as above for runs whose earlier image is of a step before 64: fraction of the steps; ratio of the losses, with the number
+of standard errors by which it must be exceeded; smallest size of the residual relative to the image."""
+_FALLS, _UNFINISHED = 0.8, 0.1
+"""Ratio of the last loss to the earlier one below which a run has not ended, and smallest difference relative to the image."""
+
+
+@dataclass(frozen=True)
+class EarlierImage:
+    """A new image of an earlier step.
+
+    Attributes:
+        step: number of completed steps.
+        loss, loss_error: loss without noise, and its standard error.
+        residuals: independent images minus the references, (K, N, 3).
+    """
+
+    step: int
+    loss: float
+    loss_error: float
+    residuals: np.ndarray
+
+    @property
+    def is_short(self) -> bool:
+        """Return whether it is of one of the first steps."""
+        return self.step < FIRST_CANDIDATE
+
+    def is_compared(self, steps: int) -> bool:
+        """Return whether it is early enough for a comparison with the end of a run of that many steps."""
+        return self.step <= (_EARLIER_SHORT if self.is_short else _EARLIER) * steps
+
+    @property
+    def least(self) -> float:
+        """Return the smallest difference from the references that counts at the end, relative to the image."""
+        return _OF_PICTURE_SHORT if self.is_short else _OF_PICTURE
+
+    def is_still(self, earlier: EarlierImage) -> bool:
+        """Return whether the loss has hardly fallen since an earlier step."""
+        if not earlier.is_short:
+            return _STILL * earlier.loss < self.loss < math.inf
+        noise = math.hypot(self.loss_error, _STILL_SHORT * earlier.loss_error)
+        return _STILL_SHORT * earlier.loss + _SURE * noise < self.loss < math.inf
+
+    @classmethod
+    def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> EarlierImage:
+        """Render the parameters of a step."""
+        picture = pictures.picture(values)
+        return cls(step, *picture.loss, pictures.differences(picture.images))
+
+
+def unfinished(last: EarlierImage, earlier: EarlierImage, steps: int, pictures: FreshPictures) -> list[str]:
+    """Return a warning if the loss still falls, and the image differs from the references by a tenth beyond noise.
+
+    Args:
+        last, earlier: images of the end and of the earlier step, with the same random numbers.
+        steps: number of steps of the run.
+        pictures: renderer of both images.
+    """
+    noise = math.hypot(last.loss_error, _FALLS * earlier.loss_error)
+    if not last.loss + _SURE * noise < _FALLS * earlier.loss:
+        return []
+    difference = misfit(last.residuals, last.residuals, pictures.references, pictures.weights, _UNFINISHED)
+    if difference is None:
+        return []
+    fallen = f"its loss has fallen by {1 - last.loss / earlier.loss:.0%} since step {earlier.step} of {steps}"
+    return [
+        f"{difference.describe()}, and still improves: {fallen}, so the run has not ended; give it more steps or seconds"
+    ]
