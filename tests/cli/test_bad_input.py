@@ -132,6 +132,7 @@ MISTAKES += [  # names that no file can have
     (["run", "problem.toml", "--out", _LONG], "File name too long"),
     (["run", "problem.toml", "--method", _LONG], "unknown method AAAA"),
     (["run", "problem.toml", "--set", f"{_LONG}=1"], "has no option AAAA"),
+    (["run", "problem.toml", "--set", "resolution=64"], "-p sets options of a gallery problem"),
     (["run", "indirect-room", "-p", f"{_LONG}=1"], "no option AAAA"),
     (["compare", _LONG], "File name too long"),
     (["compare", ".", _LONG], "File name too long"),

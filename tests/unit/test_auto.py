@@ -132,7 +132,7 @@ def test_positive_numbers_move_as_logarithms() -> None:
 def test_a_run_with_logarithms_is_taken_up_where_it_stopped(tmp_path: Path) -> None:
     whole = optimize(problem(), "auto", steps=9)
     optimize(problem(), "auto", steps=4, run_directory=tmp_path)
-    assert any(line == "moved as log (gain)" for line in whole.choices)
+    assert any(line == "parameterised as log (gain)" for line in whole.choices)
     for key, value in resume(tmp_path, problem(), steps=9).parameters.items():
         np.testing.assert_array_equal(value, whole.parameters[key])
 
@@ -170,7 +170,7 @@ def test_it_says_what_it_has_chosen_and_why() -> None:
     assert said[0].startswith("recursive control variates, 16 samples per pixel: earlier")
     assert said[1] == "L1 damped where noise exceeds the residual"
     assert said[2] == "Sobolev gradients of map"
-    assert said[3] == "moved as log (gain)"
+    assert said[3] == "parameterised as log (gain)"
     assert said[4] == "schedule-free Adam, first rate 0.1 (map, gain)"
     assert method("rcv").plan(problem()).reasons == ()
 

@@ -322,7 +322,7 @@ def test_the_fingerprint_has_it() -> None:
 @pytest.mark.parametrize("method", ["auto", "plain"])
 def test_what_a_method_chose_names_it(method: str) -> None:
     said = ur.optimize(problem("softplus"), method, steps=1).choices
-    assert "moved as softplus (colour, map)" in said
+    assert "parameterised as softplus (colour, map)" in said
 
 
 @pytest.mark.parametrize("name", ["identity", "log", "logit", "softplus"])

@@ -67,9 +67,13 @@ class Method:
         fields = self.options.model_fields
         for name in settings:
             if name not in fields:
-                hint = did_you_mean(name, fields) or f"; it has {', '.join(fields)}"
+                near = did_you_mean(name, fields)
+                hint = near or f"; it has {', '.join(fields)}"
                 others = ", ".join(other for other in methods() if name in method(other).options.model_fields)
-                hint += f"; --method {others} {'have' if ',' in others else 'has'} it" if others else ""
+                if others:
+                    hint += f"; --method {others} {'have' if ',' in others else 'has'} it"
+                elif not near:
+                    hint += "; -p sets options of a gallery problem"
                 raise InputError(f"method {self.name} has no option {name}{hint}")
         none = {name: None for name, value in settings.items() if isinstance(value, str) and value.lower() == "none"}
         try:
@@ -117,12 +121,12 @@ class Method:
 
 
 def parameterised(problem: Problem) -> tuple[str, ...]:
-    """Return a line with the parameterisations of parameters, such as "moved as log (lamp.radiance)"; empty if there are none."""
+    """Return a line with the parameterisations of parameters, such as "parameterised as log (lamp.radiance)"; empty if there are none."""
     parameterisations = {
         key: u.parameterisation for key, u in problem.unknowns.items() if u.parameterisation is not None
     }
     named = {key: type(own).__name__.lower() for key, own in parameterisations.items()}
-    return (f"moved as {grouped(named)}",) if named else ()
+    return (f"parameterised as {grouped(named)}",) if named else ()
 
 
 def methods() -> dict[str, Method]:

@@ -81,7 +81,7 @@ def positive_values(traits: Traits) -> Part:
     moved = {key: "log" for key in positive if traits.options.parameterise and key not in traits.rates}
     named = {key: type(own).__name__.lower() for key, own in parameterisations.items()} | moved
     settings = {key: ParameterSettings(parameterisation=name) for key, name in moved.items()}
-    return Part(tuple(named), f"moved as {grouped(named)}", settings) if named else Part()
+    return Part(tuple(named), f"parameterised as {grouped(named)}", settings) if named else Part()
 
 
 def lights(traits: Traits) -> Part:
