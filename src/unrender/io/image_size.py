@@ -61,8 +61,8 @@ class Header:
 def check(path: Path) -> int:
     """Return the number of values of an image that Mitsuba decodes: pixels times channels of all parts.
 
-    Raises `InputError` without the file's name, for a file of an unknown kind, a malformed header, or a header that declares more than
-    `MOST_VALUES` values or more than the file's bytes can contain.
+    Raises `InputError` without the file's name, for a file of an unknown kind or a malformed header. A header that declares more than
+    `MOST_VALUES` values, or more than the file's bytes can contain, is an error too.
     """
     return _read_header(path, _MITSUBA).values
 

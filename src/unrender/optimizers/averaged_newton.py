@@ -293,7 +293,7 @@ def _length(x: np.ndarray, step: np.ndarray, scale: np.ndarray, linear: np.ndarr
     """Return the length of a step, in units of `scale`, or relative to its end where images are linear, whichever is longer.
 
     The noise of a model is proportional to its distance from the solution. So a model of a lamp ten times too bright must not remain in
-    the mean, even if the step from it is short in units of the widths, which are large there, too.
+    the mean. The step from it may be short in units of the widths, since these are large there, too.
     """
     relative = step[linear] / (np.abs(x + step) + _OF_WIDTH * scale)[linear]
     return max(float(np.linalg.norm(step / scale)), float(np.linalg.norm(relative)))

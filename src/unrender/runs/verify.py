@@ -211,8 +211,8 @@ class Verify(Callback):
 def _ends(run: Run, result: Result) -> tuple[FreshPictures, Picture, Result, Picture, bool]:
     """Return the renderer of new images, the image of the start, the result as `_end` returns it, its image, and whether it is worse.
 
-    If these images show all pixels and do not tell which end of the run is better, larger ones with other random numbers judge it, if the
-    run's budget leaves time for them. They are returned only if the end is worse by them.
+    If these images show all pixels and do not decide which end of the run is better, larger ones with other random numbers decide. This
+    needs time in the run's budget. They are returned only if the end is worse by them.
     """
     start = run.problem.remeshed_from or run.problem
     pictures = FreshPictures(run.problem, run.seed, _SHARE * run.state.samples, _END)

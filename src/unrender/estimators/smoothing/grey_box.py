@@ -11,8 +11,8 @@ S f(φ(w)) are
     gradient                Jᵀ g
     Hessian times v         Jᵀ H J v + Σₖ gₖ (∇² φₖ) v
 
-where J, its products, and ∇² φₖ v are the network's and exact, and g = ∇ S f(φ), H (J v) = ∇² S f(φ) (J v) are estimated in the few
-dimensions of φ by `unrender.smoothed`. No matrix of n × n, or of weights × weights, is formed.
+where J, its products, and ∇² φₖ v are the network's and exact. `unrender.smoothed` estimates g = ∇ S f(φ) and H (J v) = ∇² S f(φ) (J v)
+in the few dimensions of φ. No matrix of n × n, or of weights × weights, is formed.
 """
 
 from __future__ import annotations

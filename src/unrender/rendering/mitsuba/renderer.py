@@ -225,8 +225,8 @@ class MitsubaRenderer:
     def _is_written(self, key: str, keys: Iterable[str]) -> bool:
         """Return whether a pose is written into the scene instead of transforming rays.
 
-        This holds for lights. It holds for other poses if an emitting shape moves too, which changes the scene's acceleration
-        structure, in scenes with instances, which Mitsuba cannot add to another scene, and on a GPU, which traces one scene.
+        This holds for lights. It holds for other poses if an emitting shape moves too, since that changes the scene's acceleration
+        structure. It also holds in scenes with instances, which Mitsuba cannot add to another scene, and on a GPU, which traces one scene.
         """
         scene = self.pair.loaded()
         if self._poses[key].light or has_instances(scene.scene) or gpu.is_gpu():
