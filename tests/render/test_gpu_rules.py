@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import mitsuba as mi
@@ -24,8 +25,8 @@ def on_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gpu, "is_gpu", lambda: True)
 
 
-def scene() -> dict[str, Any]:
-    """A block before a painted wall."""
+def scene(turn: float = 0.0) -> dict[str, Any]:
+    """A block before a painted wall, turned about the vertical axis by an angle in radians."""
     transform = mi.ScalarTransform4f
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
     paint = mi.Bitmap(np.random.default_rng(0).uniform(0.2, 0.8, (4, 4, 3)).astype(np.float32))
@@ -42,7 +43,11 @@ def scene() -> dict[str, Any]:
             "to_world": transform().translate([0, 0, -1]).scale(2.0),
             "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": paint, "raw": True}},
         },
-        "block": {"type": "cube", "to_world": transform().scale(0.5), "bsdf": {"type": "diffuse"}},
+        "block": {
+            "type": "cube",
+            "to_world": transform().rotate([0, 1, 0], np.degrees(turn)).scale(0.5),
+            "bsdf": {"type": "diffuse"},
+        },
         "sky": {"type": "constant"},
     }
 
@@ -67,17 +72,17 @@ def test_a_second_adjoint_has_the_gradient_of_the_first(on_gpu: None) -> None:
 
 
 def test_poses_are_written_into_the_scene(on_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The images are those of rays that are transformed, which takes a second scene."""
+    """The images are those of scenes with the turned block: rays are not transformed, which takes a second scene."""
     key, turns = "block.rotation.y", np.array([0.0, 0.6])
-    request = SampleRequest(0, 1024, 3)
-    with monkeypatch.context() as undone:
-        undone.setattr(gpu, "is_gpu", lambda: False)
-        expected = numbers(MitsubaRenderer(scene, 2).prepare([key], None, False).image_batch({key: turns}, request))
+    request, expected = SampleRequest(0, 1024, 3), []
+    for turn in turns:
+        turned = MitsubaRenderer(partial(scene, turn), 2)
+        expected.append(numbers(turned.prepare([PAINT], None).image(turned.values([PAINT]), request).images)[0])
     monkeypatch.setattr(Assembly, "ray_intersect", lambda *_, **__: pytest.fail("a second scene is traced"))
     renderer = MitsubaRenderer(scene, 2)
     found = numbers(renderer.prepare([key], None, derivatives=False).image_batch({key: turns}, request))
     assert np.abs(expected[1] - expected[0]).max() > 0.1
-    assert np.abs(found - expected).max() < 0.03
+    assert np.abs(found - np.stack(expected)).max() < 0.03
 
 
 def test_images_of_a_pair_of_meshes_trace_one_scene_each(on_gpu: None, monkeypatch: pytest.MonkeyPatch) -> None:

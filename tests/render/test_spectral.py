@@ -298,7 +298,7 @@ def _fog() -> dict[str, Any]:
             "the data of the bitmap of reflectance are colours.*give bitmap = ",
         ),
         (lambda: {"wall": _picture_wall("bitmap", _overwritten())}, "colours below 0.*make a new mitsuba.Bitmap"),
-        (lambda: {"fog": _fog()}, "do not support participating media; use the variant llvm_ad_rgb"),
+        (lambda: {"fog": _fog()}, "do not support participating media; use the variant (llvm|cuda)_ad_rgb"),
         (
             lambda: {"camera": {"type": "perspective", "film": {"type": "specfilm", "b": spectrum(1, 1)}}},
             "support an hdrfilm without srf only",

@@ -107,7 +107,7 @@ def timed(methods: dict[str, Any], seconds: dict[str, float]) -> Runs:
 def summarize(record: dict[str, Any]) -> dict[str, Any]:
     """Each task's errors at equal time, and ratios to uniform mini-batches by time and by samples."""
     entries = {}
-    for task, entry in record["entries"].items():
+    for task, entry in record.get("entries", {}).items():
         runs = timed(entry["methods"], record["seconds_per_path"][task])
         entries[task] = {**entry, "errors": tenths(runs, 0), "over uniform": over(runs, "uniform")}
         if entry.get("steps"):
@@ -173,7 +173,7 @@ def run(
 
 def table(record: Record) -> str:
     """All races in one table; then per task final errors, and ratios to uniform at checkpoints."""
-    parts = [all_races(record)]
+    parts = [all_races(record)] if record["entries"] else []
     for name, entry in record.get("levels", {}).items():
         row = "{method} | {rate:g} | {final!m}"
         parts += [
@@ -226,5 +226,8 @@ def plot(record: Record) -> figures.Figure:
             for method, runs in timed(entry["methods"], record["seconds_per_path"][name]).items()
         }
         for name, entry in record["entries"].items()
+    } | {
+        f"one level or five, {name}": {of: figures.points(run["runs"]) for of, run in entry["methods"].items()}
+        for name, entry in record.get("levels", {}).items()
     }
     return figures.curves(panels, "seconds")
