@@ -294,8 +294,8 @@ def _fog() -> dict[str, Any]:
     [
         (lambda: {"wall": _raw_wall()}, "the bitmap of reflectance is raw.*set raw to false"),
         (
-            lambda: {"wall": _picture_wall("data", mi.TensorXf(np.full((2, 2, 3), 0.5, np.float32)))},
-            "the data of the bitmap of reflectance are colours.*give bitmap = ",
+            lambda: {"wall": _picture_wall("data", mi.TensorXf(np.full((2, 2, 3), [0.01, 0.5, 0.3], np.float32)))},
+            "bitmap: spectral variants take data for coefficients.*give bitmap = ",
         ),
         (lambda: {"wall": _picture_wall("bitmap", _overwritten())}, "colours below 0.*make a new mitsuba.Bitmap"),
         (lambda: {"fog": _fog()}, "do not support participating media; use the variant (llvm|cuda)_ad_rgb"),

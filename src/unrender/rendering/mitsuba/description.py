@@ -217,13 +217,18 @@ class _Dictionary:
 def _copied(value: Any, owner: Mapping[str, Any]) -> Any:
     """Return a copy of a bitmap or tensor, because Mitsuba empties tensors, and in spectral variants overwrites bitmaps with coefficients.
 
-    Raises `InputError` for a bitmap of colours that another load has overwritten.
+    Raises `InputError` for a bitmap of colours that another load has overwritten, and for a tensor of colours, which Mitsuba would take for
+    coefficients.
     """
+    colours = is_spectral() and owner.get("type") == "bitmap" and not owner.get("raw", False)
     if dr.is_tensor_v(value):
+        if colours and value.shape[-1:] == (3,):
+            raise InputError(
+                "bitmap: spectral variants take data for coefficients of spectra; give bitmap = mitsuba.Bitmap(...)"
+            )
         return type(value)(value)
     if not isinstance(value, mi.Bitmap):
         return value
-    colours = is_spectral() and owner.get("type") == "bitmap" and not owner.get("raw", False)
     if colours and np.array(value, copy=False).min(initial=0) < 0:
         raise InputError(
             "bitmap: colours below 0, such as the coefficients with which mitsuba.load_dict overwrites a bitmap in spectral variants; "
