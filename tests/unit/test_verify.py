@@ -16,7 +16,7 @@ from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.images.base import leave_one_out
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.runs import run, verify
+from unrender.runs import run, verification, verify
 from unrender.runs.folder import reader
 from unrender.runs.folder.schema import NOT_VERIFIED
 from unrender.statistics import paired_losses
@@ -614,3 +614,23 @@ def test_a_resumed_run_keeps_the_same_parameters(tmp_path: Path) -> None:
     assert np.abs(further.last["x"] - whole.last["x"]).max() < 5 * 40 * 0.05
     assert np.abs(further.last["x"] - whole.parameters["x"]).max() > 0
     assert "last.npz" in {path.name for path in (tmp_path / "whole").iterdir()}
+
+
+@pytest.mark.parametrize("improved", [True, False])
+def test_a_difference_in_few_pixels_counts_after_a_run_without_improvement(improved: bool) -> None:
+    """Single pixels, such as a face that the sun of an unknown sky does not reach, are no difference that neighbours share."""
+    generator, problem = np.random.default_rng(0), made()
+    references = np.full((512, 3), 0.1)
+    residuals = generator.normal(0.0, 0.002, (4, 512, 3))
+    assert not verification.misfit_of_numbers(problem, residuals, references, np.ones(512), improved=improved)
+    residuals[:, 7:512:32] += 0.15 * generator.choice((-1.0, 1.0), (16, 3))
+    found = verification.misfit_of_numbers(problem, residuals, references, np.ones(512), improved=improved)
+    assert ("the final picture differs" in found) is not improved
+
+
+def test_a_run_that_starts_at_the_truth_has_not_improved(monkeypatch: pytest.MonkeyPatch) -> None:
+    noted: list[bool] = []
+    monkeypatch.setattr(verify, "misfit_of_numbers", lambda *_, improved: noted.append(improved) or "wrong")
+    result = ur.optimize(made(start=None, noise=0.1), ur.GaussNewton(), ur.optimizers.AveragedNewton(), steps=12)
+    assert noted == [False]
+    assert not result.standard_error

@@ -66,6 +66,7 @@ def misfit(
     weights: np.ndarray,
     least: float,
     fresh: np.ndarray | None = None,
+    by_pixel: bool = False,
 ) -> Misfit | None:
     """Return the difference from the references that two pictures share; None if it may be noise or is small.
 
@@ -78,6 +79,7 @@ def misfit(
         weights: weight of each pixel, (N,), in [0, 1].
         least: smallest difference relative to the references.
         fresh: differences of K >= 2 images with independent noise, (K, N, 3). With these, few pixels are also judged one by one.
+        by_pixel: whether many pixels are, too.
     """
     one, other = residuals.mean(axis=0), others.mean(axis=0)
     if not (np.isfinite(one).all() and np.isfinite(other).all()):
@@ -90,18 +92,23 @@ def misfit(
         return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), by_pixel) if beyond else None
 
     difference = significant(paired_losses.systematic(one, weights, other), least, False)
-    if difference or fresh is None or np.count_nonzero(weights) >= _FEW_PIXELS:
+    if difference or fresh is None or not (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
         return difference
     return significant(paired_losses.repeated(residuals, fresh, weights), _OF_FEW, True)
 
 
 def misfit_of_numbers(
-    problem: Problem, residuals: np.ndarray, references: np.ndarray, weights: np.ndarray, known: Sequence[str] = ()
+    problem: Problem,
+    residuals: np.ndarray,
+    references: np.ndarray,
+    weights: np.ndarray,
+    known: Sequence[str] = (),
+    improved: bool = True,
 ) -> str:
     """Return a warning if only few numbers are unknown and the images differ from the references; else "".
 
     Least squares of few numbers end where the difference is noise. Elsewhere their standard errors mean nothing. Noise of the references
-    does not count, since pixels do not share it.
+    does not count, since pixels do not share it. It counts after a run without improvement, whose difference may be in few pixels.
 
     Args:
         problem: problem with the unknowns.
@@ -109,13 +116,16 @@ def misfit_of_numbers(
         references: references, (N, 3).
         weights: weight of each pixel, (N,), in [0, 1].
         known: warnings of the run; one that says so already is returned.
+        improved: whether the images are better than at the start.
     """
     elements = sum(math.prod(shape) for shape in problem.shapes().values())
     if elements > _FEW_NUMBERS or len(residuals) < 2:
         return ""
     if line := next((warning for warning in known if DIFFERS in warning), ""):
         return line
-    difference = misfit(residuals[0::2], residuals[1::2], references, weights, _OF_PICTURE)
+    one, other = residuals[0::2], residuals[1::2]
+    fresh = None if improved or len(residuals) < 4 else other
+    difference = misfit(one, other, references, weights, _OF_PICTURE, fresh, by_pixel=True)
     if difference is None:
         return ""
     return (

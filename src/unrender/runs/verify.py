@@ -146,7 +146,8 @@ class Verify(Callback):
         lines = self._residual(problem, result, pictures, last)
         if result.standard_error and not (lines or places):
             differences = pictures.differences(last.images)
-            differs = misfit_of_numbers(problem, differences, pictures.references, pictures.weights)
+            improved = _is_worse(pictures, last, first)
+            differs = misfit_of_numbers(problem, differences, pictures.references, pictures.weights, improved=improved)
             lines = [differs] if differs else []
         if lines:
             result = replace(result, standard_error={})
