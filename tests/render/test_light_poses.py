@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from benchmarks.shapes.lights import run as lights
 from tiers import quick
 from unrender.methods import method
+from unrender.methods.rules import newton, starts
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -86,6 +88,21 @@ def test_auto_finds_a_far_rotation_beside_an_unknown_scale() -> None:
     start = {key: float(np.ravel(x)[0]) for key, x in plan.configured().start().items()}
     assert abs(start["lamp.rotation.y"]) < 1.0
     assert 0.7 < start["lamp.scale"] < 1.4
+
+
+@pytest.mark.parametrize("share", [None, 0.0])
+def test_auto_leaves_a_start_at_which_the_sun_lights_other_faces(
+    share: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Places 45° apart miss the faces' range; on a plateau, where no derivative image resembles the residual, a start is looked for too."""
+    if share is not None:
+        monkeypatch.setattr(newton, "_explained", lambda *_: share)
+    made = lights.problem("sunsky", views=3, seed=0, resolution=16, spp=64)
+    plan = method("auto").plan(made)
+    assert any(reason.startswith("starts at another place") for reason in plan.reasons)
+    assert abs(float(np.ravel(plan.configured().start()["lamp.rotation.y"])[0])) < 0.3
+    monkeypatch.setattr(starts, "_PER_DIMENSION", 8)
+    assert "smoothed" in method("auto").plan(made).reasons[0] or share is None
 
 
 VALUES = {"translation": SHIFT, "rotation": TURN, "scale": SCALE}

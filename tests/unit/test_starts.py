@@ -186,7 +186,7 @@ def test_places_are_spread_over_the_range(role: str, monkeypatch: pytest.MonkeyP
     made = Problem(renderer, [Parameter("place", bounds=(-1.0, 1.0))], [View(np.zeros((*SHAPE, 3)))])
     traits: Any = type("T", (), {"infos": {"place": info}, "problem": made})
     places = np.array([place["place"] for place in starts._places(traits, ["place"])])
-    assert len(places) == (16 if role == "direction" else 24)
+    assert len(places) == 24
     assert (np.abs(places) <= 1.0).all()
     if role == "direction":
         np.testing.assert_allclose(np.linalg.norm(places, axis=1), 1.0, atol=1e-3)

@@ -1,4 +1,5 @@
-"""Poses of lights from few pictures: a spotlight's aim, a projector's pose, an area light's place, the turn of an environment map.
+"""Poses of lights from few pictures: a spotlight's aim, a projector's pose, an area light's place, the turn of an environment
+map and of a sky.
 
 A floor and a box, pictures of few pixels, starts that differ by seed. `auto` takes a fixed number of steps. Mitsuba's own loop
 (`mi.render` with `prb_projective`, `mi.ad.Adam`) moves the area light only: the transforms of other emitters have no derivative there, nor
@@ -25,6 +26,7 @@ UNKNOWN: dict[str, dict[str, float]] = {
     "projector": {"translation": 0.2, "rotation": 0.1},
     "area": {"translation": 0.4},
     "envmap": {"rotation.y": 0.5},
+    "sunsky": {"rotation.y": 0.5},
 }
 """{light: {key: distance of the start from the truth, in each number}}."""
 RATES, SPP, TIMES = (0.01, 0.03), 16, 3
@@ -43,6 +45,8 @@ def light(name: str) -> dict[str, Any]:
         case "area":
             place = mi.ScalarTransform4f().translate([0.4, 2.2, 0.3]).rotate([1, 0, 0], 90).scale(0.3)
             return {"type": "rectangle", "to_world": place, "emitter": {"type": "area", "radiance": parts.colour(12.0)}}
+        case "sunsky":
+            return {"type": "sunsky", "sun_direction": [0.5, 0.7, 0.4]}
     return {"type": "envmap", "bitmap": picture}
 
 

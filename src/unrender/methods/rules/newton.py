@@ -76,7 +76,7 @@ def few_numbers(traits: Traits) -> Plan | None:
 
     Numbers of a BSDF, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses take these steps if
     derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be combined with other
-    numbers, such as intensities.
+    numbers, such as intensities. A light on a plateau takes them too if a better start is found elsewhere.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_bsdfs(traits)
@@ -86,17 +86,21 @@ def few_numbers(traits: Traits) -> Plan | None:
         return None
     estimator = _estimator(traits, keys, constants.pose_images)
     estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.averaged_values)
+    plateau = False
     if traits.poses:
         trial = replace(
             estimator, derivative_spp=constants.trial_spp, coarse=None, noise_limit=None, remember=False, scores=False
         )
         trial = replace(trial, largest=widths_of(traits.options.sigma, problem, traits.poses))
         least = constants.explained if shapes else constants.explained_light
-        if not problem.loss.linear or not _explained(problem, trial) > least:
+        if not problem.loss.linear:
             return None
+        plateau = not _explained(problem, trial) > least
     why = f"change their form with {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
-    return best_start(traits, keys, Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,)))
+    plan = Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
+    made = best_start(traits, keys, plan)
+    return None if plateau and made is plan else made
 
 
 def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
