@@ -183,6 +183,15 @@ def test_normals_without_a_direction_are_refused_with_what_to_give() -> None:
     ur.Problem(built("normalmap"), [ur.Parameter(key, initial=[0.5, 0.5, 1.0])], views)
 
 
+def test_a_constant_in_a_bump_map_is_no_error() -> None:
+    """Pictures depend on its slopes alone."""
+    key, views = "ball.bsdf.nested_texture.data", [ur.View(np.zeros((16, 16, 3)))]
+    truth = ur.Problem(built("bumpmap"), [ur.Parameter(key)], views).initial_values()[key]
+    made = ur.Problem(built("bumpmap"), [ur.Parameter(key)], views, truth={key: truth})
+    assert made.parameter_error({key: truth + 3.0})[key] == pytest.approx(0.0, abs=1e-5)
+    assert made.parameter_error({key: 2.0 * truth})[key] == pytest.approx(np.std(truth), rel=1e-4)
+
+
 def test_texture_coordinates_that_a_mesh_does_not_have_are_refused() -> None:
     assert "it holds no values" in refusal(built("obj"), "ball.vertex_texcoords")
 

@@ -28,6 +28,15 @@ def test_numbers_have_the_root_mean_square_difference():
     assert (PLAIN.name, PLAIN.unit, PLAIN.text(0.25)) == ("RMSE", "", "0.25")
 
 
+def test_heights_have_the_standard_deviation_of_the_difference():
+    height, truth = ErrorMeasure("height"), np.arange(6.0).reshape(2, 3, 1)
+    assert height.error(truth + 5.0, truth) == pytest.approx(0.0, abs=1e-12)
+    assert height.error(3.0 * truth, truth) == pytest.approx(2.0 * np.std(truth))
+    where = np.array([[True, True, False], [False, False, False]])
+    assert height.error(3.0 * truth, truth, where) == pytest.approx(1.0)
+    assert (height.unit, parameter_errors.title([height, PLAIN])) == ("", "Parameter error (RMSE)")
+
+
 @pytest.mark.parametrize("length", [0.3, 1.0, 2.5])
 def test_a_normal_map_has_the_mean_angle_whatever_the_length_of_its_normals(length: float):
     angles = np.array([[0.0, 10.0], [20.0, 90.0]])

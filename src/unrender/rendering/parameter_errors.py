@@ -1,4 +1,4 @@
-"""Errors of parameter values by their role: numbers, normals or directions."""
+"""Errors of parameter values by their role: numbers, heights, normals or directions."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from unrender.core import periodic
 
-Role = Literal["value", "normal", "direction"]
-"""Meaning of a parameter's values: numbers, a normal map (n = 2 x - 1), or vectors of which only the direction matters."""
+Role = Literal["value", "height", "normal", "direction"]
+"""Meaning of a parameter's values: numbers, heights of which only differences matter, a normal map (n = 2 x - 1), or vectors of which
+only the direction matters."""
 
 _MOST_COLUMNS = 8
 """Maximum number of repeated columns that a record may state."""
@@ -23,8 +24,8 @@ _SHORTEST = 1e-12
 class ErrorMeasure:
     """Error measure between values and the ground truth.
 
-    The error of numbers is the root mean square difference. The error of normals and directions is the mean angle in
-    degrees after normalisation, since images do not depend on their lengths.
+    The error of numbers is the root mean square difference, that of heights the standard deviation of the difference. The error of
+    normals and directions is the mean angle in degrees after normalisation, since images do not depend on their lengths.
 
     Attributes:
         role: meaning of the values. Arrays of normals and directions have the vectors' components on the last axis, or are flat.
@@ -35,14 +36,19 @@ class ErrorMeasure:
     repeated: int = 0
 
     @property
+    def is_angle(self) -> bool:
+        """Return whether the error is an angle."""
+        return self.role in ("normal", "direction")
+
+    @property
     def name(self) -> str:
         """Short name of the error."""
-        return "RMSE" if self.role == "value" else "mean angle"
+        return "mean angle" if self.is_angle else "RMSE" if self.role == "value" else "RMSE without the mean"
 
     @property
     def unit(self) -> str:
         """Unit of the error; "" if it is the unit of the values."""
-        return "" if self.role == "value" else "°"
+        return "°" if self.is_angle else ""
 
     def text(self, error: float) -> str:
         """Return an error with its unit, with four significant digits."""
@@ -61,7 +67,9 @@ class ErrorMeasure:
         if values.shape != truth.shape or values.size == 0:
             return None
         with np.errstate(over="ignore", invalid="ignore"):
-            errors = self._squares(values, truth) if self.role == "value" else self._angles(values, truth)
+            errors = (
+                self._angles(values, truth) if self.is_angle else np.asarray(self._unknown(values - truth), np.float64)
+            )
         if where is not None:
             cells = self._unknown(where)
             if cells.ndim < 1 or errors.shape[: cells.ndim] != cells.shape:
@@ -69,17 +77,17 @@ class ErrorMeasure:
             errors = errors[cells]
         if errors.size == 0:
             return None
-        mean = float(np.mean(errors, dtype=np.float64))
-        return mean if self.role != "value" else float(np.sqrt(mean))
+        if self.is_angle:
+            return float(np.mean(errors, dtype=np.float64))
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean = errors.mean() if self.role == "height" else 0.0
+            return float(np.sqrt(np.mean(np.square(errors - mean))))
 
     def name_with_median(self, values: np.ndarray, truth: np.ndarray) -> str:
         """Return `name`; for angles, add their median, which is robust to outliers."""
-        if self.role == "value" or values.shape != truth.shape or values.size == 0:
+        if not self.is_angle or values.shape != truth.shape or values.size == 0:
             return self.name
         return f"{self.name}; median {self.text(float(np.median(self._angles(values, truth))))}"
-
-    def _squares(self, values: np.ndarray, truth: np.ndarray) -> np.ndarray:
-        return np.square(self._unknown(values - truth), dtype=np.float64)
 
     def _angles(self, values: np.ndarray, truth: np.ndarray) -> np.ndarray:
         """Return the angle between the vectors of each cell, in degrees."""
@@ -118,7 +126,7 @@ def from_record(record: Any) -> ErrorMeasure:
 
 def title(measures: Iterable[ErrorMeasure]) -> str:
     """Return the axis title of a chart of parameter errors."""
-    roles = {measure.name for measure in measures}
+    roles = {"mean angle" if measure.is_angle else PLAIN.name for measure in measures}
     if roles <= {PLAIN.name}:
         return "Parameter error (RMSE)"
     return f"Parameter error ({'RMSE, or ' if PLAIN.name in roles else ''}mean angle in °)"

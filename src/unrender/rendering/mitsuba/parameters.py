@@ -239,14 +239,14 @@ def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Ro
         shape: shape of its array.
     """
     vectors = math.prod(shape) % 3 == 0 if len(shape) == 1 else bool(shape) and shape[-1] == 3
-    if not vectors:
-        return "value"
     names, node = key.split("."), parameters.properties[key][2]
-    if names[-1] in _DIRECTIONS:
+    if vectors and names[-1] in _DIRECTIONS:
         return "direction"
-    while node is not None:  # find the normal map, however its texture is wrapped
+    while node is not None:  # find the normal or bump map, however its texture is wrapped
         if isinstance(node, mi.BSDF):
-            return "normal" if node.class_name() == "NormalMap" and "normalmap" in names else "value"
+            if node.class_name() == "BumpMap" and "nested_texture" in names and len(shape) > 1:
+                return "height"
+            return "normal" if vectors and node.class_name() == "NormalMap" and "normalmap" in names else "value"
         node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
     return "value"
 
