@@ -11,10 +11,9 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.runs.image_sensitivity import seen_cells
-from unrender.runs.numbers import tested_views
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
-from unrender.scene.render import render
+from unrender.scene.render import render, selected_views
 
 _LEAST = 0.005
 """Relative change of the images below which a parameter counts as undetermined over its range."""
@@ -123,7 +122,7 @@ def common_factor(
         return []
     started = time.perf_counter()
     render(problem, values, 0, spp, _SEEDS[0], per_pass)
-    if _RENDERINGS * len(tested_views(problem)) * (time.perf_counter() - started) > seconds:
+    if _RENDERINGS * len(selected_views(problem)) * (time.perf_counter() - started) > seconds:
         return []
     brighter = {key: x * np.float32(_FACTOR) if key in lights else x for key, x in values.items()}
     darker = {key: x / np.float32(_FACTOR) if key in colours else x for key, x in brighter.items()}
@@ -162,7 +161,7 @@ def _change(
     The product of two independent differences has no noise bias; each uses equal random numbers.
     """
     products, squares = [], []
-    for view in tested_views(problem):
+    for view in selected_views(problem):
         differences = []
         for seed in _SEEDS:
             first, second = (render(problem, state, view, spp, seed, per_pass) for state in (before, after))

@@ -23,10 +23,9 @@ from unrender.runs.image_sensitivity import (
     transposed,
 )
 from unrender.runs.least_squares import check_numbers, checked_keys
-from unrender.runs.numbers import tested_views
 from unrender.runs.verification import misfit_of_views
 from unrender.scene.problem import Problem
-from unrender.scene.render import as_tree, render
+from unrender.scene.render import as_tree, render, selected_views
 
 __all__ = ["Uncertainty", "no_maps", "of_residuals", "pixel_noise", "uncertainty"]
 
@@ -113,7 +112,7 @@ def uncertainty(
     keys = checked_keys(problem, values, problem.initial_values())
     mapped = map_keys(problem)
     if mapped or keys:
-        views = range(len(problem.views)) if mapped else tested_views(problem)
+        views = range(len(problem.views)) if mapped else selected_views(problem)
         halves = _halves(problem, values, views, seed)
         if differs := misfit_of_views(problem, views, list(zip(*halves, strict=True))):
             return Uncertainty(missing=(differs,))

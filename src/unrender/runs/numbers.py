@@ -13,15 +13,14 @@ from unrender.core.random import Key
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.runs.image_sensitivity import mask_roots
 from unrender.scene.problem import Problem
-from unrender.scene.render import power_of_two
+from unrender.scene.render import power_of_two, selected_views
 
-__all__ = ["Differences", "Numbers", "tested_views"]
+__all__ = ["Differences", "Numbers"]
 
 _MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
 """Elements of all numbers and of one, up to which they are tested."""
 _MOST_VALUES = 1 << 25
 """Values of the pictures of one pass, up to which there is a check."""
-_MOST_VIEWS = 4
 _PATHS, _SPP = 1 << 18, (4, 32)
 """Path budget of the pictures of one pass, and limits of their samples per pixel."""
 
@@ -116,7 +115,7 @@ class Numbers:
             values: {key: array} of all unknowns.
             start: {key: array}, initial values, for the sizes.
         """
-        known, views = problem.renderer.parameters(), tested_views(problem)
+        known, views = problem.renderer.parameters(), selected_views(problem)
         sensors = {problem.views[view].sensor for view in views}
         keys = [
             key
@@ -253,9 +252,3 @@ class Numbers:
             total += image.size
         least = 0.01 * math.sqrt(float(np.mean(np.square(self.references()))))
         return max(math.sqrt(squares / total), least, 1e-30)
-
-
-def tested_views(problem: Problem) -> list[int]:
-    """Return the indices of the rendered views, evenly spaced, four at most."""
-    count = len(problem.views)
-    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})

@@ -16,6 +16,8 @@ from unrender.scene.problem import Problem
 
 _PATHS_PER_PASS = 1 << 21
 """Maximum number of paths per pass, within the memory of a small machine."""
+_SELECTED_VIEWS = 4
+"""Maximum number of views that `selected_views` returns."""
 MANY_SENSORS = 4
 """Number of sensors from which all views share one kernel: recording one per sensor would take longer than rendering."""
 
@@ -125,3 +127,9 @@ def as_tree(problem: Problem, parameters: Mapping[str, np.ndarray] | None) -> Tr
         if np.shape(value) != arrays.shape(point[key]):
             raise InputError(f"parameter {key}: expected shape {arrays.shape(point[key])}, got {np.shape(value)}")
     return {key: problem.renderer.array(np.asarray(parameters[key])) for key in point}
+
+
+def selected_views(problem: Problem) -> list[int]:
+    """Return the indices of at most four views, evenly spaced, for tests that cannot render all."""
+    count = len(problem.views)
+    return sorted({round(place) for place in np.linspace(0, count - 1, min(count, _SELECTED_VIEWS))})

@@ -11,13 +11,15 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.methods.rules.constants import Constants
 from unrender.scene.problem import Problem
-from unrender.scene.render import power_of_two, render
+from unrender.scene.render import power_of_two, render, selected_views
+from unrender.statistics.halves import normal_equations
 
 __all__ = ["start_factors"]
 
 _SEEDS = (11, 12)
 """Seeds of two independent halves."""
-_MOST_VIEWS, _MOST_PIXELS = 4, 1 << 19
+_MOST_PIXELS = 1 << 19
+"""Maximum number of pixels of the views, of which the first is always rendered."""
 _PATHS, _SPP = 1 << 17, (2, 64)
 """Path budget of the images of one state, and limits of their samples per pixel."""
 _LIMIT = 1e4
@@ -55,8 +57,10 @@ def start_factors(problem: Problem, keys: Sequence[str], constants: Constants) -
 
 def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, float], float, bool]:
     """Return the factors, the ratio of the mean square residuals with and without them, and whether the loss is less with them."""
-    start, views = problem.initial_values(), _views(problem)
-    pixels = sum(math.prod(problem.sizes[view]) for view in views)
+    start, selected = problem.initial_values(), selected_views(problem)
+    ends = np.cumsum([math.prod(problem.sizes[view]) for view in selected])
+    most = max(int((ends <= _MOST_PIXELS).sum()), 1)
+    views, pixels = selected[:most], int(ends[most - 1])
     spp = power_of_two(min(max(_PATHS // pixels, _SPP[0]), _SPP[1]))
     states: list[Mapping[str, np.ndarray]] = [start, *({**start, key: 2.0 * start[key]} for key in keys)]
     count = len(keys)
@@ -66,12 +70,10 @@ def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, flo
         weight = own.weight * own.pixel_weights(problem.sizes[view]).reshape(*problem.sizes[view], 1)
         halves = [np.stack([render(problem, x, view, spp, seed) for x in states]).astype(np.float64) for seed in _SEEDS]
         means[view] = (halves[0] + halves[1]) / 2.0
-        one, other = ((images[1:] - images[0]).reshape(count, -1) for images in halves)
-        residuals = [(np.asarray(own.reference) - images[0]) * weight for images in halves]
-        matrix += (one * np.broadcast_to(weight, residuals[0].shape).reshape(-1)) @ other.T
-        vector += 0.5 * (one @ residuals[1].reshape(-1) + other @ residuals[0].reshape(-1))
-        squares += float((residuals[0] * (np.asarray(own.reference) - halves[1][0])).sum())
-    matrix = 0.5 * (matrix + matrix.T)
+        residuals = [np.asarray(own.reference) - images[0] for images in halves]
+        parts = normal_equations([images[1:] - images[0] for images in halves], residuals, weight)
+        matrix, vector = matrix + parts[0], vector + parts[1]
+        squares += float((residuals[0] * residuals[1] * weight).sum())
     step = np.linalg.solve(matrix, vector)
     after = squares - 2.0 * float(step @ vector) + float(step @ matrix @ step)
     factors = {key: 1.0 + float(x) for key, x in zip(keys, step, strict=True)}
@@ -83,11 +85,3 @@ def _loss(problem: Problem, images: Mapping[int, np.ndarray], step: np.ndarray) 
     """Return the loss of views from the images of all states and the change of each light's factor."""
     changed = {view: of[0] + np.tensordot(step, of[1:] - of[0], 1) for view, of in images.items()}
     return sum(arrays.number(problem.loss_value(view, problem.renderer.array(x))) for view, x in changed.items())
-
-
-def _views(problem: Problem) -> list[int]:
-    """Return an even selection of the views, as many as the limit of pixels allows, at least one."""
-    count = len(problem.views)
-    chosen = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_VIEWS))})
-    ends = np.cumsum([math.prod(problem.sizes[view]) for view in chosen])
-    return [view for view, end in zip(chosen, ends, strict=True) if end <= max(_MOST_PIXELS, ends[0])]

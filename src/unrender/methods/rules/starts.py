@@ -15,6 +15,7 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules.traits import Traits
 from unrender.parameterisations.base import Bounds
 from unrender.scene.parameter import ParameterSettings
+from unrender.statistics.halves import normal_equations
 from unrender.statistics.paired_losses import difference, mean_and_error
 
 __all__ = ["best_start"]
@@ -152,11 +153,7 @@ def _losses(
 def _factor(pictures: FreshPictures, images: Sequence[np.ndarray], own: Sequence[np.ndarray]) -> float:
     """Return the factor of least squares of the part `own` of the images. Products of independent halves have no bias from noise."""
     image, light = (np.concatenate(parts, axis=1) for parts in (images, own))
-    of = [light[half::2].mean(axis=0) for half in (0, 1)]
+    own_halves = [light[half::2].mean(axis=0)[None] for half in (0, 1)]
     missing = [pictures.references - image[half::2].mean(axis=0) for half in (0, 1)]
-    with np.errstate(invalid="ignore"):
-        products = (of[0] * missing[1] + of[1] * missing[0]).sum(axis=1)
-        squares = (2.0 * of[0] * of[1]).sum(axis=1)
-    weights = pictures.weights
-    used = (weights > 0.0) & np.isfinite(products) & np.isfinite(squares)
-    return 1.0 + float((products * weights)[used].sum() / max(float((squares * weights)[used].sum()), 1e-300))
+    matrix, vector = normal_equations(own_halves, missing, pictures.weights[:, None])
+    return 1.0 + float(vector[0] / max(float(matrix[0, 0]), 1e-300))
