@@ -23,8 +23,10 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import GradientRequest, leave_one_out_groups
-from unrender.gallery import parts, volumes
+from unrender.gallery import parts, textures, volumes
 from unrender.gallery.indirect_room import IndirectRoom
+from unrender.gallery.lenses import Lenses
+from unrender.gallery.relief import Relief
 from unrender.gallery.smoke import Smoke
 from unrender.gallery.specification import build_problem
 from unrender.images import denoising
@@ -35,13 +37,16 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules import newton
 from unrender.optimizers.base import Optimizer
 from unrender.pixels.base import PixelSampler
+from unrender.rendering.expressions import ExpressionRenderer
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.ranges import Range, SlotReaders
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.mitsuba.scene_loading import media
 from unrender.rendering.numpy.one_pixel import RATE
+from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
+from unrender.rendering.tied import TiedRenderer
 from unrender.rendering.wrapper import RendererWrapper
 from unrender.runs import loop
 from unrender.runs.budget import Budget
@@ -75,6 +80,19 @@ def stock_scene(problem: ur.Problem) -> tuple[Any, Any]:
     return pair.previous, pair.previous_parameters
 
 
+def scene_values(problem: ur.Problem, values: Mapping[str, Any]) -> dict[str, Any]:
+    """{key of the scene: value} for values of the unknowns, by ties and expressions, with derivatives where the values have some."""
+    found, renderer = dict(values), problem.renderer
+    while isinstance(renderer, RendererWrapper):
+        if isinstance(renderer, TiedRenderer):
+            found = renderer.scene_values(found)
+        elif isinstance(renderer, ExpressionRenderer):
+            own = {key: found.pop(key) for key in renderer.unknowns if key in found}
+            found |= renderer.evaluated(own)
+        renderer = renderer.inner
+    return found
+
+
 def volumetric(problem: ur.Problem) -> bool:
     """Whether the problem's scene has participating media."""
     return _mitsuba(problem).pair.volumetric
@@ -91,9 +109,10 @@ def scene_description(problem: ur.Problem) -> Any:
 def _mitsuba(problem: ur.Problem) -> Any:
     from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
-    if not isinstance(problem.renderer, MitsubaRenderer):
+    renderer = scene_renderer(problem.renderer)
+    if not isinstance(renderer, MitsubaRenderer):
         raise TypeError(f"{problem.name} is not rendered by Mitsuba")
-    return problem.renderer
+    return renderer
 
 
 def from_tensor(value: Any, like: Any) -> Any:

@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import dr, from_tensor, mi, project, stock_scene, volumetric
+from benchmarks.internals import (
+    dr,
+    from_tensor,
+    load_scene,
+    mi,
+    project,
+    scene_description,
+    scene_values,
+    stock_scene,
+    volumetric,
+)
 
 
 def step_seed(seed: int, step: int, view: int) -> int:
@@ -38,6 +48,65 @@ def backward(
     return loss
 
 
+class StockViews:
+    """The views of a problem by `mi.render`. Views with known values have scenes of their own; ties and expressions are applied.
+
+    Args:
+        integrator: of radiance; `prb`, or `prbvolpath` for media, unless given. AOVs are those of Mitsuba's `aov`.
+    """
+
+    def __init__(self, problem: ur.Problem, integrator: dict[str, Any] | None = None):
+        self.problem = problem
+        path = mi.load_dict(
+            {**(integrator or {"type": "prbvolpath" if volumetric(problem) else "prb"}), "max_depth": problem.max_depth}
+        )
+        self._worlds: list[tuple[Any, Any, Any]] = [({}, *stock_scene(problem))]
+        self._views = []
+        for view in problem.original_views:
+            known = {key: np.asarray(value, np.float32) for key, value in (view.known or {}).items()}
+            same = (n for n, (held, *_) in enumerate(self._worlds) if repr(held) == repr(known))
+            if (index := next(same, None)) is None:
+                index, scene = len(self._worlds), load_scene(scene_description(problem))
+                parameters = mi.traverse(scene)
+                for key, value in known.items():
+                    parameters[key] = from_tensor(mi.TensorXf(value), parameters[key])
+                self._worlds.append((known, scene, parameters))
+            aov = {"type": "aov", "aovs": f"seen:{view.aov}"}
+            self._views.append((index, view.sensor, mi.load_dict(aov) if view.aov else path))
+
+    def write(self, values: Mapping[str, Any]) -> None:
+        """Set the unknowns: tensors, or values of Mitsuba's types. Derivatives are kept."""
+        for known, _, parameters in self._worlds:
+            for key, value in scene_values(self.problem, values).items():
+                if key not in known:
+                    parameters[key] = from_tensor(value, parameters[key]) if dr.is_tensor_v(value) else value
+            parameters.update()
+
+    def backward(self, seed: int, step: int, views: Iterable[int], spp: int = 0, more: Any = 0.0) -> Any:
+        """Render views, sum their losses and `more`, and call `dr.backward`. Return the sum; 0 samples are the integrator's own."""
+        loss = more
+        for view in views:
+            (world, sensor, integrator), number = self._views[view], step_seed(seed, step, view)
+            _, scene, parameters = self._worlds[world]
+            options = {"sensor": sensor, "integrator": integrator, "spp": spp, "seed": number, "seed_grad": number + 1}
+            image = mi.render(scene, parameters, **options)
+            if self.problem.original_views[view].aov == "depth":
+                image = image[..., :1] + dr.zeros(mi.TensorXf, (*image.shape[:2], 3))
+            loss += self.problem.loss_value(view, image)
+        dr.backward(loss)
+        return loss
+
+
+def priors(problem: ur.Problem, values: Mapping[str, Any]) -> Any:
+    """The priors' part of the loss, up to a constant, with its derivative at these values."""
+    total: Any = 0.0
+    for key, unknown in problem.unknowns.items():
+        if unknown.prior is not None:
+            _, slope = unknown.prior.evaluate(np.array(dr.detach(values[key])))
+            total += dr.sum(values[key] * mi.TensorXf((problem.prior_scale * slope).astype(np.float32)), axis=None)
+    return total
+
+
 def stock_loop(
     problem: ur.Problem,
     spp: int,
@@ -50,6 +119,7 @@ def stock_loop(
     error: Callable[[dict[str, Any]], Any] | None = None,
     timer: Callable[[], float] = time.perf_counter,
     views: int | None = None,
+    integrator: dict[str, Any] | None = None,
 ) -> list[dict[str, Any]]:
     """Take the steps of `mi.render` with `prb`, or `prbvolpath` for media, `dr.backward`, `mi.ad.Adam`, values clipped. Return the history.
 
@@ -59,11 +129,10 @@ def stock_loop(
         fall: factor of all rates by the share of the budget that is spent; None for constant rates.
         error: what the history has under "parameter_error"; None for the problem's own.
         timer: counts the seconds: `time.process_time` for those of the processor.
+        integrator: see `StockViews`.
         views: random views a step, with one rate for all parameters; None for all views, and the problem's own rates where it has some.
     """
-    scene, parameters = stock_scene(problem)
-    kind = "prbvolpath" if volumetric(problem) else "prb"
-    integrator = mi.load_dict({"type": kind, "max_depth": problem.max_depth})
+    stock = StockViews(problem, integrator)
     start, count, rng = problem.initial(), len(problem.views), np.random.default_rng(seed)
     own = {} if views else problem.learning_rates
     history: list[dict[str, Any]] = []
@@ -71,15 +140,15 @@ def stock_loop(
         rates = {key: own.get(key, learning_rate) for key in start}
         optimizer = mi.ad.Adam(lr=learning_rate)
         for key, value in start.items():
-            optimizer[key] = from_tensor(value, parameters[key])
+            optimizer[key] = value
         optimizer.set_learning_rate(rates)
-        parameters.update(optimizer)
+        stock.write(optimizer)
         clock, step = 0.0, 0
         while clock < seconds and step < ((count if views else 2) if warm else steps):
             began = timer()
             drawn = [step] if warm else rng.choice(count, min(views or count, count), replace=False).tolist()
             chosen = drawn if views else range(count)
-            loss = backward(problem, scene, parameters, integrator, seed, step, chosen, spp)
+            loss = stock.backward(seed, step, chosen, spp, priors(problem, optimizer))
             if fall:
                 factor = fall(min(max(clock / seconds, step / steps), 1.0))
                 optimizer.set_learning_rate({key: max(rate * factor, 1e-9) for key, rate in rates.items()})
@@ -87,13 +156,19 @@ def stock_loop(
             for key in start:
                 low, high = problem.unknowns[key].bounds
                 optimizer[key] = project(optimizer[key], low, high)
-            parameters.update(optimizer)
+            stock.write(optimizer)
             value = float(np.array(dr.detach(loss)).reshape(-1)[0])
             dr.sync_thread()
             clock += timer() - began
             step += 1
             if not warm and (step % every == 0 or clock >= seconds or step >= steps):
-                now = {key: mi.TensorXf(dr.ravel(dr.detach(optimizer[key])), tuple(start[key].shape)) for key in start}
-                history.append({"step": step - 1, "seconds": clock, "loss": value})
-                history[-1]["parameter_error"] = (error or problem.parameter_error)(now)
+                now = {key: mi.TensorXf(dr.detach(optimizer[key])) for key in start}
+                history.append(
+                    {
+                        "step": step - 1,
+                        "seconds": clock,
+                        "loss": value,
+                        "parameter_error": (error or problem.parameter_error)(now),
+                    }
+                )
     return history

@@ -1,0 +1,201 @@
+"""Ties, expressions, worlds, priors, AOVs, displacement and a caustic of lenses: `auto` against Mitsuba's loop, written for each by hand.
+
+The loop sets tied and derived parameters itself, renders worlds in scenes of their own, and adds the priors' derivatives. AOVs are those of
+Mitsuba's `aov` integrator, and caustics are rendered by `ptracer`. It is tuned over samples per pixel and rates on a seed of its own.
+Errors are means over unknowns, relative to the start. Seconds are the processor's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks import figures, markdown
+from benchmarks.internals import Lenses, Relief, dr, mi, parts, textures
+from benchmarks.races import TUNING_SEED, search, total_error
+from benchmarks.runner.records import Record
+from benchmarks.runner.timing import work_time
+from benchmarks.stock_loop import stock_loop
+from benchmarks.suite.run import compare
+from benchmarks.timed_runs import Kept, blind
+
+MERGE = ("problems.*",)
+QUICK: dict[str, Any] = {"problem": ("ties",), "seconds": 0.3, "seeds": 1, "spp": (2,), "rates": (0.02,)}
+LEFT, RIGHT = "left.bsdf.reflectance.data", "right.bsdf.reflectance.data"
+NEAR, FAR = "near.emitter.radiance.value", "far.emitter.radiance.value"
+_SIDE, _TEXELS, _DARK = 32, 16, [0.0, 0.0, 0.0]
+_PTRACER = {"type": "ptracer", "hide_emitters": False}
+
+
+def picture() -> np.ndarray:
+    """The true texture of both panels."""
+    return textures.photograph("coffee", _TEXELS)
+
+
+def _scene() -> dict[str, Any]:
+    """Two textured panels on a floor under two lamps."""
+
+    def panel(x: float) -> dict[str, Any]:
+        paint = {"type": "diffuse", "reflectance": textures.bitmap(picture())}
+        return parts.rectangle((x, 0, -0.3), (0.7, 0, 0.3 * np.sign(x)), (0, 0.8, 0), paint)
+
+    def lamp(z: float) -> dict[str, Any]:
+        return parts.rectangle(
+            (0, 2, z), (0.4, 0, 0), (0, 0, 0.4), parts.diffuse(0.0), emitter=parts.light(1.5, 1.5, 1.5)
+        )
+
+    floor = parts.rectangle((0, -0.8, 0.5), (2, 0, 0), (0, 0, -1.5), parts.diffuse(0.6))
+    camera = parts.camera((0, 0.3, 3.4), (0, 0, 0), 42, _SIDE)
+    return {"type": "scene", "camera": camera, "left": panel(-0.75), "right": panel(0.75), "floor": floor} | {
+        "near": lamp(2.0),
+        "far": lamp(0.8),
+    }
+
+
+def _made(
+    unknown: list[ur.Parameter], truth: dict[str, Any], worlds: tuple[Any, ...] = ({},), spp: int = 2048, **more: Any
+) -> ur.Problem:
+    """A problem of the panels, with references of our own, one for the known values of each world."""
+    blank = [ur.View(np.ones((_SIDE, _SIDE, 3), np.float32), known=known) for known in worlds]
+    made = ur.Problem(_scene, unknown, blank, max_depth=3, truth=truth, **more)
+    references = [ur.render(made, made.truth, n, spp=spp, seed=n) for n in range(len(worlds))]
+    return made.replaced(views=[ur.View(x, known=known) for x, known in zip(references, worlds, strict=True)])
+
+
+def ties() -> ur.Problem:
+    """One texture on both panels."""
+    return _made([ur.Parameter("paint", initial=0.5, keys=[LEFT, RIGHT])], {"paint": picture()})
+
+
+def expressions() -> ur.Problem:
+    """One pattern, the mixture of two colours on the left and of two others on the right."""
+    texts = {
+        LEFT: "mix([0.1, 0.1, 0.2], [0.9, 0.8, 0.6], pattern)",
+        RIGHT: "mix([0.7, 0.2, 0.1], [0.2, 0.5, 0.8], pattern)",
+    }
+    unknown = ur.Parameter("pattern", initial=np.full((_TEXELS, _TEXELS, 1), 0.5), bounds=(0.0, 1.0))
+    return _made([unknown], {"pattern": picture().mean(axis=-1, keepdims=True)}, expressions=texts)
+
+
+def worlds() -> ur.Problem:
+    """The left panel's texture and two lamps from three views: both lamps, and each alone."""
+    unknown = [ur.Parameter(LEFT, initial=0.5), *(ur.Parameter(key, initial=0.75) for key in (NEAR, FAR))]
+    return _made(unknown, {LEFT: picture(), NEAR: [1.5] * 3, FAR: [1.5] * 3}, ({}, {NEAR: _DARK}, {FAR: _DARK}))
+
+
+def priors() -> ur.Problem:
+    """A texture with a total variation, from a noisy reference."""
+    unknown = ur.Parameter(LEFT, initial=0.5, prior={"total_variation": 0.2})
+    return _made([unknown], {LEFT: picture()}, spp=4)
+
+
+def displacement() -> ur.Problem:
+    """The gallery's height map under three lamps, each lit alone."""
+    return ur.gallery.problem("relief", resolution=32, height_resolution=16)
+
+
+def depth() -> ur.Problem:
+    """The same height map from one map of depths."""
+    scene, aov = (
+        mi.load_dict(Relief(resolution=32, height_resolution=16).target()),
+        {"type": "aov", "aovs": "seen:depth"},
+    )
+    found = np.array(mi.render(scene, integrator=mi.load_dict(aov), spp=256))[..., :1]
+    return displacement().replaced(views=[ur.View(found, aov="depth")])
+
+
+class _Gaussian(Lenses):
+    """The lenses with Mitsuba's default filter: the place at which `ptracer` splats a path has no derivative with a box."""
+
+    def _stage(self, heights: np.ndarray) -> dict[str, Any]:
+        stage = super()._stage(heights)
+        stage["camera"]["film"]["rfilter"] = {"type": "gaussian"}
+        return stage
+
+
+def caustic() -> ur.Problem:
+    """Heights of three lenses from their caustics."""
+    return _Gaussian(resolution=24, mesh_resolution=32).problem("lenses")
+
+
+PROBLEMS: dict[str, Callable[[], ur.Problem]] = {
+    made.__name__: made for made in (ties, expressions, worlds, priors, depth, displacement, caustic)
+}
+
+
+def run(
+    problem: tuple[str, ...] = tuple(PROBLEMS),
+    seconds: float = 4.0,
+    seeds: int = 3,
+    spp: tuple[int, ...] = (4, 16),
+    rates: tuple[float, ...] = (0.005, 0.02, 0.05),
+) -> Iterator[dict[str, Any]]:
+    """Every problem.
+
+    Args:
+        problem: names
+        seconds: of the processor, of a run
+        seeds: runs of each side
+        spp: of the loop, to try
+        rates: of the loop, to try
+    """
+    for name in problem:
+        made = PROBLEMS[name]()
+        start = made.parameter_error(made.initial())
+        integrator = _PTRACER if name == "caustic" else None
+
+        def error(values: Any, made: ur.Problem = made, start: dict[str, float] = start) -> float:
+            return total_error(made.parameter_error(values), start)
+
+        def loop(
+            samples: int,
+            rate: float,
+            seed: int,
+            made: ur.Problem = made,
+            integrator: Any = integrator,
+            error: Any = error,
+        ) -> Any:
+            history = stock_loop(
+                made, samples, rate, seconds, seed=seed, every=2, error=error, timer=work_time, integrator=integrator
+            )
+            return [(entry["seconds"], entry["parameter_error"]) for entry in history]
+
+        tuned = {n: search(rates, lambda rate, n=n: loop(n, rate, TUNING_SEED)[-1][1]) for n in spp}
+        samples = min(tuned, key=lambda n: min(one["error"] for one in tuned[n][1]))
+        theirs = [loop(samples, tuned[samples][0], seed) for seed in range(seeds)]
+        mine = []
+        for seed in range(seeds):
+            kept = Kept(seconds)
+            ur.optimize(blind(made), seconds=100 * seconds, seed=seed, callbacks=[kept], progress=False)
+            mine.append([(at, error(values)) for at, values in kept.found])
+        found = compare(theirs, mine, seconds)
+        found |= {"setting": [samples, tuned[samples][0]], "tried": sum(len(tried) for _, tried in tuned.values())}
+        found["final"] = {"loop": [run[-1][1] for run in theirs], "auto": [run[-1][1] for run in mine]}
+        print(name, found, flush=True)
+        yield {"problems": {name: found}}
+        del made
+        dr.sync_thread()
+
+
+def table(record: Record) -> str:
+    """Errors at the end, and the speed-up."""
+    rows = []
+    for name, entry in record["problems"].items():
+        ends = [markdown.spread(entry["final"][side]) for side in ("loop", "auto")]
+        speed = f"{entry['speed']:.2g}" if entry["speed"] else "below 1"
+        rows.append([name, "{} spp, rate {:g}".format(*entry["setting"]), *ends, speed])
+    head = "problem | the loop's setting | error of the loop | of `auto` | speed-up"
+    text = "{seeds} seeds, {seconds:g} s of the processor: median (least to greatest), relative to the start."
+    return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
+
+
+def plot(record: Record) -> figures.Figure:
+    """Error over time."""
+    tenths = ((np.arange(10) + 1) / 10 * record["settings"]["seconds"]).tolist()
+    panels = {
+        name: {side: [(tenths, entry[side])] for side in ("loop", "auto")} for name, entry in record["problems"].items()
+    }
+    return figures.curves(panels, "processor seconds", "error / at the start", log="y")
