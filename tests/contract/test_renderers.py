@@ -528,7 +528,7 @@ def optimised(method: str, callbacks: tuple[ur.protocols.Callback, ...] = ()) ->
 
 
 @pytest.mark.usefixtures("one_thread")
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", quick(METHODS, "control variate"))
 def test_a_callback_that_renders_changes_nothing(method: str) -> None:
     seen = Renders()
     disturbed, undisturbed = optimised(method, (seen,)), optimised(method)

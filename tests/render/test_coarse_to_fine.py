@@ -20,7 +20,7 @@ from scipy import stats
 
 import unrender as ur
 from tests.local_hosts import LocalHosts
-from tiers import quick
+from tiers import quick, slow
 from unrender.app.distributed.executor import DistributedExecutor
 from unrender.app.distributed.share import ViewShare
 from unrender.core import arrays
@@ -388,8 +388,14 @@ class Shapes(ur.protocols.Callback):
         self.seen.append(arrays.shape(run.parameters[KEY])[:-1])
 
 
-@pytest.mark.parametrize("states", ["estimator", "carry", "reset"])
-@pytest.mark.parametrize("name", PAIRS)
+WITH_STATES = [
+    (name, states) if states == "estimator" or name == "rcv" else slow(name, states)
+    for name in PAIRS
+    for states in ("estimator", "carry", "reset")
+]
+
+
+@pytest.mark.parametrize(("name", "states"), WITH_STATES)
 def test_a_run_ends_fine_with_the_history_of_all_stages(name: str, states: Any, tmp_path: Path) -> None:
     listen = Shapes()
     live = ur.runs.Live(tmp_path / "run")
@@ -448,8 +454,7 @@ def uninterrupted(name: str, states: Any) -> ur.Result:
 
 
 @pytest.mark.parametrize("at", quick([2, 3, 4], 3))
-@pytest.mark.parametrize("states", ["estimator", "carry", "reset"])
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize(("name", "states"), WITH_STATES)
 def test_a_resumed_run_is_the_uninterrupted_one(name: str, states: Any, at: int, tmp_path: Path) -> None:
     """Interrupted before a change of resolution, at it, and after it."""
     way = ur.scene.CoarseToFine((3,), states=states)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import quick
 from unrender.core import arrays
 from unrender.core.errors import InputError, KeyedError
 from unrender.estimators.base import as_numpy
@@ -107,7 +108,7 @@ def test_texts_of_other_kinds_are_refused(text: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("image", ["plain", "rcv"])
+@pytest.mark.parametrize("image", quick(["plain", "rcv"], "rcv"))
 def test_gradients_by_unknowns_are_sums_over_the_parameters(image: str) -> None:
     """Equal random numbers: the gradient by the strength is that by both lamps, times the derivatives of the functions."""
     estimator = ur.PathGradient(RecursiveControlVariate(), spp=8) if image == "rcv" else ur.PathGradient(spp=8)

@@ -167,7 +167,7 @@ CASES: dict[str, Callable[[], tuple[Scene, dict[str, Any], dict[str, Any], float
 }
 
 
-@pytest.mark.parametrize("name", quick(CASES, "lamps", "lens"))
+@pytest.mark.parametrize("name", quick(CASES, "lens"))
 def test_auto_finds_the_right_values(name: str) -> None:
     scene, truth, start, tolerance = CASES[name]()
     integrator = mi.load_dict({"type": "path", "max_depth": 6})

@@ -596,7 +596,7 @@ def test_a_mesh_is_given_by_its_path(given):
 
 @pytest.mark.parametrize(
     "name",
-    quick([*RENDERED, *POSES, *VOLUMES, "sphere-to-mesh"], "indirect-room", "box2", "nerf-volume", "sphere-to-mesh"),
+    quick([*RENDERED, *POSES, *VOLUMES, "sphere-to-mesh"], "indirect-room", "box2", "nerf-volume"),
 )
 def test_equal_calls_give_equal_problems(name):
     first, second = (ur.gallery.problem(name, resolution=8, reference_spp=4) for _ in range(2))

@@ -185,7 +185,7 @@ def test_a_plain_descent_approaches_the_truth(name, drawn):
         assert after[key] < LEFT.get(name, 0.9) * before[key], (key, before[key], after[key])
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", quick(NAMES, "three-textures"))
 def test_equal_calls_give_equal_problems(name):
     first, second = (ur.gallery.problem(name, **SMALL[name], reference_spp=4) for _ in range(2))
     for a, b in zip(first.views, second.views, strict=True):

@@ -109,7 +109,7 @@ STEADY: dict[str, tuple[Any, int]] = {
 }
 
 
-@pytest.mark.parametrize("name", quick(STEADY, "rcv", "meta"))
+@pytest.mark.parametrize("name", quick(STEADY, "meta"))
 def test_no_kernel_is_compiled_after_warm_up(name: str) -> None:
     estimator, spare = STEADY[name]
     optimizer = ur.optimizers.MetaAdam() if isinstance(estimator, ur.MetaEstimator) else ur.optimizers.Adam()

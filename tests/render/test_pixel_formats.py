@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import quick
 from unrender.io import images
 
 KEY = "wall.bsdf.reflectance.value"
@@ -42,7 +43,7 @@ def rendered(pixel_format: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pixel_format", FORMATS)
-@pytest.mark.parametrize("kind", ["array", "exr", "npy"])
+@pytest.mark.parametrize("kind", quick(["array", "exr", "npy"], "exr"))
 def test_the_truth_s_image_is_the_reference(pixel_format: str, kind: str, tmp_path: Path) -> None:
     given: Any = rendered(pixel_format)
     if kind == "exr":

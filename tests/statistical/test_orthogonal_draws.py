@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tiers import quick
 from unrender.estimators.smoothing.options import SamplingOptions
 from unrender.estimators.smoothing.sampling import SmoothedFunction
 
@@ -69,7 +70,9 @@ def estimate(order: str, samples: int, seed: int, **options: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize("samples", [8, 28], ids=["part of a block", "more than two blocks"])
-@pytest.mark.parametrize("order", ["gradient", "hessian", "hvp", "joint gradient", "joint hessian"])
+@pytest.mark.parametrize(
+    "order", quick(["gradient", "hessian", "hvp", "joint gradient", "joint hessian"], "hvp", "joint hessian")
+)
 def test_derivatives_are_unbiased(order: str, samples: int) -> None:
     """Means over 1500 seeds, within 5 standard errors of the seeds' own spread; a planted bias is seen."""
     truth = {"gradient": GRADIENT, "hessian": HESSIAN.ravel(), "hvp": HESSIAN @ V}[order.split()[-1]]

@@ -9,6 +9,7 @@ import pytest
 
 import unrender as ur
 from benchmarks.debiasing import DebiasedGradient, bias_correction
+from tiers import quick
 from unrender.core.random import Key
 from unrender.rendering.numpy.linear import AnalyticRenderer
 
@@ -37,7 +38,7 @@ def z_scores(asked: ur.Problem, estimator: Any) -> np.ndarray:
     return (found.mean(0) - exact) / (found.std(0, ddof=1) / np.sqrt(RUNS))
 
 
-@pytest.mark.parametrize("spp", [2, 4])
+@pytest.mark.parametrize("spp", quick([2, 4], 2))
 def test_the_bias_is_gone_that_a_plain_gradient_has(spp: int) -> None:
     asked = problem(ur.losses.L1())
     assert np.abs(z_scores(asked, DebiasedGradient(spp, renders=2048))).max() < LIMIT

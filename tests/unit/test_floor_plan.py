@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -50,25 +50,29 @@ def parsed(source: str) -> ast.Module:
     return ast.parse(source)
 
 
-def imports(tree: ast.Module, known: dict[str, Path]) -> Iterator[tuple[str, int, bool]]:
-    """(module, line, whether it is imported when the file is: neither in a function nor for type checkers alone)."""
+@cache
+def names_imported(source: str) -> list[tuple[str, int, bool]]:
+    """(name below `unrender`, line, whether it is imported when the file is: neither in a function nor for type checkers alone)."""
+    tree, found = parsed(source), []
     lazy = {id(x) for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) for x in ast.walk(node)}
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             lazy |= {id(x) for x in ast.walk(node)}
     for node in ast.walk(tree):
         names: list[str] = []
-        if not isinstance(node, (ast.Import, ast.ImportFrom)):
-            continue
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif node.module:
+        elif isinstance(node, ast.ImportFrom) and node.module:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-        for name in names:
-            if name.startswith("unrender."):
-                inner = name.removeprefix("unrender.")
-                module = inner if inner in known else inner.rpartition(".")[0]
-                yield module, node.lineno, id(node) not in lazy
+        own = (name.removeprefix("unrender.") for name in names if name.startswith("unrender."))
+        found += [(name, node.lineno, id(node) not in lazy) for name in own]
+    return found
+
+
+def imports(source: str, known: Iterable[str]) -> Iterator[tuple[str, int, bool]]:
+    """`names_imported` with the modules that the names are of, among those known."""
+    for name, line, now in names_imported(source):
+        yield name if name in known else name.rpartition(".")[0], line, now
 
 
 def floor_of(module: str) -> str:
@@ -85,7 +89,7 @@ def upward(module: str, source: str, known: dict[str, Path]) -> list[str]:
     if floor not in FLOORS:
         return [f"{module}: stands on no floor"]
     found = []
-    for target, line, _ in imports(parsed(source), known):
+    for target, line, _ in imports(source, known):
         there = floor_of(target) if target else "the roof"
         if there not in FLOORS or FLOORS.index(there) > FLOORS.index(floor):
             found.append(f"{module}:{line} imports {target or 'unrender'}, of {there}")
@@ -109,7 +113,7 @@ def test_an_upward_import_is_found() -> None:
 def test_no_module_imports_itself_through_others() -> None:
     known = modules()
     graph = {
-        name: {target for target, _, now in imports(parsed(path.read_text()), known) if now and target in known}
+        name: {target for target, _, now in imports(path.read_text(), known) if now and target in known}
         for name, path in known.items()
     }
     done: set[str] = set()
@@ -143,7 +147,7 @@ def slivers(sources: dict[str, str]) -> set[str]:
     known = {name: Path(name) for name in sources}
     importers: dict[str, set[str]] = {name: set() for name in sources}
     for name, text in sources.items():
-        for target, _, _ in imports(parsed(text), known):
+        for target, _, _ in imports(text, known):
             importers.get(target, set()).add(name)
     short = {name for name, text in sources.items() if len(text.splitlines()) < SHORTEST_HELPER}
     return {name for name in short if len(importers[name] - {name}) == 1 and "\n@register" not in sources[name]}

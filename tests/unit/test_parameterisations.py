@@ -11,6 +11,7 @@ import pytest
 from drjit.auto import Float
 
 import unrender as ur
+from tiers import slow
 from unrender.core import registry, trees
 from unrender.core.random import Key
 from unrender.estimators.base import Estimate
@@ -299,7 +300,7 @@ def test_meta_estimates_are_of_the_variable(coupled: bool) -> None:
 
 @pytest.mark.parametrize(
     "optimizer",
-    [ur.optimizers.ScheduleFree(0.1), ur.optimizers.Adam(0.05), ur.optimizers.SGD(0.05, momentum=0.5)],
+    [ur.optimizers.ScheduleFree(0.1), slow(ur.optimizers.Adam(0.05)), slow(ur.optimizers.SGD(0.05, momentum=0.5))],
     ids=repr,
 )
 def test_a_resumed_run_is_the_uninterrupted_one(optimizer: Any, tmp_path: Path) -> None:
