@@ -65,7 +65,7 @@ def names_imported(source: str) -> list[tuple[str, int, bool]]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         own = (name.removeprefix("unrender.") for name in names if name.startswith("unrender."))
-        found += [(name, node.lineno, id(node) not in lazy) for name in own]
+        found += [(name, getattr(node, "lineno", 0), id(node) not in lazy) for name in own]
     return found
 
 

@@ -14,7 +14,7 @@ from unrender.estimators.gauss_newton import GaussNewtonState
 from unrender.estimators.hybrid import HybridState
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import least_squares
-from unrender.runs.least_squares import NumbersCheck, _Fit, _judged, check_numbers, pixel_weights
+from unrender.runs.least_squares import NumbersCheck, _checked, _Fit, check_numbers, pixel_weights
 from unrender.runs.numbers import Differences, Numbers
 
 SHAPE = (8, 8)
@@ -193,7 +193,7 @@ def test_a_number_that_moves_a_little_with_an_open_one_has_a_standard_error_of_t
     numbers = Numbers.of(made, TRUTH, made.initial_values())
     assert numbers is not None
     error, unseen = np.full(4, 0.001), np.array([[share], [0.0], [0.0], [0.25]])
-    found = _judged(numbers, _Fit(np.diag(error**2), error, error, np.zeros(4), unseen), np.full(4, 0.01))
+    found = _checked(numbers, _Fit(np.diag(error**2), error, error, np.zeros(4), unseen), np.full(4, 0.01))
     assert list(found.undetermined) == ["b"]
     np.testing.assert_allclose(found.errors["a"], [np.hypot(0.001, share), 0.001, 0.001], rtol=1e-9)
     assert np.isinf(found.errors["b"]).all()
@@ -259,7 +259,7 @@ def test_the_error_of_a_step_is_at_least_that_of_the_check():
     numbers = Numbers.of(made, TRUTH, made.initial_values())
     assert numbers is not None
     own, step = np.full(4, 0.004), np.array([0.1, 0.0, 0.0, 0.0])
-    found = _judged(numbers, _Fit(np.zeros((4, 4)), np.zeros(4), own, step, np.zeros((4, 0))), np.full(4, 0.01))
+    found = _checked(numbers, _Fit(np.zeros((4, 4)), np.zeros(4), own, step, np.zeros((4, 0))), np.full(4, 0.01))
     assert found.unfinished["a"].endswith("standard error 0.004, 0.004, 0.004; give more seconds, or resume the run")
 
 
