@@ -442,6 +442,11 @@ def test_a_run_that_stopped_on_its_way_is_told(steps: int, rate: float, stopped:
         assert result.status == "finished"
 
 
+def test_a_difference_below_the_noise_of_a_pixel_is_not_compared_with_it() -> None:
+    assert "(10% of the picture, 2.0 times its noise)" in verification.Misfit(0.1, 1.0, 0.05).describe()
+    assert verification.Misfit(0.1, 1.0, 0.5).describe().endswith("by 0.1 (10% of the picture)")
+
+
 SHORT = "has hardly improved since step"
 
 

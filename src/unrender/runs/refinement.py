@@ -57,7 +57,7 @@ def unfinished(run: Run) -> list[str]:
         if (shape := arrays.shape(run.parameters[key])) != run.problem.shapes()[key] and levels.steps[-1] < NEVER:
             size = "x".join(map(str, reversed(shape[:-1])))
             lines.append(
-                f"parameter {key}: still {size} at the end, after {run.step} steps of at least {levels.steps[-1] + 1}"
+                f"parameter {key}: still {size} at the end, after {run.step} step{'s' * (run.step != 1)} of at least {levels.steps[-1] + 1}"
             )
     return lines
 

@@ -52,8 +52,8 @@ class Misfit:
     by_pixel: bool = False
 
     def describe(self) -> str:
-        """Return the first words of a warning."""
-        times = f"{self.error / self.noise:.1f} times its noise" if self.noise > 0.0 else ""
+        """Return the first words of a warning, with the ratio to the noise where it is above 1."""
+        times = f"{self.error / self.noise:.1f} times its noise" if 0.0 < self.noise < self.error else ""
         share = f"{self.error / self.size:.0%} of the picture" if self.size > 0.0 else ""
         parts = ", ".join(filter(None, (share, times)))
         return f"{DIFFERS} by {formatting.number(self.error)}" + (f" ({parts})" if parts else "")
