@@ -23,11 +23,11 @@ from unrender.estimators.capabilities import (
     Variance,
 )
 from unrender.estimators.coordinates import by_coordinates, restricted
-from unrender.estimators.following import Response, advanced
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives, SmoothedState
-from unrender.rendering.partial import FollowingParameters, HeldParameters, PartialDerivatives
+from unrender.estimators.variable_projection import Response, update_response
+from unrender.rendering.partial import EliminatedParameters, HeldParameters, PartialDerivatives
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler, restarted, upsampled
@@ -36,7 +36,7 @@ _PERTURBED = 1 << 33
 """Stream of a step's key for the perturbed renders; path gradients use lower streams."""
 
 _ADJOINTS = 1 << 20
-"""Index of the random numbers of the adjoints of textures that follow."""
+"""Index of the random numbers of the adjoints of eliminated textures."""
 
 _MEAN, _SQUARE = 0.9, 0.999
 """Decays of the running means of the perturbed parameters' gradient and of its square, as in Adam."""
@@ -61,7 +61,7 @@ class HybridState:
         perturbed: state of the second estimator.
         mean, square: running means of the perturbed parameters' gradient, and of its square, not debiased; {} unless `averaged`.
         step: number of estimates since these began.
-        response: response of the textures that follow a block; None without any.
+        response: response of the eliminated textures; None without any.
     """
 
     path: Any
@@ -111,8 +111,8 @@ class HybridGradient:
     With `GaussNewton` for `perturbed`, the perturbed parameters form a block (`BlockEstimate`). An optimizer such as `Partitioned(keys,
     AveragedNewton(), others)` solves it, and their gradient is 0 in steps in which they are fixed. `wait` and `every` select the
     steps in which they move. While textures are far from the solution, images contain little information on poses. Textures in
-    `following` are eliminated from the block, see `estimators.following`: a lamp's position beside the texture that it lights, for
-    example, then does not wait for the texture.
+    `eliminated` are eliminated from the block (`estimators.variable_projection`). The position of a lamp, for example, then converges
+    without waiting for the texture that it lights.
 
     The steps of both groups have no common scale: give the perturbed parameters their own learning rates.
 
@@ -130,7 +130,7 @@ class HybridGradient:
             their rates while gradients agree. Requires a variance of `path`.
         wait: number of steps before the first in which a block moves, >= 0. For `GaussNewton` only.
         every: interval of steps in which a block moves, >= 1. For `GaussNewton` only.
-        following: keys of reflectances or radiances that the block eliminates. Each of its steps takes another adjoint for each of its
+        eliminated: keys of reflectances or radiances that the block eliminates. Each of its steps takes another adjoint for each of its
             elements. For `GaussNewton` only, and for textures without preconditioner and parameterisation.
     """
 
@@ -142,7 +142,7 @@ class HybridGradient:
     averaged: bool = False
     wait: int = 0
     every: int = 1
-    following: tuple[str, ...] = ()
+    eliminated: tuple[str, ...] = ()
 
     def __post_init__(self):
         checks.flags(self)
@@ -159,8 +159,8 @@ class HybridGradient:
         checks.integer("HybridGradient", "every", self.every, at_least=1)
         if self._is_block and self.averaged:
             raise InputError("HybridGradient: averaged requires SmoothedDerivatives, got GaussNewton")
-        if not self._is_block and (self.wait or self.every > 1 or self.following):
-            raise InputError("HybridGradient: wait, every and following require GaussNewton, got SmoothedDerivatives")
+        if not self._is_block and (self.wait or self.every > 1 or self.eliminated):
+            raise InputError("HybridGradient: wait, every and eliminated require GaussNewton, got SmoothedDerivatives")
         if not self._is_block and (
             not isinstance(self.perturbed, SmoothedDerivatives) or self.perturbed.order != "gradient"
         ):
@@ -174,7 +174,7 @@ class HybridGradient:
             )
         if isinstance(self.perturbed, GaussNewton):  # no error is stated of a block
             object.__setattr__(self, "perturbed", replace(self.perturbed, scores=False))
-        for name in ("keys", "following") if self.keys is not None else ("following",):
+        for name in ("keys", "eliminated") if self.keys is not None else ("eliminated",):
             keys: Any = getattr(self, name)
             if isinstance(keys, str) or not all(isinstance(key, str) for key in keys):
                 raise InputError(f"HybridGradient: {name} must be a list of parameters' keys, got {keys!r:.80}")
@@ -191,13 +191,13 @@ class HybridGradient:
         """Return the state before the first step. Raise `InputError` if one of the two estimators has no parameter, or refuses its own."""
         own = self._perturbed(problem.renderer, parameters)
         part = {key: parameters[key] for key in own}
-        for name in self.following:
+        for name in self.eliminated:
             if name not in parameters or name in own:
                 hint = did_you_mean(name, [other for other in parameters if other not in own])
                 raise InputError(
-                    f"HybridGradient: following names {name}, which is not one of the other parameters{hint}"
+                    f"HybridGradient: eliminated names {name}, which is not one of the other parameters{hint}"
                 )
-        response = Response.zero(parameters, self.following, trees.ravel(part).size) if self.following else None
+        response = Response.zero(parameters, self.eliminated, trees.ravel(part).size) if self.eliminated else None
         path, perturbed = self._problems(problem, parameters, own, response)
         zeros = trees.zeros_like(part) if self.averaged else {}
         states = self.path.init(path, parameters), self.perturbed.init(perturbed, part)
@@ -274,7 +274,7 @@ class HybridGradient:
         images = estimate.get(DerivativeImages)
         if response is not None and images is not None and isinstance(self.perturbed, GaussNewton):
             spp = self.perturbed.derivative_spp
-            response, paths = advanced(response, problems[0], parameters, images, spp, key.fold(_ADJOINTS))
+            response, paths = update_response(response, problems[0], parameters, images, spp, key.fold(_ADJOINTS))
             samples += paths
         if not moves:
             return fixed, state, samples
@@ -290,7 +290,7 @@ class HybridGradient:
         if response is not None:
             origin = trees.ravel({key: parameters[key] for key in own})
             bounds = {key: problem.unknowns[key].project for key in response.slopes}
-            renderer = FollowingParameters(problem.renderer, held, origin, response.slopes, bounds)
+            renderer = EliminatedParameters(problem.renderer, held, origin, response.slopes, bounds)
         return (
             problem.with_parts(renderer=PartialDerivatives(problem.renderer, frozenset(own))),
             problem.with_parts(renderer=renderer),

@@ -76,14 +76,14 @@ class HeldParameters(RendererWrapper):
         return _HeldSession(_PartialSession(session, frozenset(self.held)), self.held)
 
 
-class FollowingParameters(HeldParameters):
-    """A renderer of the scene in which some fixed parameters follow those of a session along straight lines.
+class EliminatedParameters(HeldParameters):
+    """A renderer of the scene in which eliminated parameters are linear functions of those of a session.
 
     Args:
         inner: renderer of the scene.
         held: {key: array} of the fixed parameters.
         origin: values of the session's parameters at which the fixed ones are at `held`, (n,).
-        slopes: {key: change per unit of each of the n elements, (n, *shape)} of the fixed parameters that follow.
+        slopes: {key: change per unit of each of the n elements, (n, *shape)} of the eliminated parameters.
         bounds: {key: function from its values to the nearest values within its bounds}.
     """
 
@@ -102,30 +102,32 @@ class FollowingParameters(HeldParameters):
         self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
     ) -> RenderSession:
         if differentiated(keys, derivatives):
-            raise InputError("FollowingParameters: only images are available, no derivatives")
+            raise InputError("EliminatedParameters: only images are available, no derivatives")
         everything = [*keys, *(key for key in self.held if key not in keys)]
-        return _FollowingSession(self.inner.prepare(everything, space, derivatives=False), self)
+        return _EliminatedSession(self.inner.prepare(everything, space, derivatives=False), self)
 
 
-class _FollowingSession(SessionWrapper):
-    """A session that adds the fixed parameters of a `FollowingParameters` to each state."""
+class _EliminatedSession(SessionWrapper):
+    """A session that adds the fixed and the eliminated parameters of an `EliminatedParameters` to each state."""
 
-    def __init__(self, inner: RenderSession, renderer: FollowingParameters):
+    def __init__(self, inner: RenderSession, renderer: EliminatedParameters):
         super().__init__(inner)
         self._renderer = renderer
 
     def _state(self, parameters: Tree) -> Tree:
         stacked = {key: arrays.numpy(x)[None] for key, x in parameters.items()}
-        moved = {key: arrays.like(x[0], self._renderer.held[key]) for key, x in self._followed(stacked).items()}
+        moved = {
+            key: arrays.like(x[0], self._renderer.held[key]) for key, x in self._eliminated_values(stacked).items()
+        }
         return {**self._renderer.held, **moved, **parameters}
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         count = len(next(iter(parameters.values())))
         held = {key: np.broadcast_to(x, (count, *x.shape)) for key, x in trees.numpy(self._renderer.held).items()}
-        return self._inner.image_batch({**held, **self._followed(parameters), **parameters}, request)
+        return self._inner.image_batch({**held, **self._eliminated_values(parameters), **parameters}, request)
 
-    def _followed(self, parameters: Tree) -> dict[str, np.ndarray]:
-        """Return the values of the parameters that follow in each state, (B, *shape); {} if all states are at the origin."""
+    def _eliminated_values(self, parameters: Tree) -> dict[str, np.ndarray]:
+        """Return the values of the eliminated parameters in each state, (B, *shape); {} if all states are at the origin."""
         flat = [np.asarray(x, np.float64).reshape(len(x), -1) for x in parameters.values()]
         change = np.concatenate(flat, axis=1) - self._renderer.origin
         if not change.any():

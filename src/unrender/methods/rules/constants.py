@@ -156,7 +156,7 @@ class Constants:
     """Largest number of steps of textures per step of a block. Source: as for `block_images`."""
     block_wait: int = 8
     """Number of steps of textures before the first step of a block. Source: as for `block_images`."""
-    followed: int = 1 << 22
+    eliminated_values: int = 1 << 22
     """Elements of a block times texels up to which the block eliminates a texture. Source: memory, 16 MiB."""
     path_cost: float = 4.0
     """Cost of a path with its gradient relative to that of a path alone. Source: by hand."""

@@ -119,17 +119,17 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     traced = 2 * _elements(traits, keys) * estimator.derivative_spp + estimator.spp
     every = sampling.within((1, constants.block_every), round(traced / (constants.path_cost * plan.estimator.spp)))
     times = "" if every == 1 else f", every {every} steps"
-    following = _following(traits, keys, plan)
-    eliminated = f"; {listed(following)} eliminated from their steps" if following else ""
+    eliminated = _eliminated(traits, keys, plan)
+    textures = f"; {listed(eliminated)} eliminated from their steps" if eliminated else ""
     reason = (
         f"{_reason(traits, keys, estimator)}{times}, after {constants.block_wait} steps of the others: {listed(keys)}"
-        f"{eliminated}"
+        f"{textures}"
     )
     made = replace(
         plan,
         problem=problem,
         estimator=HybridGradient(
-            plan.estimator, estimator, keys, wait=constants.block_wait, every=every, following=following
+            plan.estimator, estimator, keys, wait=constants.block_wait, every=every, eliminated=eliminated
         ),
         optimizer=Partitioned(keys, _optimizer(traits, keys), plan.optimizer),
         reasons=(reason, *plan.reasons),
@@ -161,7 +161,7 @@ def _explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float
     return float(0.5 * one @ positive_inverse(hessian, _LEAST_EIGENVALUE) @ other / loss)
 
 
-def _following(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str, ...]:
+def _eliminated(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str, ...]:
     """Return the textures that a block of lights eliminates: reflectances and radiances, in their own coordinates and without a prior.
 
     Poses of shapes show in edges, which textures hardly explain: they came no nearer per step, at 1.7 times the cost of a step.
@@ -175,7 +175,7 @@ def _following(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str, 
         if key not in keys
         and traits.infos[key].brightness
         and (unknown.transform, unknown.preconditioner, unknown.prior) == (None, None, None)
-        and elements * unknown.initial.size <= traits.constants.followed
+        and elements * unknown.initial.size <= traits.constants.eliminated_values
     )
 
 

@@ -1,4 +1,4 @@
-"""Variable projection of few numbers: their derivatives are taken along lines on which textures follow.
+"""Variable projection (Golub and Pereyra 1973): derivatives by few numbers along lines on which eliminated textures follow.
 
 Where a number x and a texture t explain the same residual, a step of one at a fixed other is short. With the change S of the texture per
 unit of x, the derivative image of x is J = ∂I/∂x + (∂I/∂t) S. S is best where the texture explains nothing of J, (∂I/∂t)ᵀ W J = 0 with the
@@ -8,6 +8,9 @@ does not wait for the texture, whose own optimizer moves it. S is found step by 
     S ← S − γ L⁻¹ (∂I/∂t)ᵀ W J,        L = (∂I/∂t)ᵀ W (∂I/∂t) s / s.
 
 If no pixel darkens as a texel grows, L is no less than the Hessian of the texture for any s > 0, so these steps converge.
+
+Golub and Pereyra, "The Differentiation of Pseudo-Inverses and Nonlinear Least Squares Problems Whose Variables Separate", SIAM Journal
+on Numerical Analysis 10(2), 1973.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["Response", "advanced"]
+__all__ = ["Response", "update_response"]
 
 _LEAST_GAIN = 0.25
 """Smallest γ. The first is 1, and the k-th is 1 / k until then."""
@@ -39,7 +42,7 @@ _LAST = 3
 
 @dataclass(frozen=True)
 class Response:
-    """Response of textures to a change of few numbers.
+    """Response of the eliminated textures to a change of few numbers.
 
     Attributes:
         slopes: S, {key of a texture: (n, *shape)} for n elements of the numbers.
@@ -53,7 +56,7 @@ class Response:
 
     @classmethod
     def zero(cls, parameters: Tree, keys: Sequence[str], elements: int) -> Response:
-        """Return the response of textures that do not follow."""
+        """Return a response of 0: the textures stay fixed."""
         return cls({key: np.zeros((elements, *arrays.shape(parameters[key])), np.float32) for key in keys})
 
     def upsampled(self, upsampler: Upsampler) -> Response:
@@ -62,7 +65,7 @@ class Response:
         return Response.zero(shapes, tuple(shapes), len(next(iter(self.slopes.values()), ())))
 
 
-def advanced(
+def update_response(
     response: Response, problem: Problem, parameters: Tree, images: DerivativeImages, spp: int, key: Key
 ) -> tuple[Response, int]:
     """Return the response after one step, and the number of paths traced.
@@ -84,7 +87,7 @@ def advanced(
         request = SampleRequest(problem.views[view].sensor, spp, key.fold(view).uint32())
         paths = session.image(parameters, request).paths
         other = replace(request, seed=key.fold(view).fold(_LAST).uint32())
-        along = _along(session, parameters, sizes, other)
+        along = _directional_derivative(session, parameters, sizes, other)
         for index, image in ((None, along), *zip(elements.tolist(), derivatives, strict=True)):
             weighted = arrays.add_first_axis(problem.renderer.array((image * weights).astype(np.float32)))
             gradient = session.adjoint(parameters, paths, weighted)
@@ -95,10 +98,12 @@ def advanced(
                 else:
                     slopes[k][index] += own
         traced += (3 + 1) * spp * weights.shape[0] * weights.shape[1]
-    return _moved(response, slopes, curvature), traced
+    return _next_response(response, slopes, curvature), traced
 
 
-def _along(session: RenderSession, parameters: Tree, sizes: Mapping[str, float], request: SampleRequest) -> np.ndarray:
+def _directional_derivative(
+    session: RenderSession, parameters: Tree, sizes: Mapping[str, float], request: SampleRequest
+) -> np.ndarray:
     """Return the derivative of the image by the textures along s, (H, W, 3)."""
     states = {}
     for key, value in trees.numpy(parameters).items():
@@ -109,7 +114,9 @@ def _along(session: RenderSession, parameters: Tree, sizes: Mapping[str, float],
     return (one - other) / (2.0 * _CHANGE)
 
 
-def _moved(response: Response, gradients: Mapping[str, np.ndarray], curvature: Mapping[str, np.ndarray]) -> Response:
+def _next_response(
+    response: Response, gradients: Mapping[str, np.ndarray], curvature: Mapping[str, np.ndarray]
+) -> Response:
     """Return the response after the step for the gradients (∂I/∂t)ᵀ W J."""
     count = response.count + 1
     before = response.curvature or curvature

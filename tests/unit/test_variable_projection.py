@@ -12,7 +12,7 @@ import unrender as ur
 from unrender.core.random import Key
 from unrender.methods import method
 from unrender.rendering.numpy.linear import AnalyticRenderer
-from unrender.rendering.partial import FollowingParameters
+from unrender.rendering.partial import EliminatedParameters
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
 
 SHAPE = (6, 6)
@@ -51,8 +51,8 @@ def problem(noise: float = 0.3) -> ur.Problem:
     return ur.Problem(renderer, unknowns, [ur.View(renderer.exact(TRUTH))], truth=TRUTH)
 
 
-def estimator(following: tuple[str, ...] = ("map",), **options: Any) -> ur.estimators.HybridGradient:
-    return ur.estimators.HybridGradient(ur.PathGradient(spp=4), ur.GaussNewton(16, 8), following=following, **options)
+def estimator(eliminated: tuple[str, ...] = ("map",), **options: Any) -> ur.estimators.HybridGradient:
+    return ur.estimators.HybridGradient(ur.PathGradient(spp=4), ur.GaussNewton(16, 8), eliminated=eliminated, **options)
 
 
 def solver() -> ur.optimizers.Optimizer:
@@ -97,7 +97,7 @@ def test_parameters_follow_along_lines_within_their_bounds() -> None:
     held = {"map": asked.initial()["map"]}
     slopes = {"map": np.stack([np.full(TRUTH["map"].shape, 0.5), np.full(TRUTH["map"].shape, -9.0)])}
     bounds = {"map": asked.unknowns["map"].project}
-    renderer = FollowingParameters(asked.renderer, held, np.array([0.5, 0.5]), slopes, bounds)
+    renderer = EliminatedParameters(asked.renderer, held, np.array([0.5, 0.5]), slopes, bounds)
     session, request = renderer.prepare(["lamp"], None, derivatives=False), SampleRequest(0, 1, 0)
     states = np.array([[0.5, 0.5], [0.7, 0.5], [0.5, 0.6]])
     found = session.image_batch({"lamp": states}, request)
@@ -113,19 +113,19 @@ def test_parameters_follow_along_lines_within_their_bounds() -> None:
 def test_auto_eliminates_textures_from_the_steps_of_lights_alone() -> None:
     plan = method("auto").plan(problem()).estimator
     assert isinstance(plan, ur.estimators.HybridGradient)
-    assert plan.following == ("map",)
+    assert plan.eliminated == ("map",)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"following": "map"}, "following must be a list"),
-        ({"following": ("maps",)}, "following names maps.*map"),
-        ({"following": ("lamp",)}, "following names lamp"),
-        ({"following": ("map",), "perturbed": ur.SmoothedDerivatives(0.1, debiased=True)}, "require GaussNewton"),
+        ({"eliminated": "map"}, "eliminated must be a list"),
+        ({"eliminated": ("maps",)}, "eliminated names maps.*map"),
+        ({"eliminated": ("lamp",)}, "eliminated names lamp"),
+        ({"eliminated": ("map",), "perturbed": ur.SmoothedDerivatives(0.1, debiased=True)}, "require GaussNewton"),
     ],
 )
-def test_what_cannot_follow_is_refused_by_name(options: dict[str, Any], message: str) -> None:
+def test_what_cannot_be_eliminated_is_refused_by_name(options: dict[str, Any], message: str) -> None:
     asked, arguments = problem(), {"perturbed": ur.GaussNewton(8, 4), **options}
     with pytest.raises(ur.InputError, match=message):
         ur.estimators.HybridGradient(**arguments).init(asked, asked.initial())
