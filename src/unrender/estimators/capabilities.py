@@ -155,11 +155,11 @@ class Smoothing(Capability):
 
 @dataclass(frozen=True)
 class DerivativeImages(Capability):
-    """Derivative images of every element, by view.
+    """Derivative images of every element, by view. They are total derivatives where other parameters are eliminated.
 
     Attributes:
         views: {view: (elements, images, weights)}: the indices of the elements that the view shows, (m,), the derivatives of its image by
-            them, (m, H, W, 3), and the second derivative of the loss by each value of the image, (H, W, 3).
+            them, (m, H, W, 3), and the second derivative of the loss by each value of the image times the weight of its noise, (H, W, 3).
     """
 
     name: ClassVar[str] = "derivative_images"
@@ -168,7 +168,10 @@ class DerivativeImages(Capability):
 
 @dataclass(frozen=True)
 class BlockEstimate(Capability):
-    """Estimate for a subset of the parameters, with their own curvature. The other parameters are fixed at their current values.
+    """Estimate for a subset of the parameters, with their own curvature.
+
+    The other parameters are fixed at their current values, except those that the estimator eliminates, which are linear functions of the
+    subset.
 
     Attributes:
         keys: keys of the subset, in key order.

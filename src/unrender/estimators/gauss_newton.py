@@ -124,6 +124,7 @@ class GaussNewton:
         scores: whether residuals are averaged over steps for `ScoreCovariance`, which standard errors need. Problems of more than
             `MOST_AVERAGED` pixels in all views have no scores, since the mean takes 24 bytes per pixel. Runs whose optimizer states no
             errors do without.
+        derivative_images: whether those of all views are returned (`DerivativeImages`), which takes 12 bytes per pixel and element.
     """
 
     spp: int = 256
@@ -136,6 +137,7 @@ class GaussNewton:
     noise_limit: float | None = None
     remember: bool = False
     scores: bool = True
+    derivative_images: bool = False
 
     def __post_init__(self):
         checks.flags(self)
@@ -152,9 +154,11 @@ class GaussNewton:
 
     @property
     def provides(self) -> Capabilities:
-        """A gradient and its noise, a Hessian and its noise; with `scores`, the covariance by the references' noise."""
+        """A gradient and its noise, a Hessian and its noise; with `scores`, the covariance by the references' noise; with
+        `derivative_images`, these."""
         scores = (ScoreCovariance,) if self.scores else ()
-        return Capabilities(Gradient, GradientNoise, Hessian, HessianNoise, *scores)
+        images = (DerivativeImages,) if self.derivative_images else ()
+        return Capabilities(Gradient, GradientNoise, Hessian, HessianNoise, *scores, *images)
 
     def init(self, problem: Problem, parameters: Tree) -> GaussNewtonState:
         """Return the state before the first step. Raise `InputError` for a parameter that cannot be perturbed or has a preconditioner,
@@ -189,6 +193,7 @@ class GaussNewton:
         sums = system.products
         noisy = references_have_noise(system.residuals)
         scores = (ScoreCovariance(sums.scores if noisy else np.zeros_like(sums.scores)),) if point.scores else ()
+        images = (DerivativeImages(system.weighted),) if self.derivative_images else ()
         estimate = Estimate(
             system.loss,
             trees.unravel(sums.gradient, parameters),
@@ -197,8 +202,8 @@ class GaussNewton:
                 HessianNoise(sums.noise),
                 GradientNoise(sums.gradient_noise),
                 Smoothing(dict(state.widths)),
-                DerivativeImages(system.weighted),
                 *scores,
+                *images,
             ),
             {"samples": point.samples, "images": system.images},
         )
@@ -240,7 +245,7 @@ class _System:
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
         loss: loss at the parameters.
         images: images by view.
-        weighted: derivative images by view, see `DerivativeImages`.
+        weighted: derivative images by view, see `DerivativeImages`; {} unless `GaussNewton.derivative_images`.
         variances: running mean of the variance of each view's image.
         derivatives: mean derivative images of each view.
         residuals: mean derivatives of the loss of each view.
@@ -302,7 +307,7 @@ class _Point:
             points, distances = self._points(elements, steps)
             halves = [self._states(points, view, seed.fold(half), self.options.derivative_spp) for half in (0, 1)]
             mean = HalvesMean(differences(halves[0], distances), differences(halves[1], distances))
-            if weights is not None:
+            if weights is not None and self.options.derivative_images:
                 total.weighted[view] = (elements, 0.5 * (mean.one + mean.other), weights.second)
             if images and self.options.remember:
                 if state.derivatives:

@@ -130,8 +130,9 @@ class HybridGradient:
             their rates while gradients agree. Requires a variance of `path`.
         wait: number of steps before the first in which a block moves, >= 0. For `GaussNewton` only.
         every: interval of steps in which a block moves, >= 1. For `GaussNewton` only.
-        eliminated: keys of reflectances or radiances that the block eliminates. Each of its steps takes another adjoint for each of its
-            elements. For `GaussNewton` only, and for textures without preconditioner and parameterisation.
+        eliminated: keys of reflectances or radiances that the block eliminates, without preconditioner, parameterisation and prior. Each
+            of its steps takes three more images of each view, and an adjoint for each of its elements and one more, all with
+            `derivative_spp` samples per pixel. For `GaussNewton` without `remember` only, and not for parameters of a sensor.
     """
 
     path: Estimator = field(default_factory=PathGradient)
@@ -172,13 +173,20 @@ class HybridGradient:
             raise InputError(
                 f"HybridGradient: averaged needs a path that provides a variance, such as MetaEstimator(), got {type(self.path).__name__}"
             )
-        if isinstance(self.perturbed, GaussNewton):  # no error is stated of a block
-            object.__setattr__(self, "perturbed", replace(self.perturbed, scores=False))
         for name in ("keys", "eliminated") if self.keys is not None else ("eliminated",):
             keys: Any = getattr(self, name)
-            if isinstance(keys, str) or not all(isinstance(key, str) for key in keys):
+            if isinstance(keys, str) or not isinstance(keys, Sequence) or not all(isinstance(key, str) for key in keys):
                 raise InputError(f"HybridGradient: {name} must be a list of parameters' keys, got {keys!r:.80}")
             object.__setattr__(self, name, tuple(keys))
+        if isinstance(self.perturbed, GaussNewton):
+            if self.eliminated and self.perturbed.remember:
+                raise InputError(
+                    "HybridGradient: eliminated requires GaussNewton(remember=False), since the lines of earlier derivative images differ"
+                )
+            options = replace(
+                self.perturbed, scores=False, derivative_images=bool(self.eliminated)
+            )  # a block states no error
+            object.__setattr__(self, "perturbed", options)
 
     @property
     def provides(self) -> Capabilities:
@@ -191,12 +199,7 @@ class HybridGradient:
         """Return the state before the first step. Raise `InputError` if one of the two estimators has no parameter, or refuses its own."""
         own = self._perturbed(problem.renderer, parameters)
         part = {key: parameters[key] for key in own}
-        for name in self.eliminated:
-            if name not in parameters or name in own:
-                hint = did_you_mean(name, [other for other in parameters if other not in own])
-                raise InputError(
-                    f"HybridGradient: eliminated names {name}, which is not one of the other parameters{hint}"
-                )
+        self._check_eliminated(problem, parameters, own)
         response = Response.zero(parameters, self.eliminated, trees.ravel(part).size) if self.eliminated else None
         path, perturbed = self._problems(problem, parameters, own, response)
         zeros = trees.zeros_like(part) if self.averaged else {}
@@ -280,6 +283,24 @@ class HybridGradient:
             return fixed, state, samples
         block = BlockEstimate(tuple(part), estimate)
         return replace(estimate, capabilities=(block,)), replace(state, perturbed=after, response=response), samples
+
+    def _check_eliminated(self, problem: Problem, parameters: Tree, own: Sequence[str]) -> None:
+        known = problem.renderer.parameters()
+        for name in self.eliminated:
+            if name not in parameters or name in own:
+                hint = did_you_mean(name, [other for other in parameters if other not in own])
+                raise InputError(
+                    f"HybridGradient: eliminated names {name}, which is not one of the other parameters{hint}"
+                )
+            unknown = problem.unknowns[name]
+            if (unknown.transform, unknown.preconditioner, unknown.prior) != (None, None, None):
+                raise InputError(
+                    f"HybridGradient: parameter {name} has a preconditioner, parameterisation or prior; remove it from eliminated"
+                )
+        if self.eliminated and (sensors := [key for key in own if known[key].sensor is not None]):
+            raise InputError(
+                f"HybridGradient: eliminated excludes parameters of a sensor, got {sensors[0]}, as textures change all views"
+            )
 
     def _problems(
         self, problem: Problem, parameters: Tree, own: Sequence[str], response: Response | None

@@ -15,7 +15,7 @@ on Numerical Analysis 10(2), 1973.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -28,14 +28,17 @@ from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["Response", "update_response"]
+__all__ = ["IMAGES", "Response", "update_response"]
+
+IMAGES = 3
+"""Number of images that a step renders of each view."""
 
 _LEAST_GAIN = 0.25
 """Smallest γ. The first is 1, and the k-th is 1 / k until then."""
 _CHANGE = 0.05
-"""Change of the textures for the derivative along s, relative to s."""
+"""Change of a texture in both directions for the derivative along s, relative to its root mean square."""
 _UNSEEN = 1e-3
-"""Share of the mean of L that is added to it, so that texels which hardly any pixel sees hardly move."""
+"""Share of the mean of L that is added to it, since noise dominates the slopes of texels that hardly any pixel sees."""
 _LAST = 3
 """Index of the random numbers of the derivative along s."""
 
@@ -68,7 +71,9 @@ class Response:
 def update_response(
     response: Response, problem: Problem, parameters: Tree, images: DerivativeImages, spp: int, key: Key
 ) -> tuple[Response, int]:
-    """Return the response after one step, and the number of paths traced.
+    """Return the response after one step, and the number of paths traced for images.
+
+    The cost for each view is that of `IMAGES` images, and of an adjoint for each element and one more.
 
     Args:
         response: response so far.
@@ -79,7 +84,7 @@ def update_response(
         key: random numbers, independent of those of J.
     """
     session = problem.renderer.prepare(list(parameters), None)
-    sizes = {k: float(np.sqrt(np.mean(np.square(arrays.numpy(parameters[k]))))) or 1.0 for k in response.slopes}
+    ends = {key: _ends(arrays.numpy(parameters[key]), problem.unknowns[key].project) for key in response.slopes}
     slopes = {k: np.zeros(x.shape) for k, x in response.slopes.items()}
     curvature = {k: np.zeros(x.shape[1:]) for k, x in response.slopes.items()}
     traced = 0
@@ -87,37 +92,41 @@ def update_response(
         request = SampleRequest(problem.views[view].sensor, spp, key.fold(view).uint32())
         paths = session.image(parameters, request).paths
         other = replace(request, seed=key.fold(view).fold(_LAST).uint32())
-        along = _directional_derivative(session, parameters, sizes, other)
+        along = _directional_derivative(session, parameters, ends, other)
         for index, image in ((None, along), *zip(elements.tolist(), derivatives, strict=True)):
             weighted = arrays.add_first_axis(problem.renderer.array((image * weights).astype(np.float32)))
             gradient = session.adjoint(parameters, paths, weighted)
             for k in slopes:
                 own = arrays.numpy(gradient[k]).astype(np.float64)
                 if index is None:
-                    curvature[k] += own / sizes[k]
+                    distance = ends[k][0] - ends[k][1]
+                    curvature[k] += np.divide(own, distance, out=np.zeros(own.shape), where=distance > 0.0)
                 else:
                     slopes[k][index] += own
-        traced += (3 + 1) * spp * weights.shape[0] * weights.shape[1]
+        traced += IMAGES * spp * weights.shape[0] * weights.shape[1]
     return _next_response(response, slopes, curvature), traced
 
 
+def _ends(value: np.ndarray, project: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Return the values of a texture after a change in both directions, within its bounds, (2, *shape). Their difference is s."""
+    change = _CHANGE * (float(np.sqrt(np.mean(np.square(value)))) or 1.0)
+    return project(np.stack([value + change, value - change])).astype(np.float64)
+
+
 def _directional_derivative(
-    session: RenderSession, parameters: Tree, sizes: Mapping[str, float], request: SampleRequest
+    session: RenderSession, parameters: Tree, ends: Mapping[str, np.ndarray], request: SampleRequest
 ) -> np.ndarray:
     """Return the derivative of the image by the textures along s, (H, W, 3)."""
-    states = {}
-    for key, value in trees.numpy(parameters).items():
-        change = _CHANGE * sizes.get(key, 0.0)
-        ends = np.stack([value + change, value - change]) if change else np.broadcast_to(value, (2, *value.shape))
-        states[key] = ends
+    fixed = {key: np.broadcast_to(x, (2, *x.shape)) for key, x in trees.numpy(parameters).items()}
+    states = {key: ends[key].astype(np.float32) if key in ends else x for key, x in fixed.items()}
     one, other = arrays.numpy(session.image_batch(states, request)).astype(np.float64)
-    return (one - other) / (2.0 * _CHANGE)
+    return one - other
 
 
 def _next_response(
     response: Response, gradients: Mapping[str, np.ndarray], curvature: Mapping[str, np.ndarray]
 ) -> Response:
-    """Return the response after the step for the gradients (∂I/∂t)ᵀ W J."""
+    """Return the response after the step for the gradients (∂I/∂t)ᵀ W J; `response` itself if one of them is not finite."""
     count = response.count + 1
     before = response.curvature or curvature
     mean = {key: (before[key] + (x - before[key]) / count).astype(np.float32) for key, x in curvature.items()}
@@ -127,4 +136,5 @@ def _next_response(
         scale = positive + _UNSEEN * float(positive.mean())
         change = np.divide(gradients[key], scale, out=np.zeros(own.shape), where=scale > 0.0)
         slopes[key] = (own - gain * change).astype(np.float32)
-    return Response(slopes, mean, count) if all(np.isfinite(x).all() for x in slopes.values()) else response
+    finite = all(np.isfinite(x).all() for x in (*slopes.values(), *mean.values()))
+    return Response(slopes, mean, count) if finite else response

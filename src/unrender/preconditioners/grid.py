@@ -56,8 +56,7 @@ class Transform:
 class TransformSolver:
     """Solver of (I + λ L)^power y = x by the diagonalising transform, in O(n log n) without factorisation.
 
-    A sparse Cholesky factor would be as fast on textures of 64² texels and four times slower from 192² on. On grids its fill-in grows
-    as n^(4/3).
+    The fill-in of a sparse Cholesky factor would grow as n^(4/3) on grids of voxels.
     """
 
     def __init__(self, strength: float, grid: tuple[int, ...], wrap: tuple[bool, ...], power: float):

@@ -14,6 +14,7 @@ from unrender.estimators.capabilities import Hessian
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient
 from unrender.estimators.path import PathGradient
+from unrender.estimators.variable_projection import IMAGES
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.plan import Plan
@@ -116,10 +117,11 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     if not _few(traits, keys) or own or not problem.loss.linear or not isinstance(plan.estimator, PathGradient):
         return None
     estimator = _estimator(traits, keys, constants.block_images)
-    traced = 2 * _elements(traits, keys) * estimator.derivative_spp + estimator.spp
+    eliminated = _eliminated(traits, keys, plan)
+    images = 2 * _elements(traits, keys) + (IMAGES if eliminated else 0)
+    traced = images * estimator.derivative_spp + estimator.spp
     every = sampling.within((1, constants.block_every), round(traced / (constants.path_cost * plan.estimator.spp)))
     times = "" if every == 1 else f", every {every} steps"
-    eliminated = _eliminated(traits, keys, plan)
     textures = f"; {listed(eliminated)} eliminated from their steps" if eliminated else ""
     reason = (
         f"{_reason(traits, keys, estimator)}{times}, after {constants.block_wait} steps of the others: {listed(keys)}"
@@ -164,7 +166,7 @@ def _explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float
 def _eliminated(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str, ...]:
     """Return the textures that a block of lights eliminates: reflectances and radiances, in their own coordinates and without a prior.
 
-    Poses of shapes show in edges, which textures hardly explain: they came no nearer per step, at 1.7 times the cost of a step.
+    Poses of shapes are visible in edges, which textures hardly explain.
     """
     unknowns, elements = plan.configured().unknowns, _elements(traits, keys)
     if not all(traits.infos[key].light for key in keys):
