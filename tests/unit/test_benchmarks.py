@@ -79,6 +79,20 @@ def test_every_figure_is_drawn_from_its_record(benchmark: Benchmark, tmp_path: P
     assert cli.draw(benchmark, record, tmp_path / "figure.png") == (benchmark.plot is not None)
 
 
+def test_a_record_of_races_at_equal_steps_alone_has_a_table_and_a_figure() -> None:
+    """Each denoised row names its denoiser."""
+    benchmark = ALL["rcv.fig9_reconstruction"]
+    record = records.read(benchmark.folder)
+    assert record is not None
+    del record["entries"]
+    rows = benchmark.table(record).splitlines()
+    assert sum("denoised by oidn" in row for row in rows) == 2
+    assert sum("denoised by variation" in row for row in rows) == 2
+    assert sum("denoised" in row for row in rows) == 4
+    assert benchmark.plot is not None
+    assert len(benchmark.plot(record).axes) == len(record["equal steps"])
+
+
 def test_templates_take_entries_of_records() -> None:
     entry = {
         "name": "a",

@@ -223,9 +223,24 @@ ORDER = ("stock", "plain", "plain, denoised", "rcv, denoised", "rcv")
 
 
 def table(record: Record) -> str:
-    """Equal-time reconstruction."""
+    """Reconstruction at equal time, and at equal steps, of those that the record has."""
+    tables = {"entries": by_time, "equal steps": by_steps}
+    return markdown.blocks(*(make(record[kind]) for kind, make in tables.items() if kind in record))
+
+
+def by_steps(entries: dict[str, Any]) -> str:
+    """Final errors of races at equal steps."""
+    row, rows = "{name} | {steps[0]} | {method} | {rate:g} | {final!m}", []
+    for found in markdown.named(entries, "name", "methods", "method"):
+        by = f" by {found['denoiser']}" if "denoised" in found["method"] else ""
+        rows.append([markdown.fill(row, found | {"method": found["method"] + by})])
+    return markdown.table("at equal steps: problem, loss, image + adjoint | steps | method | rate | final error", rows)
+
+
+def by_time(entries: dict[str, Any]) -> str:
+    """Final errors of races at equal time, and when each method is at its best."""
     rows = []
-    for entry in record["entries"].values():
+    for entry in entries.values():
         for method in (each for each in ORDER if each in entry["methods"]):
             found, others = {**entry, **entry["methods"][method], **entry["summary"][method]}, ["1", "", ""]
             if method != "rcv":
@@ -237,19 +252,20 @@ def table(record: Record) -> str:
             row = f"{{problem}} | {{loss}} | {{seconds:g}} s{clock} | {method} ({{spp}} spp, {{rate:g}}) | {{final!m}} | {{best:.3f}}"
             rows.append([markdown.fill(row, found), *others])
     head = "problem | loss | budget | method (spp, rate) | final error | best on the way | × rcv's final | its best at"
-    by_time = markdown.table(f"{head} | rcv gets there at", rows)
-    if "equal steps" not in record:
-        return by_time
-    at_equal_steps = markdown.records(
-        "at equal steps: problem, loss, image + adjoint | steps | method | rate | final error",
-        "{name} | {steps[0]} | {method} | {rate:g} | {final!m}",
-        markdown.named(record["equal steps"], "name", "methods", "method"),
-    )
-    return markdown.blocks(by_time, at_equal_steps)
+    return markdown.table(f"{head} | rcv gets there at", rows)
 
 
 def plot(record: Record) -> figures.Figure:
-    """Error over seconds, a panel per problem and loss."""
+    """Error over seconds, a panel per problem and loss; over shares of the steps where the record has races at equal steps only."""
+    if "entries" not in record:
+        races = {
+            name: {
+                method: [(np.linspace(0.0, 1.0, len(run)), [point[-1] for point in run]) for run in found["runs"]]
+                for method, found in entry["methods"].items()
+            }
+            for name, entry in record["equal steps"].items()
+        }
+        return figures.curves(races, "share of the steps", log="")
     panels = {
         name: {
             f"{method}, {found['spp']} spp, rate {found['rate']:g}": [
