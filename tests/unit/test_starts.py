@@ -178,19 +178,24 @@ def test_limits_of_a_common_factor_keep_each_value_inside() -> None:
     assert starts._limits([]) == (1e-2, 1e2)
 
 
-@pytest.mark.parametrize("role", ["value", "direction"])
-def test_places_are_spread_over_the_range(role: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    renderer = AnalyticRenderer({"place": np.ones(3)}, np.ones((192, 3)), shape=SHAPE)
+@pytest.mark.parametrize(
+    ("role", "size", "number", "farthest"), [("value", 1, 16, 0.2), ("value", 3, 24, 0.9), ("direction", 3, 24, 0.9)]
+)
+def test_places_are_spread_over_the_range(
+    role: str, size: int, number: int, farthest: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """16 places per dimension, and 24 at most."""
+    renderer = AnalyticRenderer({"place": np.ones(size)}, np.ones((192, size)), shape=SHAPE)
     info = dataclasses.replace(renderer.parameters()["place"], nonlinear=True, role=role)
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: {"place": info})
     made = Problem(renderer, [Parameter("place", bounds=(-1.0, 1.0))], [View(np.zeros((*SHAPE, 3)))])
     traits: Any = type("T", (), {"infos": {"place": info}, "problem": made})
     places = np.array([place["place"] for place in starts._places(traits, ["place"])])
-    assert len(places) == 24
+    assert len(places) == number
     assert (np.abs(places) <= 1.0).all()
     if role == "direction":
         np.testing.assert_allclose(np.linalg.norm(places, axis=1), 1.0, atol=1e-3)
-    other = np.random.default_rng(0).normal(size=(200, 3))
+    other = np.random.default_rng(0).normal(size=(200, size))
     other = other / np.linalg.norm(other, axis=1)[:, None] if role == "direction" else np.clip(0.4 * other, -1, 1)
     nearest = np.linalg.norm(other[:, None] - places[None], axis=2).min(axis=1)
-    assert nearest.max() < 0.9
+    assert nearest.max() < farthest
