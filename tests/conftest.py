@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from garbage import freeze_without_scenes
 from unrender.backend import variant
 from unrender.core.errors import VariantError
 
@@ -108,7 +109,7 @@ def no_scene_outlives_its_file() -> Iterator[None]:
     more of them, tests of media take three times as long."""
     yield
     gc.collect()
-    gc.freeze()  # what is left stays to the end, and later collections need not go through it: half a second each
+    freeze_without_scenes()
 
 
 @pytest.fixture(autouse=True)
