@@ -64,7 +64,7 @@ class StockViews:
         self._views = []
         for view in problem.original_views:
             known = {key: np.asarray(value, np.float32) for key, value in (view.known or {}).items()}
-            same = (n for n, (held, *_) in enumerate(self._worlds) if repr(held) == repr(known))
+            same = (n for n, (held, *_) in enumerate(self._worlds) if _equal(held, known))
             if (index := next(same, None)) is None:
                 index, scene = len(self._worlds), load_scene(scene_description(problem))
                 parameters = mi.traverse(scene)
@@ -95,6 +95,11 @@ class StockViews:
             loss += self.problem.loss_value(view, image)
         dr.backward(loss)
         return loss
+
+
+def _equal(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> bool:
+    """Whether two sets of known values have the same keys and equal arrays."""
+    return one.keys() == other.keys() and all(np.array_equal(value, other[key]) for key, value in one.items())
 
 
 def priors(problem: ur.Problem, values: Mapping[str, Any]) -> Any:
