@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 import unrender as ur
 from unrender.core.random import Key
@@ -166,6 +167,17 @@ def test_a_lamp_beside_a_texture_does_not_crawl(tmp_path: Path) -> None:
     resumed = ur.resume(tmp_path / "run", asked, steps=20)
     for key in TRUTH:
         np.testing.assert_array_equal(resumed.parameters[key], whole.parameters[key])
+
+
+def test_textures_at_their_bounds_do_not_shift_the_solution() -> None:
+    """The lamp ends at 0.004 from it; 0.052 where texels at their bounds follow."""
+    asked = problem(noise=0.1, bounds=(0, 0.75))
+    assert isinstance(asked.renderer, AnalyticRenderer)
+    target = np.asarray(asked.views[0].reference, np.float64).reshape(-1) - 0.1
+    limits = [0.0] * (TEXELS + 2), [0.75] * TEXELS + [1.0] * 2
+    solution = lsq_linear(asked.renderer.matrix, target, bounds=limits).x[TEXELS:]
+    found = ur.optimize(asked, estimator(), solver(), steps=200).parameters["lamp"]
+    assert np.linalg.norm(np.asarray(found) - solution) < 0.02
 
 
 def test_parameters_follow_along_lines_within_their_bounds() -> None:

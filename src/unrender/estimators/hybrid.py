@@ -212,6 +212,8 @@ class HybridGradient:
         """Return an estimate and the next state. `info`: that of `path`, with "samples" of both, and "perturbed_loss", the loss at the
         parameters with the noise of the perturbed renders."""
         own = self._perturbed(problem.renderer, parameters)
+        if state.response is not None:
+            state = replace(state, response=state.response.within(problem, parameters))
         path, perturbed = self._problems(problem, parameters, own, state.response)
         path_estimate, path_state = self.path.estimate(path, parameters, state.path, key)
         part = {name: parameters[name] for name in own}

@@ -62,6 +62,15 @@ class Response:
         """Return a response of 0: the textures stay fixed."""
         return cls({key: np.zeros((elements, *arrays.shape(parameters[key])), np.float32) for key in keys})
 
+    def within(self, problem: Problem, parameters: Tree) -> Response:
+        """Return the response with texels fixed at their bounds, where a gradient of the loss remains."""
+        slopes = {}
+        for key, own in self.slopes.items():
+            value, project = arrays.numpy(parameters[key]), problem.unknowns[key].project
+            low, high = (project(np.full_like(value, end)) for end in (-np.inf, np.inf))
+            slopes[key] = np.where((value > low) & (value < high), own, np.float32(0.0))
+        return replace(self, slopes=slopes)
+
     def upsampled(self, upsampler: Upsampler) -> Response:
         """Return a response at the finer resolution, which restarts at 0."""
         shapes = {key: np.empty(upsampler.problem.shapes(upsampler.step)[key]) for key in self.slopes}
