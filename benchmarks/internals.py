@@ -119,7 +119,8 @@ def from_tensor(value: Any, like: Any) -> Any:
     """A tensor in the type that a scene's parameter has."""
     from unrender.rendering.mitsuba.tensors import from_tensor as convert
 
-    return convert(value, like)
+    # A product, since the derivative of `dr.unravel` overwrites those that its argument has from elsewhere.
+    return convert(value * 1.0, like)
 
 
 def image_step(
