@@ -189,7 +189,7 @@ def test_a_file_that_is_wrong_is_one_line(unrender: Unrender, staged: Path, old:
 def test_options_that_stand_in_the_file_are_refused(unrender: Unrender, staged: Path) -> None:
     assert "--set spp: not supported with stages" in unrender(*RUN, "--set", "spp=2").error
     assert "--method: not supported with stages" in unrender(*RUN, "--method", "rcv").error
-    assert "--no-cache: not supported with stages" in unrender(*RUN, "--no-cache").error
+    assert "--no-cache: not supported with stages; leave it out" in unrender(*RUN, "--no-cache").error
     assert "--compress: requires --workers" in unrender("resume", ".", "--compress").error
     assert "--insecure: requires --workers" in unrender("resume", ".", "--insecure").error
     assert not (staged / "result").exists()

@@ -15,8 +15,9 @@ from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.io import parameter_values as values
 from unrender.losses import L2
+from unrender.rendering.mitsuba.pixel_format import formats
 from unrender.scene.view import View
-from unrender.scene.view_checks import check_views
+from unrender.scene.view_checks import check_views, read_reference
 
 COLOURS = np.random.default_rng(0).random((6, 8, 3)).astype(np.float32)
 
@@ -88,9 +89,9 @@ def test_drops_alpha_and_keeps_grey_as_one_channel(tmp_path: Path):
     rgba = np.concatenate([COLOURS, np.full((6, 8, 1), 0.25, np.float32)], axis=2)
     picture = images.read(bitmap(rgba, tmp_path / "a.exr"))
     np.testing.assert_array_equal(picture.values, COLOURS)
-    np.testing.assert_array_equal(np.asarray(picture.opacity), rgba[..., 3])
+    np.testing.assert_array_equal(np.asarray(picture.alpha), rgba[..., 3])
     rgba[..., 3] = 1
-    assert images.read(bitmap(rgba, tmp_path / "opaque.exr")).opacity is None
+    assert images.read(bitmap(rgba, tmp_path / "opaque.exr")).alpha is None
     assert images.read(bitmap(COLOURS[..., :1], tmp_path / "g.exr")).values.shape == (6, 8, 1)
 
 
@@ -99,6 +100,16 @@ def test_takes_the_colours_of_a_file_of_many_layers(tmp_path: Path):
     names = ["R", "G", "B", "depth.T"]
     mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(tmp_path / "a.exr"))
     np.testing.assert_array_equal(images.read(tmp_path / "a.exr").values, COLOURS)
+
+
+@pytest.mark.parametrize(("pixel_format", "stores"), [("rgb", False), ("rgba", True), ("luminance_alpha", True)])
+def test_alpha_has_no_notice_if_the_film_stores_it(pixel_format: str, stores: bool):
+    (form,) = formats(
+        [mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "pixel_format": pixel_format}})]
+    )
+    assert form.stores_alpha is stores
+    channels = 2 if form.colour == "luminance" else 4
+    assert read_reference(np.full((6, 8, channels), 0.5, np.float32), form).loses_alpha is not stores
 
 
 def test_says_which_channels_a_file_without_colours_has(tmp_path: Path):

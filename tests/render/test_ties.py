@@ -11,7 +11,8 @@ import pytest
 
 import unrender as ur
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.renderer import SampleRequest
+from unrender.rendering.parameter_errors import Role
+from unrender.rendering.renderer import ParameterInfo, SampleRequest
 from unrender.rendering.tied import Tie, with_ties
 from unrender.scene import fingerprint, serialization
 
@@ -131,6 +132,18 @@ def test_ties_are_recovered_and_exported(tmp_path: Path) -> None:
     assert roughness == pytest.approx([float(result.parameters["gloss"])] * 2, rel=1e-4)
     for key, factor in zip(LAMPS, (1, 0.5), strict=True):
         np.testing.assert_allclose(np.array(values[key]).ravel(), factor * result.parameters[LAMPS[0]], rtol=1e-4)
+
+
+@pytest.mark.parametrize("role", ["value", "height", "normal", "direction"])
+def test_values_are_tied_unless_they_are_encoded_differently(role: Role) -> None:
+    """A bump height is a number, as in another texture; a texel of a normal map is a vector."""
+    known = {"a": ParameterInfo((2, 2, 1)), "b": ParameterInfo((2, 2, 1), role=role)}
+    tie = Tie("both", {"a": 1.0, "b": 1.0})
+    if role in ("value", "height"):
+        assert tie.info(known).shape == (2, 2, 1)
+    else:
+        with pytest.raises(ur.InputError, match="read their values differently"):
+            tie.info(known)
 
 
 @pytest.mark.parametrize(

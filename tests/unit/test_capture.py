@@ -18,7 +18,7 @@ from tiers import quick
 pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrender[capture]'")
 
 import unrender
-from unrender.app.capture import atlas, formats, hull, importing, pictures
+from unrender.app.capture import atlas, formats, hull, importing, pictures, views
 from unrender.app.capture.cameras import Lens, project, rigid
 from unrender.app.capture.capture import Capture, CapturedView, Photograph
 from unrender.app.capture.conventions import AXES, pose, reinterpreted
@@ -308,8 +308,43 @@ def test_the_alpha_of_a_floating_point_photograph_is_its_mask(tmp_path: Path) ->
     mi.Bitmap(np.concatenate([colours * alpha, alpha], axis=2)).write(str(tmp_path / "a.exr"))
     found = pictures.read(tmp_path / "a.exr")
     np.testing.assert_allclose(np.asarray(found.alpha), alpha[..., 0])
-    np.testing.assert_allclose(found.values[alpha[..., 0] > 0], 0.6, rtol=1e-5)
+    assert found.premultiplied
+    np.testing.assert_allclose(found.values, colours * alpha)
     np.testing.assert_allclose(pictures.read_mask(tmp_path / "a.exr"), alpha[..., 0])
+
+
+def _soft_edges(folder: Path) -> np.ndarray:
+    """Write three photographs of a folder with transforms.json: premultiplied colour 0.6, with an alpha of 0.1 near the edge."""
+    mi = pytest.importorskip("mitsuba")
+    unrender.use("llvm_ad_rgb")
+    alpha = np.zeros((32, 32, 1), np.float32)
+    alpha[4:-4, 4:-4], alpha[8:-8, 8:-8] = 0.1, 1.0
+    names = [f"{index}.exr" for index in range(3)]
+    for name in names:
+        mi.Bitmap(np.concatenate([0.6 * alpha, alpha], axis=2).repeat([3, 1], axis=2)).write(str(folder / name))
+    directions = ([1, 0, 0.2], [0, 0.1, 1], [-1, 0.3, 0.1])
+    frames = [
+        {"file_path": name, "transform_matrix": _camera(np.array(direction), 3.0).tolist()}
+        for name, direction in zip(names, directions, strict=True)
+    ]
+    (folder / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
+    return alpha
+
+
+def test_colours_of_a_field_stay_multiplied_with_alpha(tmp_path: Path) -> None:
+    (tmp_path / "capture").mkdir()
+    alpha = _soft_edges(tmp_path / "capture")
+    unrender.app.import_capture(tmp_path / "capture", tmp_path / "out", unrender.app.ImportOptions(field=4, hold_out=0))
+    written = sorted((tmp_path / "out" / "references").iterdir())
+    assert len(written) == 3
+    np.testing.assert_allclose(pictures.read(written[0]).values, 0.6 * alpha.repeat(3, axis=2), atol=1e-3)
+
+
+def test_colours_of_masked_photographs_are_divided_by_alpha(tmp_path: Path) -> None:
+    alpha = _soft_edges(tmp_path)
+    (stored, *_), _ = views.prepare(formats.read(tmp_path), 32, None, 0)
+    np.testing.assert_allclose(np.asarray(stored.mask), alpha[..., 0])
+    np.testing.assert_allclose(stored.values, 0.6 * (alpha > 0).repeat(3, axis=2), rtol=1e-5)
 
 
 def test_broken_exif_is_passed_over(tmp_path: Path) -> None:

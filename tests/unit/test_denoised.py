@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import unrender as ur
 from unrender.core.random import Key
 from unrender.images import denoising
-from unrender.images.base import PairRequest
+from unrender.images.base import ImageEstimator, PairRequest, needs_full_views
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.scene.batches import FullView
 
@@ -156,3 +157,34 @@ def test_mitsuba_images_too() -> None:
     found = ur.optimize(asked, estimator, ur.optimizers.Adam(0.05), steps=15)
     errors = [record["parameter_error"] for record in found.history if "parameter_error" in record]
     assert max(errors[-1].values()) < 0.7 * max(errors[0].values())
+
+
+class Wrapper:
+    """An image estimator from before `needs_whole_views` became `needs_full_views`."""
+
+    def __init__(self, inner: Any):
+        self.inner = inner
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "needs_full_views":
+            raise AttributeError(name)
+        return getattr(self.inner, name)
+
+
+class Heir(ImageEstimator):
+    """The same as a subclass of the protocol, whose own `needs_full_views` returns None."""
+
+    def needs_whole_views(self, parameters: Any, state: Any, batches: int) -> bool:
+        return batches == 1
+
+
+def test_the_former_name_of_a_method_warns() -> None:
+    words = "needs_whole_views is now needs_full_views"
+    with pytest.warns(DeprecationWarning, match=words):
+        assert needs_full_views(Heir(), {}, None, 1)  # pyright: ignore[reportAbstractUsage]
+    image: Any = Wrapper(CV())
+    estimator = ur.PathGradient(image=image, spp=4, pixels=ur.pixels.Uniform(16))
+    with pytest.warns(DeprecationWarning, match=words):
+        result = ur.optimize(problem(), estimator, ur.optimizers.Adam(0.02), steps=4)
+    expected = ur.optimize(problem(), replace(estimator, image=CV()), ur.optimizers.Adam(0.02), steps=4)
+    np.testing.assert_array_equal(result.parameters["lamps"], expected.parameters["lamps"])

@@ -158,11 +158,11 @@ def test_numbers_with_a_texture_that_there_was_time_to_move_once_only(monkeypatc
     monkeypatch.setattr(_Adjoints, "of", slow)
     found = check_numbers(made, values, made.initial_values(), 2.0, sensitivity)
     assert_no_error_is_stated(
-        made, found, ("a", "b"), "standard errors of a, b", "texture (no time was left; use more seconds)"
+        made, found, ("a", "b"), "a, b have no standard errors", "texture (no time was left; use more seconds)"
     )
     monkeypatch.setattr(field_directions, "_ROUNDS", 1)
     found = check_numbers(made, values, made.initial_values(), FAR, sensitivity)
-    assert_no_error_is_stated(made, found, ("a", "b"), "texture (their shares in the pictures are not resolved)")
+    assert_no_error_is_stated(made, found, ("a", "b"), "texture (whose share in the pictures is not resolved)")
 
 
 @pytest.mark.parametrize("what", ["prior", "too large", "mesh", "no derivative"])
@@ -184,7 +184,7 @@ def test_numbers_with_an_unknown_that_the_test_cannot_move(monkeypatch: pytest.M
     if what == "no derivative":
         sensitivity = {key: x for key, x in sensitivity.items() if key != "texture"}
     found = check_numbers(made, values, made.initial_values(), FAR, sensitivity)
-    assert_no_error_is_stated(made, found, ("a", "b"), "standard errors of a, b", "with texture (", what)
+    assert_no_error_is_stated(made, found, ("a", "b"), "a, b have no standard errors", "with texture (", what)
     assert not found.undetermined
     if what in ("prior", "too large"):
         stated = ur.runs.uncertainty(made, values)
@@ -205,14 +205,14 @@ def test_a_run_folder_states_no_error_of_numbers_with_a_prior(tmp_path: Any):
     result = dataclasses.replace(result, standard_error={"a": np.array(1e-3)})
     found = final_images.render_final_images(made, result, 16)
     assert not {"a", "b"} & set(found.standard_error)
-    (line,) = [line for line in found.undetermined if line.startswith("standard errors of")]
-    assert line == "standard errors of a, b: they are recovered together with texture (it has a prior)"
+    (line,) = [line for line in found.undetermined if "no standard error" in line]
+    assert line == "a, b have no standard errors: they are recovered together with texture (which has a prior)"
 
 
 def test_a_number_that_is_undetermined_has_one_line():
-    check = NumbersCheck(undetermined={"a": "a: open"}, unchecked=("a", "b"), fixed={"texture": "it has a prior"})
+    check = NumbersCheck(undetermined={"a": "a: open"}, unchecked=("a", "b"), fixed={"texture": "which has a prior"})
     assert check.missing(check.undetermined) == [
-        "standard errors of b: they are recovered together with texture (it has a prior)"
+        "b has no standard error: it is recovered together with texture (which has a prior)"
     ]
     assert not check.missing(check.unchecked)
 
@@ -225,7 +225,7 @@ def test_a_number_with_one_with_a_prior():
     made = ur.Problem(made.renderer, parameters, made.views)
     values = at_truth(made)
     found = check_numbers(made, values, start, FAR, ur.runs.sensitivity(made, values))
-    assert_no_error_is_stated(made, found, ("a",), "with b (it has a prior)")
+    assert_no_error_is_stated(made, found, ("a",), "with b (which has a prior)")
 
 
 def test_an_unknown_that_no_picture_shows_takes_no_error_away():

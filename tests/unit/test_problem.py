@@ -130,9 +130,11 @@ def test_references_are_float32_and_alpha_is_dropped():
     np.testing.assert_array_equal(made.views[0].reference, REFERENCE)
     np.testing.assert_array_equal(made.views[1].reference, np.repeat(REFERENCE[..., :1], 3, axis=2))
     assert [notice[:32] for notice in made.notices] == [
-        "view 0: reference has alpha, whi",
         "view 1: reference has one channe",
+        "view 0: reference has alpha, whi",
     ]
+    (notice,) = problem(views=[View(rgba), View(rgba)]).notices
+    assert notice == "references of 2 views have alpha, which is left out; if it is a mask, give it as the view's mask"
 
 
 def test_a_black_file_and_alpha_of_floats_say_so(tmp_path):
@@ -140,7 +142,7 @@ def test_a_black_file_and_alpha_of_floats_say_so(tmp_path):
     assert problem(views=[View(rgba)]).notices == []
     np.save(tmp_path / "black.npy", np.zeros((HEIGHT, WIDTH, 3), np.float32))
     (notice,) = problem(views=[View(tmp_path / "black.npy")]).notices
-    assert notice == "view 0: reference is black everywhere, so it can only darken what it sees"
+    assert notice == "view 0: reference is 0 at every pixel; check the file, or leave the view out"
 
 
 def test_eight_bit_values_are_linearised_and_it_says_so():

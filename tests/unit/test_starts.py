@@ -13,6 +13,8 @@ from unrender import losses
 from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import starts
+from unrender.methods.rules.brightness import start_factors
+from unrender.methods.rules.constants import CONSTANTS
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
@@ -46,6 +48,23 @@ def problem(
         Parameter("lamp", initial=lamp, bounds=(0, most)),
     ]
     return Problem(renderer, unknown, [View(renderer.exact(TRUTH))], truth=TRUTH)
+
+
+class Broken(AnalyticRenderer):
+    """With one pixel that is not finite."""
+
+    def image(self, parameters: Any, request: Any) -> Any:
+        rendering = super().image(parameters, request)
+        rendering.images[:, 0, 0] = np.nan
+        return rendering
+
+
+def test_a_pixel_that_is_not_finite_leaves_the_factors_of_lights() -> None:
+    matrix = np.random.default_rng(2).uniform(0.5, 1.5, (SHAPE[0] * SHAPE[1] * 3, 1))
+    for kind in (AnalyticRenderer, Broken):
+        renderer = kind({"lamp": np.array([1.0])}, matrix, 0.0, 0.1, shape=SHAPE)
+        made = Problem(renderer, [Parameter("lamp", initial=[0.1])], [View(renderer.exact({"lamp": np.array([1.0])}))])
+        assert start_factors(made, ["lamp"], CONSTANTS) == pytest.approx({"lamp": 10.0}, rel=0.05)
 
 
 def restricted(

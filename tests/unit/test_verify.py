@@ -428,7 +428,7 @@ def test_a_run_that_has_converged_has_nothing_unexplained(rate: float, count: in
         assert result.status == "finished"
 
 
-UNFINISHED = "and still improves: its loss has fallen by"
+NOT_CONVERGED = "and the run has not converged: its loss has fallen by"
 
 
 @pytest.mark.parametrize(
@@ -438,7 +438,7 @@ def test_a_run_that_stopped_on_its_way_is_told(steps: int, rate: float, stopped:
     for seed in range(2):
         optimizer = ur.optimizers.Adam(rate / steps)
         result = ur.optimize(smooth(0.0, seed), ur.PathGradient(spp=4096 // steps), optimizer, steps=steps, seed=seed)
-        assert any(UNFINISHED in line for line in result.warnings) is stopped, (result.warnings, result.verification)
+        assert any(NOT_CONVERGED in line for line in result.warnings) is stopped, (result.warnings, result.verification)
         assert result.status == "finished"
 
 
@@ -633,9 +633,19 @@ def test_a_difference_in_few_pixels_counts_after_a_run_without_improvement(impro
     assert ("the final picture differs" in found) is not improved
 
 
+def test_noise_of_the_references_is_no_fault_where_the_true_values_leave_as_much() -> None:
+    generator, problem = np.random.default_rng(0), made()
+    residuals = 0.05 * generator.normal(size=(512, 3)) + generator.normal(0.0, 0.002, (4, 512, 3))
+    arguments = problem, residuals, np.full((512, 3), 0.1), np.ones(512)
+    found = verification.misfit_of_numbers(*arguments, improved=False)
+    assert "this picture's noise does not explain: the references are noisy, or" in found
+    assert not verification.misfit_of_numbers(*arguments, improved=False, at_truth=lambda: 0.05**2)
+    assert verification.misfit_of_numbers(*arguments, improved=False, at_truth=lambda: 0.01**2)
+
+
 def test_a_run_that_starts_at_the_truth_has_not_improved(monkeypatch: pytest.MonkeyPatch) -> None:
     noted: list[bool] = []
-    monkeypatch.setattr(verify, "misfit_of_numbers", lambda *_, improved: noted.append(improved) or "wrong")
+    monkeypatch.setattr(verify, "misfit_of_numbers", lambda *_, improved, at_truth: noted.append(improved) or "wrong")
     result = ur.optimize(made(start=None, noise=0.1), ur.GaussNewton(), ur.optimizers.AveragedNewton(), steps=12)
     assert noted == [False]
     assert not result.standard_error

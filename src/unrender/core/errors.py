@@ -34,5 +34,9 @@ class KeyedError(InputError):
         self.key = key
 
 
+class UnknownOptionError(InputError):
+    """An option that no method has."""
+
+
 class VariantError(UnrenderError, RuntimeError):
     """Missing capability of the machine: no usable LLVM, no GPU, an unknown variant. The command line exits with 3."""

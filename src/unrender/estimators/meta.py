@@ -15,7 +15,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, PastWeight, Variance
 from unrender.estimators.sample_groups import PIXELS, GradientRequest, GradientSample, check_pixels, draws_pixels
-from unrender.images.base import ImageEstimator, PairRequest
+from unrender.images.base import ImageEstimator, PairRequest, needs_full_views
 from unrender.images.plain import Plain
 from unrender.pixels.all import All
 from unrender.pixels.base import MiniBatch, PixelSampler, RepeatableSampler, learned
@@ -358,4 +358,4 @@ class MetaEstimator:
 
     def _renders_full_views(self, parameters: Tree, state: MetaState) -> bool:
         """Return whether a step renders full views: always without mini-batches, else if the image estimator requires it."""
-        return not draws_pixels(self.pixels) or self.image.needs_full_views(parameters, state.image, state.batches)
+        return not draws_pixels(self.pixels) or needs_full_views(self.image, parameters, state.image, state.batches)

@@ -21,7 +21,7 @@ from unrender.estimators.sample_groups import (
     draws_pixels,
     leave_one_out_groups,
 )
-from unrender.images.base import ImageEstimator
+from unrender.images.base import ImageEstimator, needs_full_views
 from unrender.images.plain import Plain
 from unrender.losses.base import Loss
 from unrender.pixels.adaptive_counts import AdaptiveCounts
@@ -176,7 +176,7 @@ class PathGradient:
         problem = self._rendered(problem)
         batch, pixels = MiniBatch(None), state.pixels
         has_batches = draws_pixels(self.pixels)
-        if not has_batches or not self.image.needs_full_views(parameters, state.image, state.batches):
+        if not has_batches or not needs_full_views(self.image, parameters, state.image, state.batches):
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
         emitters, emitter_request = state.emitters, None
         if emitters is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -118,6 +119,12 @@ class PairRequest:
     difference_spp: int | None = None
 
 
+def needs_whole_views(self: ImageEstimator, parameters: Tree, state: Any, batches: int) -> bool:
+    """Former name of `needs_full_views`, as a method. Version 0.2 removes it."""
+    warnings.warn("ImageEstimator.needs_whole_views is now needs_full_views", DeprecationWarning, stacklevel=2)
+    return self.needs_full_views(parameters, state, batches)
+
+
 class ImageEstimator(Protocol):
     """Immutable image estimator; everything that changes is in the state."""
 
@@ -165,3 +172,13 @@ class ImageEstimator(Protocol):
     def advance(self, parameters: Tree, state: Any, contributions: tuple[Any, ...]) -> Any:
         """Return the state after a step of full views at `parameters`, from the contribution of each view."""
         ...
+
+
+def needs_full_views(image: ImageEstimator, parameters: Tree, state: Any, batches: int) -> bool:
+    """Return `image.needs_full_views(...)`, or the result of its former name `needs_whole_views`, which version 0.2 ignores."""
+    inherited = (None, ImageEstimator.needs_full_views)
+    former = getattr(image, "needs_whole_views", None)
+    if former is None or getattr(type(image), "needs_full_views", None) not in inherited:
+        return image.needs_full_views(parameters, state, batches)
+    warnings.warn("ImageEstimator.needs_whole_views is now needs_full_views", DeprecationWarning, stacklevel=2)
+    return former(parameters, state, batches)

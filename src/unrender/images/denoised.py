@@ -13,7 +13,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images import denoising
-from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
+from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, needs_whole_views
 from unrender.images.denoising import Denoiser
 from unrender.images.plain import Plain
 from unrender.rendering.renderer import Space
@@ -84,6 +84,8 @@ class Denoised:
             problem, parameters, state, frame, spp, self._groups(groups), key, pair_request
         )
         return replace(estimate, filter=self._filter(problem), variance=None), contribution
+
+    needs_whole_views = needs_whole_views
 
     def needs_full_views(self, parameters: Tree, state: Any, batches: int) -> bool:
         """Return True."""

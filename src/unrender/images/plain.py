@@ -8,7 +8,7 @@ from typing import Any
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
+from unrender.images.base import ImageEstimate, PairRequest, needs_whole_views, variance_of_mean
 from unrender.rendering.renderer import Space
 from unrender.scene.batches import Frame, FullView, PixelSample
 from unrender.scene.problem import Problem
@@ -66,6 +66,8 @@ class Plain:
         counts = frame.counts if isinstance(frame, FullView) else None
         variance = variance_of_mean(rendering.images, counts)
         return ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance, counts=counts), None
+
+    needs_whole_views = needs_whole_views
 
     def needs_full_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
         """Return False."""

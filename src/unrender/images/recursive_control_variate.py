@@ -18,7 +18,7 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.images.base import ImageEstimate, PairRequest, variance_of_mean
+from unrender.images.base import ImageEstimate, PairRequest, needs_whole_views, variance_of_mean
 from unrender.rendering.renderer import Rendering, Space
 from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample
 from unrender.scene.problem import Problem
@@ -156,6 +156,8 @@ class RecursiveControlVariate:
     def pixelwise(self) -> bool:
         """True, with a snapshot as control variate."""
         return True
+
+    needs_whole_views = needs_whole_views
 
     def needs_full_views(self, parameters: Tree, state: RecursiveControlVariateState, batches: int) -> bool:
         """Return True at the first step, after a change of shapes, and after `whole_views` mini-batches."""

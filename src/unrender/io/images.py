@@ -30,16 +30,16 @@ class Picture:
     Attributes:
         values: (H, W, C) float32, C in {1, 3}; linear unless read with `linearise=False`.
         notice: one line about the conversion of the values, "" for none.
-        alpha: (H, W) float32 in [0, 1], if it was requested and integer values are not opaque everywhere; else None.
+        alpha: (H, W) float32 in [0, 1]; None if it is 1 everywhere, or if it was not requested for integer values.
         labelled_xyz: whether the file names its channels X, Y and Z. The values are RGB in any case.
-        opacity: (H, W) alpha of floating-point values, in [0, 1], with which their colours are multiplied; None if it is 1 everywhere.
+        premultiplied: whether the values are multiplied with `alpha`, as in floating-point files.
     """
 
     values: np.ndarray
     notice: str = ""
     alpha: np.ndarray | None = None
     labelled_xyz: bool = False
-    opacity: np.ndarray | None = None
+    premultiplied: bool = False
 
 
 def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tuple[int, ...] = (1, 3, 4)) -> Picture:
@@ -179,7 +179,7 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
     if not linearised:
         labelled = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.XYZ, mi.Bitmap.PixelFormat.XYZA)
         opacity = _opacity(stored[..., -1]) if bitmap.has_alpha() and not encoded else None
-        return Picture(values, labelled_xyz=labelled, opacity=opacity)
+        return Picture(values, alpha=opacity, labelled_xyz=labelled, premultiplied=opacity is not None)
     coverage = _coverage(stored[..., -1]) if transparent and alpha else None
     note = f", its alpha {'left out' if coverage is None else 'taken as mask'}" if transparent else ""
     return Picture(values, f"{bits}-bit sRGB, linearised{note}", coverage)
@@ -232,7 +232,8 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
         )
     opacity = _opacity(array[..., -1]) if array.shape[2] in (2, 4) else None
     with np.errstate(over="ignore"):
-        return Picture(np.ascontiguousarray(values, dtype=np.float32), opacity=opacity)
+        values = np.ascontiguousarray(values, dtype=np.float32)
+    return Picture(values, alpha=opacity, premultiplied=opacity is not None)
 
 
 def _check_finite(values: np.ndarray) -> None:

@@ -11,7 +11,7 @@ import pydantic
 from pydantic import BaseModel, ConfigDict
 
 from unrender.core import registry, tables
-from unrender.core.errors import InputError
+from unrender.core.errors import InputError, UnknownOptionError
 from unrender.core.text import did_you_mean, grouped
 from unrender.estimators.base import Estimator
 from unrender.methods.plan import Plan
@@ -72,9 +72,8 @@ class Method:
                 others = ", ".join(other for other in methods() if name in method(other).options.model_fields)
                 if others:
                     hint += f"; --method {others} {'have' if ',' in others else 'has'} it"
-                elif not near:
-                    hint += "; -p sets options of a gallery problem"
-                raise InputError(f"method {self.name} has no option {name}{hint}")
+                kind = InputError if others else UnknownOptionError
+                raise kind(f"method {self.name} has no option {name}{hint}")
         none = {name: None for name, value in settings.items() if isinstance(value, str) and value.lower() == "none"}
         try:
             options = self.options.model_validate({**settings, **none})

@@ -14,6 +14,7 @@ from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.sample_groups import PIXELS
+from unrender.images.base import needs_full_views
 from unrender.own_loop.options import Options
 from unrender.pixels.base import MiniBatch
 from unrender.rendering.renderer import RenderSession, SampleRequest, Space
@@ -179,7 +180,7 @@ class Stream:
         """
         options, state, problem = self._options, self.state, self.problem
         batch, pixels = MiniBatch(None), state.pixels
-        if not options.all_pixels and not options.image.needs_full_views(parameters, state.image, state.batches):
+        if not options.all_pixels and not needs_full_views(options.image, parameters, state.image, state.batches):
             batch, pixels = options.pixels.draw(problem, parameters, state.pixels, key.fold(PIXELS))
         frames = full_views(problem) if batch.sample is None else [PixelBatch(problem, batch.sample)]
         records, images, contributions = [], [], []

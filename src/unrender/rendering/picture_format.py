@@ -21,11 +21,13 @@ class PictureFormat:
         signed: whether pixels may be negative, because of negative lobes of the filter, colours of spectra outside sRGB, or
             because the images are not radiance.
         aov: property of the first surface in place of radiance, one of `AOVS`; "" for radiance.
+        stores_alpha: whether the film stores alpha, which images of the renderer do not have.
     """
 
     colour: Literal["rgb", "luminance", "xyz"] = "rgb"
     signed: bool = False
     aov: str = ""
+    stores_alpha: bool = False
 
 
 @runtime_checkable

@@ -44,7 +44,7 @@ class ParameterInfo:
         welded: whether the values are vertex positions, shared by vertices at the same position.
         resizable: whether it may be rendered at resolutions other than its own, (H, W, C) or (Z, Y, X, C).
         conversion: conversion of a file's values when the renderer loads such a parameter.
-        role: meaning of the values: numbers, normals or directions. The errors of the last two are angles.
+        role: meaning of the values: numbers, heights, normals or directions. The errors of the last two are angles.
         brightness: quantity that the picture is proportional to: "light" of an emitter, "reflectance" of a surface; else "".
         nonlinear: whether it changes the form of the picture, not its brightness: positions, lenses, skies, indices of refraction.
         shapes_bsdf: whether it changes the form of a BSDF, such as a roughness, and not its colour.

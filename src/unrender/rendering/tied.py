@@ -28,6 +28,9 @@ from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
 __all__ = ["Tie", "TiedRenderer", "with_ties"]
 
+_ENCODED = ("normal", "direction")
+"""Roles whose values represent vectors. Heights are numbers."""
+
 
 @dataclass(frozen=True)
 class Tie:
@@ -70,7 +73,8 @@ class Tie:
                 raise KeyedError(
                     self.key, f"{member} has the shape {info.shape}, {first} {infos[0].shape}; expected equal shapes"
                 )
-            if info.conversion != infos[0].conversion or info.role != infos[0].role:
+            encodings = {one.role if one.role in _ENCODED else "value" for one in (info, infos[0])}
+            if info.conversion != infos[0].conversion or len(encodings) > 1:
                 raise KeyedError(
                     self.key, f"{member} and {first} read their values differently; expected parameters of one kind"
                 )

@@ -1,4 +1,4 @@
-"""New images of earlier steps of a run: does it no longer improve, or has it not ended?"""
+"""New images of earlier steps of a run: does it no longer improve, or has it not converged?"""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _OF_PICTURE = 0.02
 _EARLIER_SHORT, _STILL_SHORT, _SURE, _OF_PICTURE_SHORT = 0.5, 0.9, 2.0, 0.05
 """The same limits as above for runs whose earlier image is of a step before 64: fraction of the steps; ratio of the losses, with the number
 of standard errors by which it must be exceeded; smallest size of the residual relative to the image."""
-_FALLS, _UNFINISHED = 0.8, 0.1
-"""Ratio of the last loss to the earlier one below which a run has not ended, and smallest difference relative to the image."""
+_FALLS, _OF_PICTURE_FALLING = 0.8, 0.1
+"""Ratio of the last loss to the earlier one below which a run has not converged, and smallest difference relative to the image."""
 
 
 @dataclass(frozen=True)
@@ -67,21 +67,19 @@ class EarlierImage:
         return cls(step, *picture.loss, pictures.differences(picture.images))
 
 
-def unfinished(last: EarlierImage, earlier: EarlierImage, steps: int, pictures: FreshPictures) -> list[str]:
+def not_converged(last: EarlierImage, earlier: EarlierImage, pictures: FreshPictures) -> list[str]:
     """Return a warning if the loss still falls, and the image differs from the references by a tenth beyond noise.
 
     Args:
-        last, earlier: images of the end and of the earlier step, with the same random numbers.
-        steps: number of steps of the run.
+        last, earlier: images of the last and of an earlier step, with the same random numbers. Averages over steps would lower the loss
+            without progress, so neither is of averages.
         pictures: renderer of both images.
     """
     noise = math.hypot(last.loss_error, _FALLS * earlier.loss_error)
     if not last.loss + _SURE * noise < _FALLS * earlier.loss:
         return []
-    difference = misfit(last.residuals, last.residuals, pictures.references, pictures.weights, _UNFINISHED)
+    difference = misfit(last.residuals, last.residuals, pictures.references, pictures.weights, _OF_PICTURE_FALLING)
     if difference is None:
         return []
-    fallen = f"its loss has fallen by {1 - last.loss / earlier.loss:.0%} since step {earlier.step} of {steps}"
-    return [
-        f"{difference.describe()}, and still improves: {fallen}, so the run has not ended; give it more steps or seconds"
-    ]
+    fallen = f"its loss has fallen by {1 - last.loss / earlier.loss:.0%} since step {earlier.step} of {last.step}"
+    return [f"{difference.describe()}, and the run has not converged: {fallen}; give it more steps or seconds"]

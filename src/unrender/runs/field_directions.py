@@ -29,7 +29,7 @@ _SHRINKS = 0.9
 """Ratio of a number's squared remainder to that of the round before, up to which there is another round."""
 _RIDGE = 0.3
 """Sensitivity relative to the median below which cells hardly take part."""
-_LATE, _UNRESOLVED = "no time was left; use more seconds", "their shares in the pictures are not resolved"
+_LATE, _UNRESOLVED = "no time was left; use more seconds", "whose share in the pictures is not resolved"
 """Reasons of a missing standard error: the directions found so far do not contain all that trades off against a number."""
 
 
@@ -46,18 +46,18 @@ def fields_of(numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> tupl
         if key in numbers.keys or not (info.sensor is None or info.sensor in sensors):
             continue
         if info.welded:
-            fixed[key] = "a mesh"
+            fixed[key] = "which is a mesh"
         elif seen is not None and not seen.any():
             continue
         elif problem.unknowns[key].prior is not None:
-            fixed[key] = "it has a prior"
+            fixed[key] = "which has a prior"
         elif seen is None or not info.perturbable:
-            fixed[key] = "it has no derivative"
+            fixed[key] = "which has no derivative"
         else:
             moved.append(key)
     states = 2 * _ROUNDS * (1 + numbers.count) + 2 * len(moved)
     if states * sum(sensitivities[key].size for key in moved) > _MOST_VALUES:
-        return (), fixed | dict.fromkeys(moved, "it is too large")
+        return (), fixed | dict.fromkeys(moved, "which is too large")
     return tuple(moved), fixed
 
 

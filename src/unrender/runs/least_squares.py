@@ -40,10 +40,9 @@ _WEAKEST = 1e-4
 """Smallest eigenvalue, relative to the largest, that the length of a direction follows."""
 _REPEATS = 8
 """Most repeats of the pictures that are judged."""
-_FLAT = 0.1
-"""Change of the pictures relative to that of a shift by `_SHIFT` below which the longest difference leaves a number undetermined."""
-_COMPARABLE = 0.3
-"""Noise of the references relative to that of this check from which a change that the check does not see is undetermined."""
+_FLAT, _COMPARABLE = 0.1, 0.3
+"""Change of the pictures relative to that of a shift by `_SHIFT` below which the longest difference leaves a number undetermined;
+noise of the references relative to that of this check from which a change that the check does not see is undetermined."""
 _CHANNELS = 3.0
 """Channels that share their noise."""
 _ERRORS = 3.0
@@ -100,7 +99,8 @@ class NumbersCheck:
         if not self.fixed:
             return [f"whether {listed(keys)} converged: no time was left to test it; use more seconds or fewer pixels"]
         others = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
-        return [f"standard errors of {listed(keys)}: they are recovered together with {others}"]
+        have = "has no standard error: it is" if len(keys) == 1 else "have no standard errors: they are"
+        return [f"{listed(keys)} {have} recovered together with {others}"]
 
     def standard_errors(
         self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] = MappingProxyType({})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -34,6 +34,9 @@ relative to the image in this case."""
 _FEW_NUMBERS, _OF_PICTURE = 24, 0.01
 """Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image."""
 
+_OF_TRUTH = 4.0
+"""Smallest mean square of a residual judged pixel by pixel, relative to that at the true values, if these are known."""
+
 
 @dataclass(frozen=True)
 class Misfit:
@@ -43,13 +46,21 @@ class Misfit:
         error: its root mean square.
         size: root mean square of the references.
         noise: root mean square of the rest of the first picture's difference.
-        by_pixel: whether pixels were judged one by one, so that the references' noise counts.
+        by_pixel: whether pixels were judged one by one, so that the references' noise may be part of the difference.
     """
 
     error: float
     size: float
     noise: float
     by_pixel: bool = False
+
+    def is_references_noise(self, at_truth: Callable[[], float] | None) -> bool:
+        """Return whether the references' noise may explain a difference that was judged pixel by pixel.
+
+        Args:
+            at_truth: function that returns the mean square difference of pictures of the true values; None if these are unknown.
+        """
+        return self.by_pixel and at_truth is not None and self.error**2 <= _OF_TRUTH * at_truth()
 
     def describe(self) -> str:
         """Return the first words of a warning, with the ratio to the noise where it is above 1."""
@@ -86,10 +97,10 @@ def misfit(
         return None
     size, total = (math.sqrt(paired_losses.mean_square(x, weights)) for x in (references, one))
 
-    def significant(shared: paired_losses.SystematicDifference, smallest: float, by_pixel: bool) -> Misfit | None:
+    def significant(shared: paired_losses.SystematicDifference, smallest: float, one_by_one: bool) -> Misfit | None:
         error = math.sqrt(max(shared.mean_square, 0.0))
         beyond = shared.score > paired_losses.SIGNIFICANT and error > smallest * size
-        return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), by_pixel) if beyond else None
+        return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), one_by_one) if beyond else None
 
     difference = significant(paired_losses.systematic(one, weights, other), least, False)
     if difference or fresh is None or not (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
@@ -104,6 +115,7 @@ def misfit_of_numbers(
     weights: np.ndarray,
     known: Sequence[str] = (),
     improved: bool = True,
+    at_truth: Callable[[], float] | None = None,
 ) -> str:
     """Return a warning if only few numbers are unknown and the images differ from the references; else "".
 
@@ -117,6 +129,7 @@ def misfit_of_numbers(
         weights: weight of each pixel, (N,), in [0, 1].
         known: warnings of the run; one that says so already is returned.
         improved: whether the images are better than at the start.
+        at_truth: see `Misfit.is_references_noise`.
     """
     elements = sum(math.prod(shape) for shape in problem.shapes().values())
     if elements > _FEW_NUMBERS or len(residuals) < 2:
@@ -126,10 +139,15 @@ def misfit_of_numbers(
     one, other = residuals[0::2], residuals[1::2]
     fresh = None if improved or len(residuals) < 4 else other
     difference = misfit(one, other, references, weights, _OF_PICTURE, fresh, by_pixel=True)
-    if difference is None:
+    if difference is None or difference.is_references_noise(at_truth):
         return ""
+    noise = (
+        "this picture's noise does not explain: the references are noisy, or"
+        if difference.by_pixel
+        else "noise does not explain:"
+    )
     return (
-        f"{difference.describe()}, which noise does not explain: the run needs more steps, another start or bounds (auto compares starts "
+        f"{difference.describe()}, which {noise} the run needs more steps, another start or bounds (auto compares starts "
         "within them), or something that is not among the unknowns is wrong"
     )
 

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
-from unrender.runs.earlier_image import FIRST_CANDIDATE, EarlierImage, unfinished
+from unrender.runs.earlier_image import FIRST_CANDIDATE, EarlierImage, not_converged
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.number_means import averaged
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
@@ -45,8 +46,6 @@ _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
 _OF_RESIDUAL, _OF_PICTURE = 0.1, 0.02
 """Smallest error of a control variate, as a fraction of the mean square residual, and relative to the image."""
-_OF_TRUTH = 4.0
-"""Smallest mean square of a residual judged pixel by pixel, relative to that at the true values, if these are known."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
 _FIRST_EARLIER, _COST = 4, 0.02
@@ -130,6 +129,7 @@ class Verify(Callback):
 
     def _verified(self, run: Run, result: Result) -> Result:
         problem = run.problem
+        unaveraged = result.parameters
         pictures, first, result, last, worse = _ends(run, result)
         places: dict[str, tuple[Picture, Mapping[str, np.ndarray]]] = {}
         if worse and problem.remeshed_from is None:
@@ -143,15 +143,17 @@ class Verify(Callback):
         memory = _memory(run, pictures, last)
         disagrees = memory is not None and memory.disagrees
         best_picture = places[best][0] if places else last
-        lines = self._residual(problem, result, pictures, last)
+        lines = self._residual(problem, result, unaveraged, pictures, last)
         if result.standard_error and not (lines or places):
             differences = pictures.differences(last.images)
             improved = _is_worse(pictures, last, first)
-            differs = misfit_of_numbers(problem, differences, pictures.references, pictures.weights, improved=improved)
+            arguments = problem, differences, pictures.references, pictures.weights
+            at_truth = partial(_at_truth, problem, pictures, result) if problem.has_truth else None
+            differs = misfit_of_numbers(*arguments, improved=improved, at_truth=at_truth)
             lines = [differs] if differs else []
         if lines:
             result = replace(result, standard_error={})
-        # A Gauss-Newton step solves for all unknowns, so a run of few steps is no unfinished one.
+        # A Gauss-Newton step solves for all unknowns, so few of them may converge.
         few = result.steps < (FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else FEW_STEPS)
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
@@ -175,12 +177,20 @@ class Verify(Callback):
             warnings=[*result.warnings, *lines],
         )
 
-    def _residual(self, problem: Problem, result: Result, pictures: FreshPictures, end: Picture) -> list[str]:
-        """Return a warning if the images differ from the references by more than noise, and no longer improve or improve fast.
+    def _residual(
+        self,
+        problem: Problem,
+        result: Result,
+        unaveraged: Mapping[str, np.ndarray],
+        pictures: FreshPictures,
+        end: Picture,
+    ) -> list[str]:
+        """Return a warning if the images differ from the references by more than noise, and the loss stays or still falls fast.
 
         Args:
             problem: problem of the run.
             result: result of the run.
+            unaveraged: parameters of the last step, as the images of earlier steps have them.
             pictures: renderer of the last image, with random numbers independent of those of earlier steps.
             end: the last image.
         """
@@ -189,15 +199,15 @@ class Verify(Callback):
             return []
         last = EarlierImage.of(result.steps, self._pictures, result.parameters)
         if not last.is_still(earlier):
-            return unfinished(last, earlier, result.steps, self._pictures)
+            if unaveraged is not result.parameters:
+                last = EarlierImage.of(result.steps, self._pictures, unaveraged)
+            return not_converged(last, earlier, self._pictures)
         references, weights = self._pictures.references, self._pictures.weights
         sampled = pictures.sampled or self._pictures.sampled  # each has other pixels then
         fresh = None if sampled else pictures.differences(end.images)
         difference = misfit(last.residuals, earlier.residuals, references, weights, earlier.least, fresh)
-        if difference is None:
-            return []
-        compares_truth = difference.by_pixel and problem.has_truth
-        if compares_truth and difference.error**2 <= _OF_TRUTH * _at_truth(problem, self._pictures, result):
+        at_truth = partial(_at_truth, problem, self._pictures, result) if problem.has_truth else None
+        if difference is None or difference.is_references_noise(at_truth):
             return []
         cause = "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
         if any(unknown.prior is not None for unknown in problem.unknowns.values()):

@@ -50,12 +50,14 @@ class Reference:
         alpha: (H, W) in [0, 1] for an 8- or 16-bit image with alpha; else None.
         limited: whether values are clipped at white.
         notices: one line for each conversion.
+        loses_alpha: whether the source has alpha that becomes no mask, and the film stores none.
     """
 
     values: np.ndarray
     alpha: np.ndarray | None
     limited: bool
     notices: tuple[str, ...]
+    loses_alpha: bool = False
 
 
 def read_reference(source: Any, form: PictureFormat) -> Reference:
@@ -99,12 +101,12 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
         notices.append("has one channel, with which red, green and blue of the image are each compared")
     elif grey:
         notices.append("is luminance, with which the image's luminance is compared")
-    if image.opacity is not None:
-        notices.append("has alpha, which is left out; if it is a mask, give it as the view's mask")
     if isinstance(source, (str, Path)) and not values.any():  # arrays of zeros are placeholders
-        notices.append("is black everywhere, so it can only darken what it sees")
+        notices.append("is 0 at every pixel; check the file, or leave the view out")
     full = np.array(np.broadcast_to(values, (*values.shape[:2], 3)))
-    return Reference(full, image.alpha, bool(image.notice), tuple(notices))
+    loses_alpha = image.premultiplied and not form.stores_alpha
+    alpha = None if image.premultiplied else image.alpha
+    return Reference(full, alpha, bool(image.notice), tuple(notices), loses_alpha)
 
 
 def _of_aov(source: Any, name: str) -> Reference:
@@ -128,7 +130,8 @@ def _of_aov(source: Any, name: str) -> Reference:
     if name == "depth":
         _check_not_negative(values)
     full = np.array(np.broadcast_to(values, (*values.shape[:2], 3)))
-    return Reference(full, image.alpha if name == "albedo" else None, False, tuple(notices))
+    alpha = image.alpha if name == "albedo" and not image.premultiplied else None
+    return Reference(full, alpha, False, tuple(notices))
 
 
 def _is_of_film(source: Any) -> bool:
@@ -160,13 +163,17 @@ def check_views(views: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[
         renderer: renderer whose films give sizes and formats.
         loss: loss; one that handles saturated pixels needs no notice of them.
     """
-    checked, notices, resolutions = [], [], renderer.resolutions()
+    checked, notices, losing, resolutions = [], [], list[int](), renderer.resolutions()
     known = [v.sensor for v in views if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
     store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
     for number, one in enumerate(views):
-        view, notes = _check_view(number, one, resolutions, renderer, not isinstance(loss, Censored))
+        view, notes, loses_alpha = _check_view(number, one, resolutions, renderer, not isinstance(loss, Censored))
         checked.append(view if store is None else _stored(view, store))
         notices += notes
+        losing += [number] if loses_alpha else []
+    if losing:
+        have = f"view {losing[0]}: reference has" if len(losing) == 1 else f"references of {len(losing)} views have"
+        notices.append(f"{have} alpha, which is left out; if it is a mask, give it as the view's mask")
     return tuple(checked), notices
 
 
@@ -190,8 +197,10 @@ def check_sensor(index: int, view: View, count: int) -> None:
 
 def _check_view(
     index: int, view: View, resolutions: Sequence[tuple[int, int]], films: Renderer, tell_saturated: bool
-) -> tuple[View, list[str]]:
-    """Return the view with reference (H, W, 3) and mask (H, W) as float32 arrays, and notices. Raises `FieldError` for an invalid field.
+) -> tuple[View, list[str], bool]:
+    """Return the view with reference (H, W, 3) and mask (H, W) as float32 arrays, notices, and `Reference.loses_alpha`.
+
+    Raises `FieldError` for an invalid field.
 
     Args:
         index: index of the view in the problem, for messages.
@@ -210,14 +219,14 @@ def _check_view(
         raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
     height, width = resolutions[view.sensor]
     notices: list[str] = []
-    limited, alpha = None, None  # the reference, if it is clipped at white; its alpha
+    limited, alpha, loses_alpha = None, None, False  # the reference, if it is clipped at white; its alpha
     try:
         if isinstance(view.reference, StoredPicture):
             _check_size(view.reference, height, width, view.sensor)
             reference = view.reference
         else:
             read = read_reference(view.reference, format_of(films, view.sensor))
-            reference, alpha = read.values, read.alpha
+            reference, alpha, loses_alpha = read.values, read.alpha, read.loses_alpha
             _check_size(reference, height, width, view.sensor)
             notices += [f"{owner}: reference {notice}" for notice in read.notices]
             limited = reference if read.limited else None
@@ -245,7 +254,7 @@ def _check_view(
         notices.append(
             f"{owner}: {white:.1%} of the reference's pixels are saturated; the loss Censored treats them as lower bounds"
         )
-    return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices
+    return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices, loses_alpha
 
 
 def _saturated(reference: np.ndarray, counted: np.ndarray | None) -> float:

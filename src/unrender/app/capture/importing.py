@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -250,12 +250,13 @@ def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
     capture = _capture(folder, options)
     with phases.phase("photographs") as advance:
         views, notices = prepare(
-            replace(capture, photographs=tuple(replace(one, mask=None) for one in capture.photographs)),
+            capture,
             options.resolution,
             options.scale,
             options.hold_out,
             lambda done, count: advance(done / count),
             options.response,
+            masks=False,
         )
     name = folder.resolve().name
     _write_folder(out, lambda place: field_folder.write(place, name, views, voxels, chosen))

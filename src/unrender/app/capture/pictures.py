@@ -35,8 +35,6 @@ _QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 3}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 """{EXIF orientation: counter-clockwise quarter turns}; orientations 2, 4, 5 and 7 are also mirrored."""
 _MIRRORED = (2, 4, 5, 7)
-_LEAST_ALPHA = 1e-3
-"""Least alpha by which colours of floating-point files, which are multiplied with alpha, are divided."""
 _LONGEST_SIDE = 1 << 15
 """Exclusive limit of a side in pixels, set by OpenCV's `remap`."""
 _BROKEN = (OSError, ValueError, SyntaxError, struct.error, Image.DecompressionBombError)
@@ -49,11 +47,13 @@ class Pixels:
 
     Attributes:
         values: (H, W, 3) float32, linear.
-        alpha: (H, W) float32 in [0, 1]; None if the file has none, or if it is 1 everywhere. `values` are not multiplied with it.
+        alpha: (H, W) float32 in [0, 1]; None if the file has none, or if it is 1 everywhere.
+        premultiplied: whether `values` are multiplied with `alpha`.
     """
 
     values: np.ndarray
     alpha: np.ndarray | None
+    premultiplied: bool = False
 
 
 def _stored_size(path: Path) -> tuple[int, int, int]:
@@ -98,7 +98,7 @@ def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
     if array is None:
         picture = _by_mitsuba(path)
         alpha = None if picture.alpha is None else _turn(picture.alpha, orientation)
-        return Pixels(_turn(picture.values, orientation), alpha)
+        return Pixels(_turn(picture.values, orientation), alpha, picture.premultiplied)
     array = _turn(array, orientation)
     largest = np.iinfo(array.dtype).max
     curve = decode(np.arange(largest + 1) / largest, response).astype(np.float32)
@@ -119,8 +119,8 @@ def read_mask(path: Path, orientation: int = 1) -> np.ndarray:
     picture = images.read(path, linearise=False)
     return (
         np.clip(_turn(picture.values, orientation).mean(2), 0, 1)
-        if picture.opacity is None
-        else _turn(picture.opacity, orientation)
+        if picture.alpha is None
+        else _turn(picture.alpha, orientation)
     )
 
 
@@ -231,11 +231,9 @@ def _decode_opencv(path: Path, header: image_size.Header) -> np.ndarray:
 
 def _by_mitsuba(path: Path) -> Pixels:
     picture = images.read(path)
-    values, alpha = picture.values, picture.opacity
+    values = picture.values
     _check_size(path, values.shape[1], values.shape[0])
-    if alpha is not None:
-        values = values / np.maximum(alpha, _LEAST_ALPHA)[..., None]
-    return Pixels(np.repeat(values, 3, 2) if values.shape[2] == 1 else values, alpha)
+    return Pixels(np.repeat(values, 3, 2) if values.shape[2] == 1 else values, picture.alpha, picture.premultiplied)
 
 
 def _check_size(path: Path, width: int, height: int) -> None:

@@ -17,6 +17,8 @@ from unrender.core.text import printable
 
 _EMPTY = 1e-4
 _FULL_BORDER = 0.5
+_LEAST_ALPHA = 1e-3
+"""Alpha above which premultiplied colours are divided by it. It is less than half a level of the written masks; other colours become 0."""
 
 
 def prepare(
@@ -26,6 +28,7 @@ def prepare(
     hold_out: int | None,
     progress: Callable[[int, int], None] = lambda done, count: None,
     response: str = pictures.SRGB,
+    masks: bool = True,
 ) -> tuple[StoredViews, list[str]]:
     """Read, undistort and check all photographs, one by one. Results of the chosen resolution are stored in a temporary file.
 
@@ -36,6 +39,7 @@ def prepare(
         hold_out: interval of held-out photographs, beginning with the first; 0 for none; None for the capture's own split, or 8.
         progress: function of the number of processed photographs and their total.
         response: response of files of 8 or 16 bits, see `pictures.decode`.
+        masks: whether views have masks, from files or alpha. Without masks, colours that are multiplied with alpha stay so.
 
     Returns:
         The views in the capture's order, and notices.
@@ -50,7 +54,7 @@ def prepare(
     views, looks = StoredViews(), []
     turned: list[str] = []
     for index, photograph in enumerate(capture.photographs):
-        view, was_turned = _view(photograph, resolution, scale, held_out[index], response)
+        view, was_turned = _view(photograph, resolution, scale, held_out[index], response, masks)
         views.append(view)
         looks += [] if view.mask is None else [_Mask.of(view.name, view.mask)]
         turned += [photograph.name] if was_turned else []
@@ -78,7 +82,7 @@ def _split(photographs: Sequence[Photograph], every: int | None) -> list[bool]:
 
 
 def _view(
-    photograph: Photograph, resolution: int, scale: float | None, held_out: bool, response: str
+    photograph: Photograph, resolution: int, scale: float | None, held_out: bool, response: str, masks: bool
 ) -> tuple[CapturedView, bool]:
     width, height, orientation = pictures.upright(photograph.file, photograph.lens)
     try:
@@ -93,10 +97,12 @@ def _view(
         raise InputError(f"{photograph.file}: holds {have} pixels where its header says {width} x {height}")
     values, shown = Resampling(lens, target).apply(read.values)
     mask = None
-    if photograph.mask is not None:
+    if masks and photograph.mask is not None:
         mask = _mask(photograph, lens, target, orientation)
-    elif read.alpha is not None:
+    elif masks and read.alpha is not None:
         mask = Resampling(lens, target).apply(read.alpha[..., None])[0][..., 0]
+        if read.premultiplied:
+            values = np.divide(values, mask[..., None], out=np.zeros_like(values), where=mask[..., None] > _LEAST_ALPHA)
     view = CapturedView(photograph.name, target, photograph.camera_to_world, values, mask, shown, held_out)
     return view, orientation != 1
 

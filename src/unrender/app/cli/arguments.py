@@ -200,7 +200,10 @@ def check_file(name: str) -> None:
 
 
 def check_problem(name: str, options: Mapping[str, str], cached: bool = True) -> None:
-    """Raise `InputError` if `open_problem` would fail for reasons that can be checked without Mitsuba."""
+    """Raise `InputError` if `open_problem` would fail for reasons that can be checked without Mitsuba, or --no-cache has no effect.
+
+    `cached` is False if --no-cache was typed.
+    """
     from unrender import gallery
 
     if name not in gallery.names() and Path(name).is_dir():
@@ -256,7 +259,7 @@ def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> 
         from unrender import gallery
         from unrender.scene.problem import Problem
 
-        check_problem(name, options, cached)
+        check_problem(name, options)
         if _is_file(name):
             return Problem.from_file(name)
         made = gallery.problem(name, **{key: literal(value) for key, value in options.items()})

@@ -19,7 +19,7 @@ from unrender.app.cli import memory
 from unrender.app.cli.signals import ENVIRONMENT, INPUT, INTERRUPTED, TERMINATED, WORDS, Signals
 from unrender.backend import limits, variant
 from unrender.core.checks import encode_text
-from unrender.core.errors import UnrenderError, VariantError
+from unrender.core.errors import UnknownOptionError, UnrenderError, VariantError
 from unrender.core.text import one_line
 
 
@@ -90,6 +90,8 @@ def _status_of(error: BaseException, signals: Signals) -> int | None:
         case UnrenderError():
             if limits.address_space() and memory.says_so(error):
                 return _out_of_memory(f"{error}: ")
+            if isinstance(error, UnknownOptionError):
+                return _complain(f"{error}".rstrip("?") + "; -p sets options of a gallery problem", INPUT)
             return _complain(str(error), ENVIRONMENT if isinstance(error, VariantError) else INPUT)
         case typer.Exit():
             return error.exit_code

@@ -80,7 +80,9 @@ def refuse_settings(
     """Raise `InputError` for command-line options that belong in a file of stages, or that stages do not support."""
     refuse_workers(workers)
     refused = [f"--set {name}" for name in settings] + [f"--problem-set {name}" for name in options]
-    refused += ["--method"] * (method != "auto") + ["--no-cache"] * no_cache
+    refused += ["--method"] * (method != "auto")
+    if no_cache:
+        raise InputError("--no-cache: not supported with stages; leave it out")
     if refused:
         raise InputError(f"{refused[0]}: not supported with stages; set it in the file of stages")
 

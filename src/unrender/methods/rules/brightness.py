@@ -69,8 +69,11 @@ def _least_squares(problem: Problem, keys: Sequence[str]) -> tuple[dict[str, flo
         own = problem.views[view]
         weight = own.weight * own.pixel_weights(problem.sizes[view]).reshape(*problem.sizes[view], 1)
         halves = [np.stack([render(problem, x, view, spp, seed) for x in states]).astype(np.float64) for seed in _SEEDS]
+        reference = np.asarray(own.reference)
+        finite = np.asarray(np.isfinite(np.stack(halves)).all(axis=(0, 1, -1)))[..., None]
+        halves = [np.where(finite, images, reference) for images in halves]  # neither residual nor light in the others
         means[view] = (halves[0] + halves[1]) / 2.0
-        residuals = [np.asarray(own.reference) - images[0] for images in halves]
+        residuals = [reference - images[0] for images in halves]
         parts = normal_equations([images[1:] - images[0] for images in halves], residuals, weight)
         matrix, vector = matrix + parts[0], vector + parts[1]
         squares += float((residuals[0] * residuals[1] * weight).sum())

@@ -21,7 +21,7 @@ from unrender.statistics.paired_losses import difference, mean_and_error
 __all__ = ["best_start"]
 
 _PER_DIMENSION, _MOST_PLACES = 16, 24
-"""Number of compared places per dimension, and its maximum."""
+"""Number of compared places per dimension, and maximum number in all dimensions together."""
 _PATHS, _NUMBER = 1 << 15, 3
 """Paths of one picture, and index of their random numbers."""
 _BETTER, _ERRORS = 0.5, 4.0

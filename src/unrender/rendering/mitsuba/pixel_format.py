@@ -30,10 +30,11 @@ def formats(sensors: Sequence[Any]) -> list[PictureFormat]:
     result = []
     for sensor in sensors:
         match = re.search(r"pixel_format = (\w+)", str(sensor.film()))
-        colour = _COLOURS.get(match[1] if match else "", "rgb")
+        name = match[1] if match else ""
+        colour, stores_alpha = _COLOURS.get(name, "rgb"), name in ("rgba", "xyza", "ya")
         # Colours of some spectra are outside sRGB, and so are samples of few wavelengths.
         signed = has_negative_lobes(sensor.film()) or is_spectral()
-        result.append(PictureFormat(colour, signed))  # pyright: ignore[reportArgumentType]
+        result.append(PictureFormat(colour, signed, stores_alpha=stores_alpha))  # pyright: ignore[reportArgumentType]
     if len({form.colour == "luminance" for form in result}) > 1:
         raise InputError("some films have the pixel_format luminance and others store colour; give all films the same")
     return result
