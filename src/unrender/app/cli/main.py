@@ -91,7 +91,7 @@ def _status_of(error: BaseException, signals: Signals) -> int | None:
             if limits.address_space() and memory.says_so(error):
                 return _out_of_memory(f"{error}: ")
             if isinstance(error, UnknownOptionError):
-                return _complain(f"{error}".rstrip("?") + "; -p sets options of a gallery problem", INPUT)
+                return _complain(f"{error} (-p sets options of a gallery problem)", INPUT)
             return _complain(str(error), ENVIRONMENT if isinstance(error, VariantError) else INPUT)
         case typer.Exit():
             return error.exit_code
