@@ -85,10 +85,9 @@ def test_a_record_of_races_at_equal_steps_alone_has_a_table_and_a_figure() -> No
     record = records.read(benchmark.folder)
     assert record is not None
     del record["entries"]
-    rows = benchmark.table(record).splitlines()
-    assert sum("denoised by oidn" in row for row in rows) == 2
-    assert sum("denoised by variation" in row for row in rows) == 2
-    assert sum("denoised" in row for row in rows) == 4
+    rows = [row for row in benchmark.table(record).splitlines() if "denoised" in row]
+    assert len(rows) == 6
+    assert all("denoised by oidn" in row for row in rows)
     assert benchmark.plot is not None
     assert len(benchmark.plot(record).axes) == len(record["equal steps"])
 

@@ -9,7 +9,8 @@ with the Hessian of the whole, network and black box; OurJoint, the same with gr
 renders. Newton-CG is in Adam's metric: of weights over the fourth root of 1 / v, v the mean square of the gradient.
 Rates, radii and σ fall over a run. FR22 is OurG with the product of gradient kernels; for one output they are the
 same. CMA-ES on 268 000 weights has no chance and is left out, as is a Hessian. Error: root mean square over the
-images of the answers, relative to the first, each number over its range. Seconds are the processor's.
+images of the answers, relative to the first, each number over its range. The loss is a product of two renders, which has
+no bias by their noise. Seconds are the processor's.
 """
 
 from __future__ import annotations
