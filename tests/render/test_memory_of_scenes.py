@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
 from typing import Any
 
 import drjit as dr
@@ -12,7 +10,6 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from garbage import freeze_without_scenes
 from unrender.core import memory
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -98,25 +95,3 @@ def test_what_a_user_gives_is_copied() -> None:
     problem = ur.Problem(scene, [ur.Parameter(KEY, initial=given)], [ur.View(np.full((6, 6, 3), 0.3, np.float32))])
     given[:] = 0.1
     assert problem.unknowns[KEY].initial.min() == pytest.approx(0.4)
-
-
-def test_scenes_that_live_when_a_file_ends_are_collected_later() -> None:
-    """In tests, which exempt modules from collections of cycles. A planted exemption of the scene, too, keeps it."""
-
-    def dropped_after(planted: bool) -> bool:
-        renderer: Any = MitsubaRenderer(scene, 2)
-        renderer.itself, parameters = renderer, weakref.ref(renderer.pair.loaded().parameters)
-        gc.collect()
-        if planted:
-            gc.freeze()
-        else:
-            assert not freeze_without_scenes()
-        del renderer
-        gc.collect()
-        return parameters() is None
-
-    assert dropped_after(planted=False)
-    assert not dropped_after(planted=True)
-    gc.unfreeze()
-    gc.collect()
-    freeze_without_scenes()
