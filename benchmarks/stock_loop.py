@@ -28,6 +28,17 @@ def step_seed(seed: int, step: int, view: int) -> int:
     return (seed * 1_000_003 + step * 64 + view) * 2 % 2**31
 
 
+def _view_loss(
+    problem: ur.Problem, view: int, sensor: Any, scene: Any, parameters: Any, integrator: Any, number: int, spp: int
+) -> Any:
+    """The loss of a view by `mi.render`, with the seeds `number` and the next one; 0 samples are the integrator's own."""
+    options = {"sensor": sensor, "integrator": integrator, "spp": spp, "seed": number, "seed_grad": number + 1}
+    image = mi.render(scene, parameters, **options)
+    if problem.original_views[view].aov == "depth":
+        image = image[..., :1] + dr.zeros(mi.TensorXf, (*image.shape[:2], 3))
+    return problem.loss_value(view, image)
+
+
 def backward(
     problem: ur.Problem,
     scene: Any,
@@ -36,14 +47,12 @@ def backward(
     seed: int,
     step: int,
     views: Iterable[int],
-    spp: int = 0,
 ) -> Any:
-    """Render views by `mi.render`, sum their losses, and call `dr.backward`. Return the sum; 0 samples are the integrator's own."""
+    """Render views with the integrator's own samples, sum their losses, and call `dr.backward`. Return the sum."""
     loss: Any = 0.0
     for view in views:
         sensor, number = problem.views[view].sensor, step_seed(seed, step, view)
-        options = {"sensor": sensor, "integrator": integrator, "spp": spp, "seed": number, "seed_grad": number + 1}
-        loss += problem.loss_value(view, mi.render(scene, parameters, **options))
+        loss += _view_loss(problem, view, sensor, scene, parameters, integrator, number, 0)
     dr.backward(loss)
     return loss
 
@@ -88,11 +97,7 @@ class StockViews:
         for view in views:
             (world, sensor, integrator), number = self._views[view], step_seed(seed, step, view)
             _, scene, parameters = self._worlds[world]
-            options = {"sensor": sensor, "integrator": integrator, "spp": spp, "seed": number, "seed_grad": number + 1}
-            image = mi.render(scene, parameters, **options)
-            if self.problem.original_views[view].aov == "depth":
-                image = image[..., :1] + dr.zeros(mi.TensorXf, (*image.shape[:2], 3))
-            loss += self.problem.loss_value(view, image)
+            loss += _view_loss(self.problem, view, sensor, scene, parameters, integrator, number, spp)
         dr.backward(loss)
         return loss
 

@@ -28,15 +28,17 @@ TRUTH = {"map": np.random.default_rng(0).uniform(0.3, 0.9, (2, 2, 1)), "pose": n
 class PosedRenderer(AnalyticRenderer):
     """One of whose parameters has no path gradient, and shares no paths."""
 
+    MOVES = "pose"
+
     def parameters(self) -> dict[str, ParameterInfo]:
         known = {"pose": ParameterInfo((2,), differentiable=False, shares_paths=False, reason="it moves", rigid=True)}
         return {**super().parameters(), **known}
 
     def prepare(self, keys: list[str], space: Any, derivatives: Any = True) -> Any:
-        if "pose" in keys and (derivatives is True or (derivatives and "pose" in derivatives)):
-            raise ur.InputError("parameter pose: no path gradient")
-        if "pose" in keys and space == "path":
-            raise ur.InputError("parameter pose: no paths shared")
+        if self.MOVES in keys and (derivatives is True or (derivatives and self.MOVES in derivatives)):
+            raise ur.InputError(f"parameter {self.MOVES}: no path gradient")
+        if self.MOVES in keys and space == "path":
+            raise ur.InputError(f"parameter {self.MOVES}: no paths shared")
         return super().prepare(keys, space, derivatives)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from test_hybrid import PosedRenderer
 
 import unrender as ur
 from unrender.core.random import Key
@@ -25,19 +26,14 @@ TRUTH = {"map": np.random.default_rng(0).uniform(0.6, 0.9, (5, 5, 1)), "lamp": n
 TEXELS = TRUTH["map"].size
 
 
-class LampRenderer(AnalyticRenderer):
+class LampRenderer(PosedRenderer):
     """A lamp without path gradients, and a reflectance."""
+
+    MOVES = "lamp"
 
     def parameters(self) -> dict[str, ParameterInfo]:
         lamp = ParameterInfo((2,), differentiable=False, shares_paths=False, reason="it moves", rigid=True, light=True)
         return {"map": ParameterInfo(TRUTH["map"].shape, brightness="reflectance"), "lamp": lamp}
-
-    def prepare(self, keys: list[str], space: Any, derivatives: Any = True) -> Any:
-        if "lamp" in keys and (derivatives is True or (derivatives and "lamp" in derivatives)):
-            raise ur.InputError("parameter lamp: no path gradient")
-        if "lamp" in keys and space == "path":
-            raise ur.InputError("parameter lamp: no paths shared")
-        return super().prepare(keys, space, derivatives)
 
 
 class LensRenderer(LampRenderer):

@@ -26,7 +26,7 @@ from unrender.estimators.coordinates import by_coordinates, restricted
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives, SmoothedState
-from unrender.estimators.variable_projection import Response, update_response
+from unrender.estimators.variable_projection import Response, can_be_eliminated, update_response
 from unrender.rendering.partial import EliminatedParameters, HeldParameters, PartialDerivatives
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene.problem import Problem
@@ -294,8 +294,7 @@ class HybridGradient:
                 raise InputError(
                     f"HybridGradient: eliminated names {name}, which is not one of the other parameters{hint}"
                 )
-            unknown = problem.unknowns[name]
-            if (unknown.transform, unknown.preconditioner, unknown.prior) != (None, None, None):
+            if not can_be_eliminated(problem.unknowns[name]):
                 raise InputError(
                     f"HybridGradient: parameter {name} has a preconditioner, parameterisation or prior; remove it from eliminated"
                 )

@@ -26,9 +26,10 @@ from unrender.core.trees import Tree
 from unrender.estimators.capabilities import DerivativeImages
 from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.scene.problem import Problem
+from unrender.scene.unknown import Unknown
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["IMAGES", "Response", "update_response"]
+__all__ = ["IMAGES", "Response", "can_be_eliminated", "update_response"]
 
 IMAGES = 3
 """Number of images that a step renders of each view."""
@@ -75,6 +76,11 @@ class Response:
         """Return a response at the finer resolution, which restarts at 0."""
         shapes = {key: np.empty(upsampler.problem.shapes(upsampler.step)[key]) for key in self.slopes}
         return Response.zero(shapes, tuple(shapes), len(next(iter(self.slopes.values()), ())))
+
+
+def can_be_eliminated(unknown: Unknown) -> bool:
+    """Return whether an unknown has no parameterisation, preconditioner or prior: S is for its own values and the loss alone."""
+    return (unknown.transform, unknown.preconditioner, unknown.prior) == (None, None, None)
 
 
 def update_response(

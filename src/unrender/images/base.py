@@ -119,9 +119,12 @@ class PairRequest:
     difference_spp: int | None = None
 
 
+_RENAMED = "ImageEstimator.needs_whole_views is now needs_full_views"
+
+
 def needs_whole_views(self: ImageEstimator, parameters: Tree, state: Any, batches: int) -> bool:
     """Former name of `needs_full_views`, as a method. Version 0.2 removes it."""
-    warnings.warn("ImageEstimator.needs_whole_views is now needs_full_views", DeprecationWarning, stacklevel=2)
+    warnings.warn(_RENAMED, DeprecationWarning, stacklevel=2)
     return self.needs_full_views(parameters, state, batches)
 
 
@@ -180,5 +183,5 @@ def needs_full_views(image: ImageEstimator, parameters: Tree, state: Any, batche
     former = getattr(image, "needs_whole_views", None)
     if former is None or getattr(type(image), "needs_full_views", None) not in inherited:
         return image.needs_full_views(parameters, state, batches)
-    warnings.warn("ImageEstimator.needs_whole_views is now needs_full_views", DeprecationWarning, stacklevel=2)
+    warnings.warn(_RENAMED, DeprecationWarning, stacklevel=2)
     return former(parameters, state, batches)

@@ -11,6 +11,9 @@ import numpy as np
 
 from unrender.app.capture.cameras import Lens
 
+INSIDE = 0.999
+"""Fraction of a pixel inside the photograph or the mask from which the whole pixel counts as inside."""
+
 
 @dataclass(frozen=True)
 class CapturedView:

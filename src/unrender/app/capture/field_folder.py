@@ -11,7 +11,7 @@ from xml.etree import ElementTree as Xml
 
 import numpy as np
 
-from unrender.app.capture.capture import CapturedView
+from unrender.app.capture.capture import INSIDE, CapturedView
 from unrender.app.capture.overlays import png
 from unrender.app.capture.problem_folder import sensor_element
 from unrender.app.capture.stored import StoredViews
@@ -56,7 +56,6 @@ _SETTINGS = {"scheme": "uniform", "pixels": _PIXELS, "spp": 4, "beta_2": 0.99, "
 """Settings of the stages: mini-batches of pixels of all photographs, and decaying rates, since the noise does not decrease. A path is
 weighted by the residual of the pixel's three other samples; with fewer samples, noise would dominate this residual."""
 _LIGHT_SIZE = 16, 32
-_INSIDE = 0.999
 
 
 def cube_of(cameras: np.ndarray) -> tuple[np.ndarray, float]:
@@ -103,7 +102,7 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
         (folder / part).mkdir()
     means, masked = [], []
     for view, stem in zip(views, stems, strict=True):
-        shown = view.shown > _INSIDE
+        shown = view.shown > INSIDE
         if not view.held_out:
             means.append(float(view.values[shown].mean()))
         write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)

@@ -11,7 +11,7 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from unrender.app.capture import unknowns
-from unrender.app.capture.capture import CapturedView, CapturedViews
+from unrender.app.capture.capture import INSIDE, CapturedView, CapturedViews
 from unrender.app.capture.mesh import Mesh, ply
 from unrender.app.capture.overlays import png
 from unrender.app.capture.silhouettes import Silhouettes
@@ -43,7 +43,6 @@ OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, stages_file.FILE, *_FOLDERS})
 """Names that `write` creates in a folder."""
 _LIGHT_SIZE = 16, 32
 _MAX_DEPTH = 3
-_INSIDE = 0.999
 _BAND_WEIGHT = 0.1
 _WHITE = 0.95
 """Minimum linear value of a saturated pixel, below 1 since resizing averages neighbours."""
@@ -131,9 +130,9 @@ def _loss_mask(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
     """Return the pixels of the loss: they and their eight neighbours are covered completely by the object, the mesh and the photograph."""
     from scipy import ndimage
 
-    inside = (view.shown > _INSIDE) & silhouettes.mask(view.lens, view.camera_to_world)
+    inside = (view.shown > INSIDE) & silhouettes.mask(view.lens, view.camera_to_world)
     if view.mask is not None:
-        inside &= view.mask > _INSIDE
+        inside &= view.mask > INSIDE
     mask_of_loss = ndimage.binary_erosion(inside, np.ones((3, 3)), border_value=1)
     mask_of_loss = mask_of_loss if mask_of_loss.any() else inside
     if not mask_of_loss.any():

@@ -14,7 +14,7 @@ from unrender.estimators.capabilities import Hessian
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient
 from unrender.estimators.path import PathGradient
-from unrender.estimators.variable_projection import IMAGES
+from unrender.estimators.variable_projection import IMAGES, can_be_eliminated
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.plan import Plan
@@ -139,7 +139,7 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     return best_start(traits, keys, made)
 
 
-def _explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float:
+def _explained(problem: Problem, estimator: GaussNewton) -> float:
     """Return the fraction of the initial loss that the quadratic model at the start predicts to remove.
 
     It is near 0 on a plateau, where no derivative image resembles the residual. Noise does not bias it: gradients and images come from
@@ -148,7 +148,7 @@ def _explained(problem: Problem, estimator: GaussNewton, seed: int = 0) -> float
     first = problem.initial()
     state, estimates, losses, images = estimator.init(problem, first), [], [], []
     for step in range(2):
-        estimate, state = estimator.estimate(problem, first, state, Key(seed, step, stream=_TRIAL))
+        estimate, state = estimator.estimate(problem, first, state, Key(0, step, stream=_TRIAL))
         estimates.append(estimate)
         losses.append(estimate.loss)
         images.append(estimate.info["images"])
@@ -176,7 +176,7 @@ def _eliminated(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str,
         for key, unknown in unknowns.items()
         if key not in keys
         and traits.infos[key].brightness
-        and (unknown.transform, unknown.preconditioner, unknown.prior) == (None, None, None)
+        and can_be_eliminated(unknown)
         and elements * unknown.initial.size <= traits.constants.eliminated_values
     )
 
