@@ -12,17 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import unrender as ur
-from benchmarks.internals import (
-    Estimate,
-    FullView,
-    Key,
-    PlainState,
-    Tree,
-    arrays,
-    leave_one_out_groups,
-    prepare,
-    trees,
-)
+from benchmarks.internals import Estimate, FullView, Key, PlainState, Tree, arrays, leave_one_out_groups, prepare, trees
 
 __all__ = ["DebiasedGradient", "bias_correction"]
 

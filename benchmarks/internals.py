@@ -45,7 +45,7 @@ from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.mitsuba.scene_loading import media
 from unrender.rendering.numpy.one_pixel import RATE
 from unrender.rendering.photographs import scene_renderer
-from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, with_differential_bsdf
+from unrender.rendering.renderer import RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.rendering.tied import TiedRenderer
 from unrender.rendering.wrapper import RendererWrapper
 from unrender.runs import loop
@@ -65,13 +65,6 @@ mi: Any = importlib.import_module("mitsuba")
 def prepare(problem: ur.Problem, keys: Any, space: Space | None = None, derivatives: bool = True) -> RenderSession:
     """The render session of the problem for these parameters; see `Renderer.prepare`."""
     return problem.renderer.prepare(list(keys), space, derivatives)
-
-
-def mitsuba_renderer(scene: Callable[[], Any], depth: int) -> Renderer:
-    """Mitsuba's renderer of a scene description."""
-    from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-
-    return MitsubaRenderer(scene, depth)
 
 
 def stock_scene(problem: ur.Problem) -> tuple[Any, Any]:

@@ -28,48 +28,22 @@ def step_seed(seed: int, step: int, view: int) -> int:
     return (seed * 1_000_003 + step * 64 + view) * 2 % 2**31
 
 
-def _view_loss(
-    problem: ur.Problem, view: int, sensor: Any, scene: Any, parameters: Any, integrator: Any, number: int, spp: int
-) -> Any:
-    """The loss of a view by `mi.render`, with the seeds `number` and the next one; 0 samples are the integrator's own."""
-    options = {"sensor": sensor, "integrator": integrator, "spp": spp, "seed": number, "seed_grad": number + 1}
-    image = mi.render(scene, parameters, **options)
-    if problem.original_views[view].aov == "depth":
-        image = image[..., :1] + dr.zeros(mi.TensorXf, (*image.shape[:2], 3))
-    return problem.loss_value(view, image)
-
-
-def backward(
-    problem: ur.Problem,
-    scene: Any,
-    parameters: Any,
-    integrator: Any,
-    seed: int,
-    step: int,
-    views: Iterable[int],
-) -> Any:
-    """Render views with the integrator's own samples, sum their losses, and call `dr.backward`. Return the sum."""
-    loss: Any = 0.0
-    for view in views:
-        sensor, number = problem.views[view].sensor, step_seed(seed, step, view)
-        loss += _view_loss(problem, view, sensor, scene, parameters, integrator, number, 0)
-    dr.backward(loss)
-    return loss
-
-
 class StockViews:
     """The views of a problem by `mi.render`. Views with known values have scenes of their own; ties and expressions are applied.
 
     Args:
         integrator: of radiance; `prb`, or `prbvolpath` for media, unless given. AOVs are those of Mitsuba's `aov`.
+        own: scene and parameters of views without known values; None for those of the problem's renderer.
     """
 
-    def __init__(self, problem: ur.Problem, integrator: dict[str, Any] | None = None):
+    def __init__(
+        self, problem: ur.Problem, integrator: dict[str, Any] | None = None, own: tuple[Any, Any] | None = None
+    ):
         self.problem = problem
         path = mi.load_dict(
             {**(integrator or {"type": "prbvolpath" if volumetric(problem) else "prb"}), "max_depth": problem.max_depth}
         )
-        self._worlds: list[tuple[Any, Any, Any]] = [({}, *stock_scene(problem))]
+        self._worlds: list[tuple[Any, Any, Any]] = [({}, *(own or stock_scene(problem)))]
         self._views = []
         for view in problem.original_views:
             known = {key: np.asarray(value, np.float32) for key, value in (view.known or {}).items()}
@@ -97,7 +71,11 @@ class StockViews:
         for view in views:
             (world, sensor, integrator), number = self._views[view], step_seed(seed, step, view)
             _, scene, parameters = self._worlds[world]
-            loss += _view_loss(self.problem, view, sensor, scene, parameters, integrator, number, spp)
+            options = {"sensor": sensor, "integrator": integrator, "spp": spp, "seed": number, "seed_grad": number + 1}
+            image = mi.render(scene, parameters, **options)
+            if self.problem.original_views[view].aov == "depth":
+                image = image[..., :1] + dr.zeros(mi.TensorXf, (*image.shape[:2], 3))
+            loss += self.problem.loss_value(view, image)
         dr.backward(loss)
         return loss
 

@@ -47,6 +47,14 @@ class Kept(ur.protocols.Callback):
         return [(seconds, values) for seconds, _, values in self._recorder.kept]
 
 
+def timed_run(problem: ur.Problem, seconds: float, seed: int, *method: Any, points: int = POINTS) -> Kept:
+    """Run `auto`, or an estimator and an optimizer, for some processor seconds without measuring errors; return what was kept."""
+    kept = Kept(seconds, points)
+    limit = 100 * seconds  # of the clock, never reached
+    ur.optimize(blind(problem), *method, seconds=limit, seed=seed, callbacks=[kept], progress=False)
+    return kept
+
+
 def blind(problem: ur.Problem) -> ur.Problem:
     """The same without the truth: errors are no part of a run's time."""
     unknowns = {key: replace(unknown, truth=None, surface=None) for key, unknown in problem.unknowns.items()}

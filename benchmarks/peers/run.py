@@ -23,14 +23,13 @@ from typing import Any
 
 import numpy as np
 
-import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import mi
 from benchmarks.peers import scenes
 from benchmarks.races import TUNING_SEED, first_at, search
 from benchmarks.runner.records import Record, scratch
 from benchmarks.suite.run import errors_of
-from benchmarks.timed_runs import Kept, blind
+from benchmarks.timed_runs import timed_run
 
 _POINTS = 20
 _PICTURE_SPP = 256
@@ -118,9 +117,7 @@ class Judge:
 
 def ours(judge: Judge, seconds: float, seed: int) -> dict[str, Any]:
     """`auto`, no option given; errors are no part of the time."""
-    kept = Kept(seconds, _POINTS)
-    limit = 100 * seconds  # of the clock, never reached
-    ur.optimize(blind(judge.case.problem), seconds=limit, seed=seed, callbacks=[kept])
+    kept = timed_run(judge.case.problem, seconds, seed, points=_POINTS)
     return judge.run(kept.found, kept.steps)
 
 

@@ -29,7 +29,7 @@ from benchmarks.races import TUNING_SEED, Entrant, median_and_range, race, scale
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import stock_loop
-from benchmarks.timed_runs import Kept, blind
+from benchmarks.timed_runs import timed_run
 
 Grid = dict[str, list[tuple[int, float]]]
 
@@ -84,9 +84,8 @@ def descend(
     else:
         estimator, optimizer = ur.PathGradient(IMAGES[method](), spp=spp), ur.optimizers.Adam(learning_rate=rate)
         if processor:
-            kept, limit = Kept(seconds), 100 * seconds  # of the clock, never reached
-            ur.optimize(blind(problem), estimator, optimizer, seconds=limit, seed=seed, callbacks=[kept])
-            return [(at, total_error(problem.parameter_error(values), start)) for at, values in kept.found]
+            found = timed_run(problem, seconds, seed, estimator, optimizer).found
+            return [(at, total_error(problem.parameter_error(values), start)) for at, values in found]
         history = ur.optimize(problem, estimator, optimizer, seconds=seconds, seed=seed).history
     return [(h["seconds"], total_error(h["parameter_error"], start)) for h in history if "parameter_error" in h]
 

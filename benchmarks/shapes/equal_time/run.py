@@ -23,8 +23,8 @@ from benchmarks.internals import dr, from_tensor, mi, project, stock_scene
 from benchmarks.races import TUNING_SEED, first_at, search
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
-from benchmarks.stock_loop import backward
-from benchmarks.timed_runs import POINTS, Kept, Point, blind, measured
+from benchmarks.stock_loop import StockViews
+from benchmarks.timed_runs import POINTS, Point, measured, timed_run
 
 QUICK: dict[str, Any] = {
     "seconds": 0.5, "seeds": 1, "problems": ["sphere-to-bunny"], "resolution": 8, "subdivisions": 1, "views": 2, "rates": [0.01],
@@ -58,10 +58,10 @@ def stock_shapes(problem: ur.Problem, setting: Setting, seconds: float, seed: in
 
     Return (processor seconds, parameters) along the run. Two steps of warm-up and the keeping of parameters are left out of the clock.
     """
-    scene, parameters = stock_scene(problem)
+    _, parameters = stock_scene(problem)
     (mesh,) = problem.faces
     counts = {"sppc": setting.spp, "sppp": setting.spp, "sppi": setting.indirect, "guiding": "none"}
-    integrator = mi.load_dict({"type": "prb_projective", "max_depth": problem.max_depth, **counts})
+    stock = StockViews(problem, {"type": "prb_projective", **counts})
     start, views = problem.initial(), range(len(problem.views))
     found = []
     for limit in (2, None):
@@ -85,7 +85,7 @@ def stock_shapes(problem: ur.Problem, setting: Setting, seconds: float, seed: in
                 others[key] = project(others[key], *problem.unknowns[key].bounds)
                 parameters[key] = others[key]
             parameters.update()
-            backward(problem, scene, parameters, integrator, seed, step, views)
+            stock.backward(seed, step, views)
             vertices.step()
             others.step()
             dr.eval(vertices["u"])
@@ -103,10 +103,7 @@ def stock_shapes(problem: ur.Problem, setting: Setting, seconds: float, seed: in
 
 def ours(problem: ur.Problem, seconds: float, seed: int) -> dict[str, Any]:
     """`auto`, no option given."""
-    kept = Kept(seconds)
-    limit = 100 * seconds  # of the clock, never reached
-    ur.optimize(blind(problem), seconds=limit, seed=seed, callbacks=[kept])
-    return measured(problem, kept.found)
+    return measured(problem, timed_run(problem, seconds, seed).found)
 
 
 def tuned(

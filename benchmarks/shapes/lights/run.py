@@ -17,7 +17,7 @@ import unrender as ur
 from benchmarks import markdown
 from benchmarks.internals import mi, parts
 from benchmarks.runner.records import Record
-from benchmarks.stock_loop import backward
+from benchmarks.stock_loop import StockViews
 
 MERGE = ("cases.*",)
 QUICK: dict[str, Any] = {"cases": ("spot",), "views": (1,), "seeds": 1, "steps": 2, "reference_spp": 4}
@@ -82,7 +82,7 @@ def loop(made: ur.Problem, seconds: float, rate: float, seed: int, resolution: i
     loaded = mi.load_dict(scene("area", len(made.views), resolution))
     parameters = mi.traverse(loaded)
     projective = {"type": "prb_projective", "guiding": "none", "sppc": SPP, "sppp": SPP // 2, "sppi": SPP // 2}
-    integrator = mi.load_dict({**projective, "max_depth": made.max_depth})
+    stock = StockViews(made, projective, (loaded, parameters))
     first = mi.Transform4f(parameters["lamp.to_world"])
     adam = mi.ad.Adam(lr=rate)
     adam["shift"] = mi.Point3f(*made.unknowns["lamp.translation"].initial.tolist())
@@ -94,7 +94,7 @@ def loop(made: ur.Problem, seconds: float, rate: float, seed: int, resolution: i
             break
         parameters["lamp.to_world"] = mi.Transform4f().translate(adam["shift"]) @ first
         parameters.update()
-        backward(made, loaded, parameters, integrator, seed, step, range(len(made.views)))
+        stock.backward(seed, step, range(len(made.views)))
         adam.step()
     return float(np.abs(np.array(adam["shift"])).max())
 

@@ -20,7 +20,7 @@ from benchmarks import figures, markdown
 from benchmarks.internals import Key, PixelSampler, with_preconditioner
 from benchmarks.races import TUNING_SEED, search
 from benchmarks.runner.records import Record
-from benchmarks.timed_runs import Kept, blind, measured
+from benchmarks.timed_runs import measured, timed_run
 
 MERGE = ("problems.*",)
 QUICK: dict[str, Any] = {
@@ -62,11 +62,9 @@ def descend(
     problem: ur.Problem, sampler: PixelSampler, rate: float, spp: int, seconds: float, seed: int
 ) -> dict[str, Any]:
     """The curve of one run, and what it reached."""
-    kept = Kept(seconds)
     estimator = ur.PathGradient(ur.images.Plain(), sampler, spp=spp)
     descent = ur.optimizers.Adam(rate, uniform=True)
-    ur.optimize(blind(problem), estimator, descent, seconds=100 * seconds, seed=seed, callbacks=[kept])
-    return measured(problem, kept.found)
+    return measured(problem, timed_run(problem, seconds, seed, estimator, descent).found)
 
 
 def run(

@@ -20,7 +20,7 @@ from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import stock_loop
 from benchmarks.suite.run import compare
-from benchmarks.timed_runs import Kept, blind
+from benchmarks.timed_runs import timed_run
 
 MERGE = ("problems.*",)
 QUICK: dict[str, Any] = {"problem": ("ties",), "seconds": 0.3, "seeds": 1, "spp": (2,), "rates": (0.02,)}
@@ -99,11 +99,9 @@ def displacement() -> ur.Problem:
 
 def depth() -> ur.Problem:
     """The same height map from one map of depths."""
-    scene, aov = (
-        mi.load_dict(Relief(resolution=32, height_resolution=16).target()),
-        {"type": "aov", "aovs": "seen:depth"},
-    )
-    found = np.array(mi.render(scene, integrator=mi.load_dict(aov), spp=256))[..., :1]
+    scene = mi.load_dict(Relief(resolution=32, height_resolution=16).target())
+    aov = mi.load_dict({"type": "aov", "aovs": "seen:depth"})
+    found = np.array(mi.render(scene, integrator=aov, spp=256))[..., :1]
     return displacement().replaced(views=[ur.View(found, aov="depth")])
 
 
@@ -150,27 +148,17 @@ def run(
         def error(values: Any, made: ur.Problem = made, start: dict[str, float] = start) -> float:
             return total_error(made.parameter_error(values), start)
 
-        def loop(
-            samples: int,
-            rate: float,
-            seed: int,
-            made: ur.Problem = made,
-            integrator: Any = integrator,
-            error: Any = error,
-        ) -> Any:
-            history = stock_loop(
-                made, samples, rate, seconds, seed=seed, every=2, error=error, timer=work_time, integrator=integrator
-            )
+        given: dict[str, Any] = {"every": 2, "error": error, "timer": work_time, "integrator": integrator}
+
+        def loop(samples: int, rate: float, seed: int, made: ur.Problem = made, given: Any = given) -> Any:
+            history = stock_loop(made, samples, rate, seconds, seed=seed, **given)
             return [(entry["seconds"], entry["parameter_error"]) for entry in history]
 
         tuned = {n: search(rates, lambda rate, n=n: loop(n, rate, TUNING_SEED)[-1][1]) for n in spp}
         samples = min(tuned, key=lambda n: min(one["error"] for one in tuned[n][1]))
         theirs = [loop(samples, tuned[samples][0], seed) for seed in range(seeds)]
-        mine = []
-        for seed in range(seeds):
-            kept = Kept(seconds)
-            ur.optimize(blind(made), seconds=100 * seconds, seed=seed, callbacks=[kept], progress=False)
-            mine.append([(at, error(values)) for at, values in kept.found])
+        kept = (timed_run(made, seconds, seed) for seed in range(seeds))
+        mine = [[(at, error(values)) for at, values in one.found] for one in kept]
         found = compare(theirs, mine, seconds)
         found |= {"setting": [samples, tuned[samples][0]], "tried": sum(len(tried) for _, tried in tuned.values())}
         found["final"] = {"loop": [run[-1][1] for run in theirs], "auto": [run[-1][1] for run in mine]}

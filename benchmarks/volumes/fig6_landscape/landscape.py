@@ -32,12 +32,7 @@ def slopes(problem: ur.Problem, at: State, factor: float, spp: int, change: floa
 
 
 def sample(
-    problem: ur.Problem,
-    at: State,
-    factors: Sequence[float],
-    runs: int,
-    reference: np.ndarray,
-    slope_spp: int,
+    problem: ur.Problem, at: State, factors: Sequence[float], runs: int, reference: np.ndarray, slope_spp: int
 ) -> Values:
     """Loss and derivative of every run at every factor. The derivative is the mean of loss' (noisy image) · dI/dfactor.
 

@@ -1,1 +1,0 @@
-"""Arguments, records, timing in turns, the machine's load, and the results page, alike for every benchmark."""

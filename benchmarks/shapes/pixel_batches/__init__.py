@@ -1,1 +1,0 @@
-"""Pixel mini-batches on a mesh."""
