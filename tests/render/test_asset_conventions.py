@@ -15,6 +15,7 @@ from PIL import Image
 from unrender.app.exporting import formats, gltf, textures, usd
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.app.exporting.materials import Material
+from unrender.display.pictures import png
 
 COLOURS = np.array([[[0.9, 0.1, 0.2], [0.1, 0.8, 0.3]], [[0.2, 0.3, 0.7], [0.6, 0.6, 0.1]]], np.float32)
 ROUGHNESS = np.array([[0.2, 0.4], [0.6, 0.8]], np.float32)
@@ -160,6 +161,6 @@ def test_maps_of_different_sizes_are_packed() -> None:
     part = replace(part, material=replace(part.material, metallic=np.full((8, 4), 0.25, np.float32)))
     found = textures.metallic_roughness(part)
     assert found.shape == (8, 4, 3)
-    assert Image.open(io.BytesIO(textures.png(found))).size == (4, 8)
+    assert Image.open(io.BytesIO(png(found))).size == (4, 8)
     np.testing.assert_array_equal(found[..., 2], 64)
     np.testing.assert_array_equal(found[[0, 0, 7, 7], [0, 3, 0, 3], 1], np.round(255 * ROUGHNESS).ravel())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from typing import Any
 
 import numpy as np
 
@@ -11,17 +12,27 @@ from unrender.io.resampling import reduced
 from unrender.losses.metrics import exposure, srgb
 
 
-def png(colours: np.ndarray, effort: int = 6) -> bytes:
-    """Encode a display image (H, W, 3) in [0, 1] as a PNG file; `effort` is the compression level, 0 to 9."""
+def quantized(colours: np.ndarray) -> np.ndarray:
+    """Return display values as 8-bit numbers; values outside [0, 1] are clipped."""
+    return (np.clip(colours, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def png(picture: Any, effort: int = 6) -> bytes:
+    """Encode a picture as a PNG file: values in [0, 1] or bytes, (H, W) or (H, W, 3 | 4), or an image of Pillow.
+
+    `effort` is the compression level, 0 to 9.
+    """
     from PIL import Image
 
+    if isinstance(picture, np.ndarray):
+        picture = Image.fromarray(picture if picture.dtype == np.uint8 else quantized(picture))
     buffer = io.BytesIO()
-    Image.fromarray((colours * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG", compress_level=effort)
+    picture.save(buffer, "PNG", compress_level=effort)
     return buffer.getvalue()
 
 
-def data_uri(colours: np.ndarray) -> str:
-    """Return a display image (H, W, 3) in [0, 1] as the `src` of an HTML image."""
+def data_uri(colours: Any) -> str:
+    """Return a picture that `png` encodes as the `src` of an HTML image."""
     return f"data:image/png;base64,{base64.b64encode(png(colours)).decode('ascii')}"
 
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich import console
 from rich.console import Group
 from rich.console import RenderableType as Renderable
 from rich.segment import Segment
+from rich.text import Text
 
 from unrender.core.text import visible
 
-__all__ = ["Console", "Group", "Renderable", "echo"]
+if TYPE_CHECKING:
+    from rich.table import Table
+
+__all__ = ["Console", "Group", "Renderable", "columns", "echo"]
 
 _UNESCAPED = "\n\t"
 
@@ -34,6 +38,23 @@ class Console(console.Console):
                 yield segment
             else:
                 yield Segment(visible(segment.text, _UNESCAPED), segment.style)
+
+    def say(self, text: str, style: str | None = None) -> None:
+        """Print plain text, without markup and without line breaks at the console's width."""
+        self.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def columns(*headings: str) -> Table:
+    """Return a table without lines: with these headings, or of two columns of names and values."""
+    from rich.table import Table
+
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold", show_header=bool(headings))
+    for heading in headings:
+        table.add_column(Text(visible(heading)), overflow="fold")
+    if not headings:
+        table.add_column(style="bold", no_wrap=True)
+        table.add_column(overflow="fold")
+    return table
 
 
 def echo(text: Any) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.phases import Listener
+from unrender.display.pictures import quantized
 from unrender.io.resampling import reduced
 from unrender.losses.metrics import exposure, srgb
 
@@ -180,4 +181,4 @@ class TensorBoard(Callback):
             shown = arrays.numpy(image)
             if view < _VIEWS and shown.shape == reference.shape:
                 colours = srgb(reduced(shown, _LARGEST) * exposure(reference))
-                self._writer.add_image(f"view/{view}", (colours * 255 + 0.5).astype(np.uint8), step, dataformats="HWC")
+                self._writer.add_image(f"view/{view}", quantized(colours), step, dataformats="HWC")

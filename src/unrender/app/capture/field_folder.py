@@ -12,10 +12,19 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 
 from unrender.app.capture.capture import INSIDE, CapturedView
-from unrender.app.capture.overlays import png
 from unrender.app.capture.problem_folder import sensor_element
 from unrender.app.capture.stored import StoredViews
-from unrender.app.capture.writing import MASKS, PROBLEM, REFERENCES, SCENE, add_value, problem_text, write_exr
+from unrender.app.capture.writing import (
+    MASKS,
+    PROBLEM,
+    REFERENCES,
+    SCENE,
+    add_value,
+    encoded,
+    write_exr,
+    write_mask,
+    write_problems,
+)
 from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
@@ -108,7 +117,7 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
         write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
         masked.append(not shown.all())
         if masked[-1]:
-            (folder / MASKS / f"{stem}.png").write_bytes(png(np.repeat(shown[..., None].astype(np.float32), 3, 2)))
+            write_mask(shown, folder / MASKS / f"{stem}.png")
     level = max(float(np.mean(means)), 1e-4)
     size = (voxels,) * 3
     volumes.write_grid(folder / EXTINCTION, np.full((*size, 1), _DEPTH / (2 * half), np.float32))
@@ -125,16 +134,11 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
         {"key": _KEYS[one], **bounds.get(one, {}), **({"learning_rate": rates[one]} if one in rates else {})}
         for one in moved
     ]
-    for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
-        listed = [
-            {"reference": f"{REFERENCES}/{stem}.exr", "sensor": i}
-            | ({"mask": f"{MASKS}/{stem}.png"} if masked[i] else {})
-            for i, (view, stem) in enumerate(zip(bare, stems, strict=True))
-            if view.held_out == held_out
-        ]
-        if listed:
-            unknown_tables = [table for table in tables if not (held_out and table["key"] == EXPOSURE)]
-            (folder / file).write_text(problem_text(name, listed, held_out, unknown_tables, "L2", 1), encoding="utf-8")
+    listed = []
+    for index, (view, stem) in enumerate(zip(bare, stems, strict=True)):
+        mask = {"mask": f"{MASKS}/{stem}.png"} if masked[index] else {}
+        listed.append((view.held_out, {"reference": f"{REFERENCES}/{stem}.exr", "sensor": index} | mask))
+    write_problems(folder, name, listed, tables, "L2", 1)
     note = "Each stage has twice the voxels a side. Run all: unrender run stages.toml. Written by `unrender import`."
     (folder / stages_file.FILE).write_text(stages_file.text(_stages(voxels, moved), note), encoding="utf-8")
 
@@ -173,8 +177,7 @@ def _scene(views: Sequence[CapturedView], stems: Sequence[str], middle: np.ndarr
         root.append(sensor)
     light = Xml.SubElement(root, "emitter", type="envmap", id="light")
     add_value(light, "string", "filename", LIGHT)
-    Xml.indent(root)
-    return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+    return encoded(root)
 
 
 def _place(parent: Xml.Element, corner: np.ndarray, scale: float) -> None:

@@ -37,6 +37,7 @@ from unrender.core import checks, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.core.text import printable
+from unrender.display.pictures import png
 from unrender.io import files
 
 CHECK, SHEET = "check", "check.png"
@@ -248,16 +249,7 @@ def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
         raise InputError(f"--unknowns {others[0]}: expected light, exposure or both for a radiance field")
     variant.ensure()
     capture = _capture(folder, options)
-    with phases.phase("photographs") as advance:
-        views, notices = prepare(
-            capture,
-            options.resolution,
-            options.scale,
-            options.hold_out,
-            lambda done, count: advance(done / count),
-            options.response,
-            masks=False,
-        )
+    views, notices = _views(capture, options, masks=False)
     name = folder.resolve().name
     _write_folder(out, lambda place: field_folder.write(place, name, views, voxels, chosen))
     held_out = sum(view.held_out for view in views.bare())
@@ -272,6 +264,15 @@ def _capture(folder: Path, options: ImportOptions) -> Capture:
         inverse = capture.world_to_camera if options.world_to_camera is None else options.world_to_camera
         capture = reinterpreted(capture, options.axes or capture.axes, inverse)
     return capture
+
+
+def _views(capture: Capture, options: ImportOptions, masks: bool = True) -> tuple[StoredViews, list[str]]:
+    """Read the photographs of a capture. See `views.prepare`."""
+    with phases.phase("photographs") as advance:
+        size = options.resolution, options.scale
+        return prepare(
+            capture, *size, options.hold_out, lambda done, n: advance(done / n), options.response, masks=masks
+        )
 
 
 def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, str]:
@@ -296,7 +297,7 @@ def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, st
             for index, view in enumerate(data.views):
                 picture = _overlay(data, index)
                 name = f"{index:04d}-{file_name(Path(view.name).stem)}.png"
-                (place / CHECK / name).write_bytes(overlays.png(picture))
+                (place / CHECK / name).write_bytes(png(picture))
                 thumbnails += [overlays.thumbnail(picture)] if index in shown else []
             (place / SHEET).write_bytes(_sheet(data, thumbnails))
 
@@ -333,15 +334,7 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
         atlas.check_installed()
     if own_mesh is None and not _has_masks(capture):
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
-    with phases.phase("photographs") as advance:
-        views, notices = prepare(
-            capture,
-            options.resolution,
-            options.scale,
-            options.hold_out,
-            lambda done, count: advance(done / count),
-            options.response,
-        )
+    views, notices = _views(capture, options)
     masked = all(views.masked)
     if own_mesh is None and not masked:
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 
@@ -12,6 +11,7 @@ from PIL import Image, ImageDraw
 from unrender.app.capture.capture import CapturedView
 from unrender.app.capture.silhouettes import Silhouettes
 from unrender.core.text import printable
+from unrender.display.pictures import png, quantized
 from unrender.losses.metrics import srgb
 
 LEGEND = "orange: the mesh and its edges; blue: the outline of the mask; dimmed: outside the mesh"
@@ -49,7 +49,7 @@ def chosen(count: int) -> list[int]:
 
 def thumbnail(picture: np.ndarray) -> Image.Image:
     """Return a picture with values in [0, 1] as an 8-bit thumbnail."""
-    small = Image.fromarray(_bytes(picture))
+    small = Image.fromarray(quantized(picture))
     small.thumbnail((_CELL - 4, _CELL - 4), Image.Resampling.BOX)
     return small
 
@@ -65,12 +65,7 @@ def contact_sheet(thumbnails: Sequence[Image.Image], labels: Sequence[str]) -> b
         left, top = place % columns * _CELL, place // columns * (_CELL + _LABEL) + _LABEL
         sheet.paste(small, (left + 2, top + _LABEL))
         draw.text((left + 3, top + 1), _latin(label), fill=(220, 220, 220))
-    return _encoded(sheet)
-
-
-def png(picture: np.ndarray) -> bytes:
-    """Return a picture with values in [0, 1] as a PNG file."""
-    return _encoded(Image.fromarray(_bytes(picture)))
+    return png(sheet)
 
 
 def _exposure(view: CapturedView) -> float:
@@ -104,13 +99,3 @@ def _creases(normals: np.ndarray, distances: np.ndarray, inside: np.ndarray) -> 
 
 def _latin(text: str) -> str:
     return printable(text).encode("latin-1", "replace").decode("latin-1")[:38]
-
-
-def _bytes(picture: np.ndarray) -> np.ndarray:
-    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-
-def _encoded(picture: Image.Image) -> bytes:
-    buffer = io.BytesIO()
-    picture.save(buffer, "PNG")
-    return buffer.getvalue()

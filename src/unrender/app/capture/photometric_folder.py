@@ -24,7 +24,6 @@ from scipy import ndimage
 from unrender.app.capture import pictures
 from unrender.app.capture.cameras import Lens
 from unrender.app.capture.formats.lights import LitCapture
-from unrender.app.capture.overlays import png
 from unrender.app.capture.undistortion import Resampling, pinhole
 from unrender.app.capture.writing import (
     MASKS,
@@ -32,10 +31,13 @@ from unrender.app.capture.writing import (
     REFERENCES,
     SCENE,
     TEXTURES,
+    add_film,
     add_texture,
     add_value,
-    problem_text,
+    encoded,
     write_exr,
+    write_mask,
+    write_problems,
 )
 from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
@@ -205,18 +207,14 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
     write_exr(np.full((height, width, 3), np.median(colour) / strength, np.float32), folder / TEXTURES / _COLOUR)
     write_exr(np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), (height, width, 3)), folder / TEXTURES / _NORMAL)
     (folder / SCENE).write_bytes(_scene(views, strength))
-    (folder / MASKS / "mask.png").write_bytes(png(np.repeat(inside[..., None], 3, 2).astype(np.float32)))
-    tables: list[list[dict[str, object]]] = [[], []]
+    write_mask(inside, folder / MASKS / "mask.png")
+    listed = []
     for index, (photograph, values) in enumerate(zip(views.names, views.values, strict=True)):
         file = f"{REFERENCES}/{index:04d}-{file_name(Path(photograph).stem)}.exr"
         write_exr(values, folder / file, half=True)
-        tables[views.held_out[index]].append({"reference": file, "sensor": index, "mask": f"{MASKS}/mask.png"})
-    for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
-        moved = [one for one in chosen if not (held_out and one == "exposure")]
-        unknowns = [{"key": _KEYS[one], **({} if one == "exposure" else {"bounds": [0.0, 1.0]})} for one in moved]
-        if tables[held_out] and unknowns:
-            text = problem_text(name, tables[held_out], held_out, unknowns, "L1", 2)
-            (folder / file).write_text(text, encoding="utf-8")
+        listed.append((views.held_out[index], {"reference": file, "sensor": index, "mask": f"{MASKS}/mask.png"}))
+    unknowns = [{"key": _KEYS[one], **({} if one == "exposure" else {"bounds": [0.0, 1.0]})} for one in chosen]
+    write_problems(folder, name, listed, unknowns, "L1", 2)
 
 
 def _scene(views: LitViews, strength: float) -> bytes:
@@ -233,11 +231,7 @@ def _scene(views: LitViews, strength: float) -> bytes:
         add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(1 / _DISTANCE)))
         transform = Xml.SubElement(sensor, "transform", name="to_world")
         Xml.SubElement(transform, "lookat", origin=f"0, 0, {_DISTANCE:g}", target="0, 0, 0", up="0, 1, 0")
-        film = Xml.SubElement(sensor, "film", type="hdrfilm")
-        add_value(film, "integer", "width", width)
-        add_value(film, "integer", "height", height)
-        add_value(film, "string", "pixel_format", "rgb")
-        Xml.SubElement(film, "rfilter", type="box")
+        add_film(sensor, width, height)
     plate = Xml.SubElement(root, "shape", type="rectangle", id="plate")
     transform = Xml.SubElement(plate, "transform", name="to_world")
     Xml.SubElement(transform, "scale", x="1", y=repr(height / width), z="1")
@@ -251,8 +245,7 @@ def _scene(views: LitViews, strength: float) -> bytes:
     lamp = Xml.SubElement(light, "emitter", type="directional", name="map")
     Xml.SubElement(lamp, "vector", name="direction", x="0", y="0", z="-1")
     Xml.SubElement(lamp, "rgb", name="irradiance", value=repr(np.pi * strength))
-    Xml.indent(root)
-    return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+    return encoded(root)
 
 
 def _towards(direction: np.ndarray) -> np.ndarray:

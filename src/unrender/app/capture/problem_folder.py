@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -13,7 +12,6 @@ import numpy as np
 from unrender.app.capture import unknowns
 from unrender.app.capture.capture import INSIDE, CapturedView, CapturedViews
 from unrender.app.capture.mesh import Mesh, ply
-from unrender.app.capture.overlays import png
 from unrender.app.capture.silhouettes import Silhouettes
 from unrender.app.capture.turntable import light_turns
 from unrender.app.capture.writing import (
@@ -22,10 +20,13 @@ from unrender.app.capture.writing import (
     REFERENCES,
     SCENE,
     TEXTURES,
+    add_film,
     add_texture,
     add_value,
-    problem_text,
+    encoded,
     write_exr,
+    write_mask,
+    write_problems,
 )
 from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
@@ -34,7 +35,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.mitsuba import turntable_light
-from unrender.rendering.photographs import OF_PHOTOGRAPHS
 
 MESH = "asset.ply"
 LIGHT = "textures/light.exr"
@@ -88,7 +88,7 @@ def write(
         brightest = max(brightest, float(view.values.max()))
         write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
         weights = _banded(mask, 0 if view.held_out else band)
-        (folder / MASKS / f"{stem}.png").write_bytes(png(np.repeat(weights[..., None], 3, 2)))
+        write_mask(weights, folder / MASKS / f"{stem}.png")
     for file, values in unknowns.textures(chosen, texture).values():
         write_exr(values, folder / TEXTURES / file)
     # Under uniform light, a surface shows its base colour times the light's radiance.
@@ -98,27 +98,15 @@ def write(
     white = clipped and brightest <= 1.001
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
     tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), turntable)
-    _write_problems(folder, name, views, stems, tables, loss)
+    listed = [
+        (view.held_out, {"reference": f"{REFERENCES}/{stem}.exr", "sensor": i, "mask": f"{MASKS}/{stem}.png"})
+        for i, (view, stem) in enumerate(zip(views, stems, strict=True))
+    ]
+    write_problems(folder, name, listed, tables, loss, _MAX_DEPTH)
     note = "Each stage starts from the result of the previous stage. Run all: unrender run stages.toml"
     stages = unknowns.stages(chosen, Path(PROBLEM), turntable)
     text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
     (folder / stages_file.FILE).write_text(text, encoding="utf-8")
-
-
-def _write_problems(
-    folder: Path, name: str, views: CapturedViews, stems: Sequence[str], tables: Sequence[dict], loss: Any
-) -> None:
-    """Write the problem files of the training views and of the held-out views. `tables` are those of the parameters."""
-    for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
-        sensors = [index for index, view in enumerate(views) if view.held_out == held_out]
-        moved = [table for table in tables if not (held_out and table["key"] in OF_PHOTOGRAPHS)]
-        if sensors and moved:
-            listed = [
-                {"reference": f"{REFERENCES}/{stems[i]}.exr", "sensor": i, "mask": f"{MASKS}/{stems[i]}.png"}
-                for i in sensors
-            ]
-            text = problem_text(name, listed, held_out, moved, loss, _MAX_DEPTH)
-            (folder / file).write_text(text, encoding="utf-8")
 
 
 def to_world(camera_to_world: np.ndarray) -> np.ndarray:
@@ -171,8 +159,7 @@ def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Seque
     add_value(shape, "string", "filename", MESH)
     _material(shape, chosen)
     _light(root, views, radius, turntable)
-    Xml.indent(root)
-    return Xml.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+    return encoded(root)
 
 
 def _light(root: Xml.Element, views: CapturedViews, radius: float, turntable: bool) -> None:
@@ -215,9 +202,5 @@ def sensor_element(view: CapturedView, stem: str, near: float, far: float) -> Xm
     transform = Xml.SubElement(sensor, "transform", name="to_world")
     numbers = " ".join(repr(float(number)) for number in to_world(view.camera_to_world).ravel())
     Xml.SubElement(transform, "matrix", value=numbers)
-    film = Xml.SubElement(sensor, "film", type="hdrfilm")
-    add_value(film, "integer", "width", lens.width)
-    add_value(film, "integer", "height", lens.height)
-    add_value(film, "string", "pixel_format", "rgb")
-    Xml.SubElement(film, "rfilter", type="box")
+    add_film(sensor, lens.width, lens.height)
     return sensor

@@ -10,8 +10,11 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 import tomli_w
 
+from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.backend import variant
+from unrender.display.pictures import png
 from unrender.io import toml_lines
+from unrender.rendering.photographs import OF_PHOTOGRAPHS
 
 PROBLEM, SCENE = "problem.toml", "scene.xml"
 REFERENCES, MASKS, TEXTURES = "references", "masks", "textures"
@@ -34,6 +37,41 @@ def problem_text(
     parts = [f"# {what} Written by `unrender import`.\n", tomli_w.dumps(head)]
     parts += [toml_lines.array_table(heading, table) for heading, table in tables]
     return "\n".join(parts)
+
+
+def write_problems(
+    folder: Path, name: str, views: Sequence[tuple[bool, dict]], parameters: Sequence[dict], loss: Any, max_depth: int
+) -> None:
+    """Write problem.toml of the training views and held-out.toml of the others, as far as there are any.
+
+    `views` are (whether it is held out, its table). Unknowns of the photographs do not apply to other photographs.
+    """
+    for held_out, file in ((False, PROBLEM), (True, HELD_OUT)):
+        listed = [table for apart, table in views if apart == held_out]
+        moved = [table for table in parameters if not (held_out and table["key"] in OF_PHOTOGRAPHS)]
+        if listed and moved:
+            text = problem_text(name, listed, held_out, moved, loss, max_depth)
+            (folder / file).write_text(text, encoding="utf-8")
+
+
+def encoded(scene: Xml.Element) -> bytes:
+    """Return a scene as an XML file."""
+    Xml.indent(scene)
+    return Xml.tostring(scene, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def add_film(sensor: Xml.Element, width: int, height: int) -> None:
+    """Add an RGB film with a box filter."""
+    film = Xml.SubElement(sensor, "film", type="hdrfilm")
+    add_value(film, "integer", "width", width)
+    add_value(film, "integer", "height", height)
+    add_value(film, "string", "pixel_format", "rgb")
+    Xml.SubElement(film, "rfilter", type="box")
+
+
+def write_mask(weights: np.ndarray, path: Path) -> None:
+    """Write pixel weights (H, W) in [0, 1] as a PNG file of three equal channels."""
+    path.write_bytes(png(np.repeat(weights[..., None], 3, 2).astype(np.float32)))
 
 
 def add_value(parent: Xml.Element, kind: str, name: str, value: object) -> None:

@@ -155,13 +155,13 @@ def _report(console: Console, directories: Sequence[Path], folder: Path) -> None
     """Compare runs made here."""
     with phases.phase("page"):
         from unrender.app import report
-        from unrender.app.cli.comparison_table import plain, show
+        from unrender.app.cli.comparison_table import show
 
         comparison, notices = report.load_comparison(directories)
         page = report.write_comparison(comparison, notices, folder)
     show(console, comparison)
     console.print("Times are those of the steps, without compilation and final pictures.")
-    console.print(f"page: {plain(str(page))}", soft_wrap=True)
+    console.say(f"page: {page}")
 
 
 def _check_single(what: Sequence[str]) -> None:
@@ -179,7 +179,7 @@ def _compare_folders(
     if refused := arguments.typed_options(context, ("out", "overwrite", "allow_outside")):
         raise InputError(f"compare: {refused[0]} does not apply to run folders; leave it out")
     from unrender.app import report
-    from unrender.app.cli.comparison_table import plain, show
+    from unrender.app.cli.comparison_table import show
 
     folder = arguments.folder(out, "compare", overwrite, *_MARKS)
     try:
@@ -189,8 +189,8 @@ def _compare_folders(
         arguments.remove_if_empty(folder)
     show(console, comparison)
     for notice in notices:
-        console.print(f"note: {plain(notice)}", soft_wrap=True)
-    console.print(f"page: {plain(str(page))}", soft_wrap=True)
+        console.say(f"note: {notice}")
+    console.say(f"page: {page}")
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,7 @@ def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
                 take(ended)
     for outcome in outcomes:
         if outcome.message:
-            console.print(f"{outcome.folder}: failed: {outcome.message}", markup=False, soft_wrap=True, style="red")
+            console.say(f"{outcome.folder}: failed: {outcome.message}", style="red")
     return outcomes
 
 

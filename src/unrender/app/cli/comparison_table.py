@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from rich.markup import escape
-from rich.table import Table
 
 from unrender.app.report.equal_time import Comparison, Spread
 from unrender.core.text import visible
 from unrender.display import formatting
-from unrender.display.terminal import Console
+from unrender.display.terminal import Console, columns
 from unrender.losses.metrics import has_flip
 
 
@@ -19,7 +18,7 @@ def show(console: Console, comparison: Comparison) -> None:
         console.print(f"[bold]{plain(metric.title)}[/]", soft_wrap=True)
         first = metric.methods[comparison.groups[0].label]
         times = [f"at {formatting.duration(moment.seconds)}" for moment in first.moments]
-        table = _table("method", "runs", *times, f"after {formatting.count(comparison.samples)} paths")
+        table = columns("method", "runs", *times, f"after {formatting.count(comparison.samples)} paths")
         for group in comparison.groups:
             outcome = metric.methods[group.label]
             cells = [moment.error for moment in (*outcome.moments, outcome.at_samples[-1])]
@@ -27,24 +26,17 @@ def show(console: Console, comparison: Comparison) -> None:
         console.print(table)
     if comparison.image_error[comparison.groups[0].label].median is not None:
         console.print("[bold]Last pictures, each run's at its own end[/]")
-        table = _table("method", *comparison.images)
+        table = columns("method", *comparison.images)
         for group in comparison.groups:
             table.add_row(plain(group.label), *(_spread(of[group.label]) for of in comparison.images.values()))
         console.print(table)
         if not has_flip():
-            console.print("FLIP is left out: its package is missing (pip install 'unrender[flip]')", markup=False)
+            console.say("FLIP is left out: its package is missing (pip install 'unrender[flip]')")
 
 
 def plain(text: str) -> str:
     """Return text of a run folder without rich markup, with its printed width."""
     return escape(visible(text))
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-    for heading in headings:
-        table.add_column(plain(heading), overflow="fold")
-    return table
 
 
 def _spread(of: Spread) -> str:

@@ -12,11 +12,10 @@ from importlib import metadata
 from pathlib import Path
 
 from rich.markup import escape
-from rich.table import Table
 
 from unrender.backend import cache, limits, llvm, variant
 from unrender.core.errors import VariantError
-from unrender.display.terminal import Console
+from unrender.display.terminal import Console, columns
 
 TOLERANCE = 1e-3
 """Maximum relative error of the test gradient. Both sides use the same paths, so only rounding errors remain."""
@@ -57,9 +56,7 @@ def doctor(console: Console | None = None) -> int:
         error = gradient_error()
     except VariantError as unusable:
         problem = str(unusable)
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
+    table = columns()
     for name, value in [*_versions(), *_hardware(), *_cache(), ("backend", backend)]:
         table.add_row(name, escape(value))
     if error is not None:

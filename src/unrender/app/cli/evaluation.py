@@ -49,31 +49,26 @@ def judge(
 
 
 def _tell(console: object, judgement: Judgement) -> None:
-    from rich.table import Table
-
     from unrender.app.cli.comparison_table import plain
-    from unrender.display.terminal import Console
+    from unrender.display.terminal import Console, columns
 
     assert isinstance(console, Console)
     if judgement.measures:
-        table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
         names = {"PSNR": "psnr", "SSIM": "ssim", "LPIPS": "lpips"}
         names = {title: name for title, name in names.items() if judgement.mean[name] is not None}
-        for title in ("photograph", *names):
-            table.add_column(title, overflow="fold")
+        table = columns("photograph", *names)
         for photograph, each in zip(judgement.names, judgement.measures, strict=True):
             table.add_row(plain(photograph), *(_number(getattr(each, name), name) for name in names.values()))
         table.add_row("[bold]mean[/]", *(_number(judgement.mean[name], name) for name in names.values()))
         console.print(table)
     if judgement.albedo is not None:
         factors = ", ".join(f"{factor:.3g}" for factor in judgement.albedo.factors)
-        console.print(
-            f"base colour: RMSE {judgement.albedo.rmse:.4f}, {judgement.albedo.scaled_rmse:.4f} after factors {factors}",
-            markup=False,
+        console.say(
+            f"base colour: RMSE {judgement.albedo.rmse:.4f}, {judgement.albedo.scaled_rmse:.4f} after factors {factors}"
         )
     for notice in judgement.notices:
-        console.print(f"note: {notice}", soft_wrap=True, markup=False)
-    console.print(f"overview: {judgement.folder / 'sheet.png'}", soft_wrap=True, markup=False)
+        console.say(f"note: {notice}")
+    console.say(f"overview: {judgement.folder / 'sheet.png'}")
 
 
 def _number(value: float | None, name: str) -> str:
@@ -125,8 +120,8 @@ def turntable(
         look = environment, frames, rate, size, spp, elevation, axis, background
         video = write(directory, place, *look, overwrite, notices.append)
     for notice in notices:
-        console.print(f"note: {notice}", soft_wrap=True, markup=False)
-    console.print(f"video: {video}", soft_wrap=True, markup=False)
+        console.say(f"note: {notice}")
+    console.say(f"video: {video}")
 
 
 def _axis(text: str) -> list[float]:

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 from rich.markup import escape
-from rich.table import Table
 
 from unrender.display import formatting
-from unrender.display.terminal import Console
+from unrender.display.terminal import Console, columns
 from unrender.methods import Method
 from unrender.methods.plan_file import PlanFile
 from unrender.runs import watches
@@ -73,12 +72,12 @@ def execution(
     """
     plan = order.method.plan(problem, order.settings)
     for line in plan.lines:
-        console.print(f"{order.method.name}: {escape(line)}", soft_wrap=True)
+        console.say(f"{order.method.name}: {line}")
     options = order.method.options_of(order.settings)
     settings = {"options": options, "problem_options": dict(order.problem_settings)}
     settings = {name: value for name, value in settings.items() if value}
     for line in watches.remarks(problem, plan.optimizer):
-        console.print(f"note: {escape(line)}", soft_wrap=True)
+        console.say(f"note: {line}")
     earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # earlier runs
     annotations = RunAnnotations(
         order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, progress.budget_began
@@ -154,14 +153,12 @@ def introduce(console: Console, problem: Problem, variant: str) -> None:
     keys = ", ".join(parameter.key for parameter in problem.parameters)
     console.print(f"[bold]{escape(problem.name)}[/]: {escape(keys)} from {views}, on {variant}", soft_wrap=True)
     for notice in problem.notices:
-        console.print(f"note: {escape(notice)}", soft_wrap=True)
+        console.say(f"note: {notice}")
 
 
 def summarise(console: Console, problem: Problem, result: Result, progress: Progress) -> None:
     """Print a summary of the result."""
-    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
+    table = columns()
     table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s (and {result.warmup_seconds:.1f} s to compile)")
     if result.skipped:
         table.add_row("skipped", f"{result.skipped} steps whose gradient was not finite")

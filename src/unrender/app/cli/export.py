@@ -39,7 +39,6 @@ def export(
     allow_outside: AllowOutside = False,
 ) -> None:
     """Write a run's result as a scene folder for Mitsuba or for other programs, and the recovered maps alone."""
-    from rich.markup import escape
 
     console = Console(highlight=False)
     is_problem = directory.suffix.lower() == ".toml" and directory.is_file()
@@ -59,9 +58,9 @@ def export(
     place = default if out is None else out
     done = write(directory, place, overwrite, spp, chosen)
     for notice in done.notices:
-        console.print(f"note: {escape(notice)}", soft_wrap=True)
+        console.say(f"note: {notice}")
     if done.scene is not None:
         written = ("scene", done.scene)
     else:
         written = ("values" if chosen == ["mitsuba"] else "folder", done.folder)
-    console.print(f"{written[0]}: {escape(str(written[1]))}", soft_wrap=True)
+    console.say(f"{written[0]}: {written[1]}")

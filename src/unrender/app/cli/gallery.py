@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +13,6 @@ from unrender.app.cli.arguments import MOST_SAMPLES, NoCache, Overwrite, Problem
 from unrender.core.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
     from rich.table import Table
 
     from unrender.scene.problem import Problem
@@ -70,7 +68,7 @@ def gallery(
         console.print(_parameters(problem))
         if folder is not None:
             for path in _draw(problem, folder, spp):
-                console.print(escape(str(path)), soft_wrap=True)
+                console.say(str(path))
     finally:
         if folder is not None:
             arguments.remove_if_empty(folder)
@@ -111,8 +109,9 @@ def _draw(problem: Problem, folder: Path, spp: int) -> list[Path]:
     """Write PNG files of each view's reference, start and ground truth, with the exposure of the reference."""
     import numpy as np
 
+    from unrender.display.pictures import png
     from unrender.io.files import write
-    from unrender.losses.metrics import exposure
+    from unrender.losses.metrics import exposure, srgb
     from unrender.scene.render import render
 
     written: list[Path] = []
@@ -123,16 +122,5 @@ def _draw(problem: Problem, folder: Path, spp: int) -> list[Path]:
             requests["truth"] = render(problem, problem.truth, index, spp)
         for what, picture in requests.items():
             path = folder / f"view{index}-{what}.png"
-            written.append(write(path, _png(picture * exposure(reference))))
+            written.append(write(path, png(srgb(picture * exposure(reference)))))
     return written
-
-
-def _png(linear: np.ndarray) -> bytes:
-    import numpy as np
-    from PIL import Image
-
-    from unrender.losses.metrics import srgb
-
-    buffer = io.BytesIO()
-    Image.fromarray((srgb(linear) * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG")
-    return buffer.getvalue()

@@ -141,7 +141,7 @@ def import_(
         arguments.remove_if_empty(place)
     _print_summary(console, imported)
     written = place / (importing.SHEET if check else importing.PROBLEM)
-    console.print(f"{'pictures' if check else 'problem'}: {written}", soft_wrap=True, markup=False)
+    console.say(f"{'pictures' if check else 'problem'}: {written}")
     if refusal:
         raise InputError(f"{folder}: {refusal}")
     if not check:
@@ -160,19 +160,17 @@ def _print_next_steps(console: Console, place: Path) -> None:
     for file, what, seconds in names:
         if (path := place / file).is_file():
             command = f"unrender run {shlex.quote(str(path))} --seconds {seconds}" if seconds else path
-            console.print(f"{what}: {command}", soft_wrap=True, markup=False)
+            console.say(f"{what}: {command}")
 
 
 def _print_summary(console: Console, imported: Imported) -> None:
     from statistics import mean
 
     for notice in imported.notices:
-        console.print(f"note: {notice}", soft_wrap=True, markup=False)
+        console.say(f"note: {notice}")
     counts = f"{imported.views} photographs and {imported.held_out} held out"
     shape = f"; a mesh of {imported.faces} faces" if imported.faces else ""
-    console.print(f"{imported.kind}: {counts}, {imported.size[0]} x {imported.size[1]}{shape}", markup=False)
+    console.say(f"{imported.kind}: {counts}, {imported.size[0]} x {imported.size[1]}{shape}")
     if imported.overlaps:
         worst = min(imported.overlaps)
-        console.print(
-            f"the mesh covers the masks with IoU {mean(imported.overlaps):.3f}, {worst:.3f} at worst", markup=False
-        )
+        console.say(f"the mesh covers the masks with IoU {mean(imported.overlaps):.3f}, {worst:.3f} at worst")

@@ -139,7 +139,6 @@ def conclude(
     Raises:
         typer.Exit: the run was interrupted, failed, or is doubtful.
     """
-    from rich.markup import escape
 
     from unrender.app.cli.execute import summarise
 
@@ -151,10 +150,10 @@ def conclude(
             written = report.page(folder)
     summarise(console, problem, result, progress)
     if written is not None:
-        console.print(f"page: {escape(str(written))}", soft_wrap=True)
+        console.say(f"page: {written}")
     if status := exit_status(result.stopped):
         why = "to continue" if result.status == "interrupted" else "to try once more from its last step"
-        console.print(f"{why}: unrender resume {escape(shlex.quote(str(again or folder)))}", soft_wrap=True)
+        console.say(f"{why}: unrender resume {shlex.quote(str(again or folder))}")
         raise typer.Exit(status)
     if result.status != "finished":
         raise typer.Exit(DOUBTFUL)

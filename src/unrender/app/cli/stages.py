@@ -206,7 +206,7 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
         folder = stages_file.folder_of(run.stages, index, run.out)
         console.print(f"[bold]stage {index + 1} of {len(run.stages.stages)}[/]: {escape(stage.name)}", soft_wrap=True)
         if _is_finished(folder):
-            console.print(f"finished: {escape(str(folder))}", soft_wrap=True)
+            console.say(f"finished: {folder}")
         else:
             problem, result = _run_stage(run, index, values, console, progress)
             last = index == len(run.stages.stages) - 1

@@ -30,7 +30,7 @@ from unrender.backend.variant import check_threads
 from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.display import formatting
-from unrender.display.terminal import Console
+from unrender.display.terminal import Console, columns
 from unrender.io import files
 from unrender.runs.budget import few_steps
 from unrender.runs.folder.lock import Lock
@@ -63,28 +63,22 @@ def show(console: Console, record: SweepRecord) -> None:
         console.print(_table(record.trials, _SHOWN))
     counts = {status: sum(t.status == status for t in record.trials) for status in ("finished", "pruned", "failed")}
     outcome = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
-    console.print(
-        f"{outcome or 'no trial has ended'}; {formatting.duration(record.wall_seconds)} in all", highlight=False
-    )
+    console.say(f"{outcome or 'no trial has ended'}; {formatting.duration(record.wall_seconds)} in all")
     reasons: dict[str, list[int]] = {}
     for trial in record.trials:
         if trial.status == "failed":
             reasons.setdefault(trial.message, []).append(trial.number)
     for message, numbers in reasons.items():
         which = ", ".join(map(str, numbers[:_SHOWN])) + (", …" if len(numbers) > _SHOWN else "")
-        console.print(
-            f"failed (trial {which}): {visible(message)}", markup=False, highlight=False, soft_wrap=True, style="red"
-        )
+        console.say(f"failed (trial {which}): {visible(message)}", style="red")
     if record.best_line:
-        console.print(f"best: {record.best_line}", markup=False, highlight=False, soft_wrap=True)
+        console.say(f"best: {record.best_line}")
         if others := equally_good(record):
             which = ", ".join(map(str, others[:_SHOWN])) + (", …" if len(others) > _SHOWN else "")
-            console.print(
-                f"not distinguished from it (two standard errors): trial {which}; more --final-spp or --seeds may decide",
-                highlight=False,
-                soft_wrap=True,
+            console.say(
+                f"not distinguished from it (two standard errors): trial {which}; more --final-spp or --seeds may decide"
             )
-        console.print(f"to run it: {run_command(record)}", markup=False, highlight=False, soft_wrap=True)
+        console.say(f"to run it: {run_command(record)}")
 
 
 def equally_good(record: SweepRecord) -> list[int]:
@@ -120,9 +114,7 @@ def _table(trials: list[TrialRecord], most: int) -> Table:
     known = [(ranks[t.status], t.error, t) for t in trials if t.error is not None and t.status in ranks]
     ordered = [t for _, _, t in sorted(known, key=lambda entry: (entry[0], entry[1], entry[2].number))]
     names = list(ordered[0].settings) if ordered else []
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-    for heading in ("trial", *names, "error", "steps", "seconds", ""):
-        table.add_column(Text(visible(heading)), overflow="fold")
+    table = columns("trial", *names, "error", "steps", "seconds", "")
     for trial in ordered[:most]:
         steps = "+".join(str(run.steps) for run in trial.runs)
         seconds = f"{sum(run.seconds for run in trial.runs):.1f}"
@@ -226,7 +218,7 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
         if not trials.done and (session.folder / SWEEP).exists():
             state.save(session.folder, "interrupted")
             again = f"to continue: unrender sweep {shlex.quote(str(session.folder))}"
-            console.print(again, markup=False, highlight=False, soft_wrap=True)
+            console.say(again)
         lock.release()
     if not trials.done:
         raise typer.Exit(TERMINATED if state.stopped == BY_SIGTERM else INTERRUPTED)
@@ -283,7 +275,7 @@ def _announce(console: Console, session: Session, state: _State, executor: Execu
     seeds = f", {plan.seeds} seeds each" if plan.seeds > 1 else ""
     left = state.trials.search.trials - len(state.trials.ended)
     had = f", {len(state.trials.ended)} done before" if state.trials.ended else ""
-    console.print(f"{plan.method}, {plan.search}: {left} trials{seeds} {where}{had}", highlight=False, soft_wrap=True)
+    console.say(f"{plan.method}, {plan.search}: {left} trials{seeds} {where}{had}")
 
 
 def _drive(console: Console, session: Session, state: _State, executor: Executor, job: Job) -> None:
@@ -362,4 +354,4 @@ def _page(console: Console, folder: Path, state: _State) -> None:
     """Write a page that compares the best trials."""
     if folders.best(folder, state.record):
         page = report.write_page(folder, state.record)
-        console.print(f"page: {page}", markup=False, highlight=False, soft_wrap=True)
+        console.say(f"page: {page}")

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.display import formatting
-from unrender.display.terminal import Console, Group, Renderable
+from unrender.display.terminal import Console, Group, Renderable, columns
 from unrender.io import bounded_files
 from unrender.runs.folder import schema
 from unrender.runs.folder.schema import LIVE, LIVE_STATUS, LiveStatus
@@ -84,7 +83,7 @@ class TaskDisplay:
 
     def say(self, line: str) -> None:
         """Print a permanent line."""
-        self._console.print(visible(line), markup=False, highlight=False, soft_wrap=True)
+        self._console.say(visible(line))
         self._console.file.flush()
 
     def _render(self) -> Renderable:
@@ -92,9 +91,7 @@ class TaskDisplay:
             rows, ended = list(self._running.values()), self._ended
         elapsed = formatting.duration(time.monotonic() - self._began)
         head = Text(f"{ended} of {self._total} {self._what} ended, {len(rows)} running, {elapsed}")
-        table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
-        for heading in ("running", "seed", "step", "loss", "since"):
-            table.add_column(heading, no_wrap=heading != "running")
+        table = columns("running", "seed", "step", "loss", "since")
         for row in rows[:_MOST_ROWS]:
             folder, status = _status(row.folders)
             since = formatting.duration(time.monotonic() - row.since)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from PIL import Image, ImageDraw
 from unrender.app.evaluation.measures import Measures, shown
 from unrender.app.exporting import ready_made
 from unrender.core.text import printable
+from unrender.display.pictures import png, quantized
 from unrender.losses import metrics
 from unrender.losses.metrics import exposure, srgb
 from unrender.scene.problem import Problem
@@ -42,37 +42,22 @@ def sheet(rows: Sequence[tuple[str, Sequence[np.ndarray]]], headings: Sequence[s
         draw.text((left + 3, top), printable(label).encode("latin-1", "replace").decode("latin-1"), fill=_INK)
         for column, cell in enumerate(line):
             page.paste(cell, (left + column * (_CELL + _GAP), top + _LABEL))
-    return _encoded(page)
+    return png(page)
 
 
 def environment_picture(values: np.ndarray) -> bytes:
     """Return a PNG of an environment map (H, W, 3), exposed for all but the brightest 5 % of its texels; small maps are enlarged."""
-    picture = Image.fromarray(_bytes(srgb(values * exposure(values))))
+    picture = Image.fromarray(quantized(srgb(values * exposure(values))))
     factor = max(1, _WIDE // picture.width)
-    return _encoded(picture.resize((picture.width * factor, picture.height * factor), Image.Resampling.NEAREST))
-
-
-def plain(picture: np.ndarray) -> bytes:
-    """Return a PNG of a picture (H, W, 3) in [0, 1]."""
-    return _encoded(Image.fromarray(_bytes(picture)))
-
-
-def _encoded(picture: Image.Image) -> bytes:
-    buffer = io.BytesIO()
-    picture.save(buffer, "PNG")
-    return buffer.getvalue()
+    return png(picture.resize((picture.width * factor, picture.height * factor), Image.Resampling.NEAREST))
 
 
 def _fitted(picture: np.ndarray) -> Image.Image:
     """Resize a picture to the width of a cell; enlarged pixels remain squares."""
-    image = Image.fromarray(_bytes(picture))
+    image = Image.fromarray(quantized(picture))
     scale = _CELL / max(image.size)
     size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
     return image.resize(size, Image.Resampling.NEAREST if scale > 1 else Image.Resampling.BOX)
-
-
-def _bytes(picture: np.ndarray) -> np.ndarray:
-    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 SHEET, FOLDER = "sheet.png", "pictures"
@@ -125,7 +110,7 @@ def write(
             rows.append((label, [cell[box] for cell in cells]))
         stem = f"{index:04d}-{ready_made.file_name(name)}"
         for kind, cell in zip(kinds, cells, strict=True):
-            (folder / FOLDER / f"{stem}-{kind}.png").write_bytes(plain(cell))
+            (folder / FOLDER / f"{stem}-{kind}.png").write_bytes(png(cell))
     last = "under the other light" if relit else f"difference x {_DIFFERENCE}"
     (folder / SHEET).write_bytes(sheet(rows, ["photograph", "rendering", last]))
 

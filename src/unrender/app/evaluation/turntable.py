@@ -20,6 +20,7 @@ from unrender.backend import variant
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
+from unrender.display.pictures import quantized
 from unrender.io import files
 from unrender.losses.metrics import exposure, srgb
 from unrender.rendering.mitsuba import turntable_light
@@ -194,7 +195,7 @@ def _frames(
             if factor is None:
                 factor = exposure(colour if behind is None else colour[alpha[..., 0] > 0.5])
             shown = colour * factor + (0.0 if behind is None else (1 - alpha) * behind)
-            yield (srgb(shown) * 255 + 0.5).astype(np.uint8)
+            yield quantized(srgb(shown))
             advance((index + 1) / count)
 
 

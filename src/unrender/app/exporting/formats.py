@@ -12,6 +12,7 @@ from unrender.app.exporting import gltf, ready_made, textures, usd
 from unrender.app.exporting.asset import Asset, Part
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
+from unrender.display.pictures import png
 from unrender.io import mesh_files
 
 
@@ -71,7 +72,7 @@ def _maps(part: Part, folder: Path) -> dict[str, str]:
     for what, name in names.items():
         picture = pixels[what]
         if picture is not None:
-            (folder / name).write_bytes(textures.png(picture))
+            (folder / name).write_bytes(png(picture))
     return names
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from unrender.app.exporting import textures
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.core.errors import InputError
+from unrender.display.pictures import png
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ class _Writer:
     def _texture(self, pixels: np.ndarray, part: Part, name: str) -> int:
         import pygltflib as kit
 
-        view = self._view(textures.png(pixels))
+        view = self._view(png(pixels))
         self._gltf.images.append(kit.Image(bufferView=view, mimeType="image/png", name=f"{part.name} {name}"))
         inside = part.uv is not None and part.uv.min() >= 0 and part.uv.max() <= 1
         wrap = _CLAMP if inside else _REPEAT

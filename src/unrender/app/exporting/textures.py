@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw
 
 from unrender.app.exporting.asset import Part
 from unrender.app.exporting.ready_made import as_bitmap, file_name, write_bitmap
+from unrender.display.pictures import quantized
 from unrender.io.resampling import upsample
 from unrender.io.volumes import write_grid
 from unrender.losses.metrics import srgb
@@ -93,22 +94,15 @@ def _values(base: str, value: np.ndarray, folder: Path) -> str:
     return f"{base}.npy"
 
 
-def png(pixels: np.ndarray) -> bytes:
-    """Encode (H, W, 3) or (H, W) bytes as a PNG file."""
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
 def base_colour(part: Part) -> np.ndarray:
     """Return the base colour as (H, W, 3) sRGB bytes; a constant has one texel."""
     colour = part.material.base_colour
-    return _bytes(srgb(colour if colour.ndim == 3 else colour.reshape(1, 1, 3)))
+    return quantized(srgb(colour if colour.ndim == 3 else colour.reshape(1, 1, 3)))
 
 
 def grey(values: np.ndarray) -> np.ndarray:
     """Return a number or (H, W) values as (H, W) linear bytes; a constant has one texel."""
-    return _bytes(values if values.ndim == 2 else values.reshape(1, 1))
+    return quantized(values if values.ndim == 2 else values.reshape(1, 1))
 
 
 def metallic_roughness(part: Part) -> np.ndarray:
@@ -116,7 +110,7 @@ def metallic_roughness(part: Part) -> np.ndarray:
     maps = [part.material.roughness, part.material.metallic]
     size = np.max([value.shape for value in maps if value.ndim == 2] or [(1, 1)], axis=0)
     large = [upsample(np.broadcast_to(x, x.shape or (1, 1))[..., None], size)[..., 0] for x in maps]
-    return _bytes(np.stack([np.ones(tuple(size)), *large], -1))
+    return quantized(np.stack([np.ones(tuple(size)), *large], -1))
 
 
 def normal_map(part: Part) -> np.ndarray | None:
@@ -131,7 +125,7 @@ def normal_map(part: Part) -> np.ndarray | None:
     flipped = values.copy()
     mirrored = mirrored_texels(part, *values.shape[:2])
     flipped[mirrored, 1] = 1 - flipped[mirrored, 1]
-    return _bytes(flipped)
+    return quantized(flipped)
 
 
 def mirrored_texels(part: Part, height: int, width: int) -> np.ndarray:
@@ -155,7 +149,3 @@ def mirrored_texels(part: Part, height: int, width: int) -> np.ndarray:
     nearest: Any = ndimage.distance_transform_edt(label == 0, return_distances=False, return_indices=True)
     rows, columns = nearest
     return label[rows, columns] == 2
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return (np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8)

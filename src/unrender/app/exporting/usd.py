@@ -13,6 +13,7 @@ import numpy as np
 from unrender.app.exporting import textures
 from unrender.app.exporting.asset import Asset, Part
 from unrender.core.errors import InputError
+from unrender.display.pictures import png
 
 FILE = "asset.usdz"
 
@@ -88,7 +89,7 @@ def _material(stage: Any, path: str, part: Part, place: Path) -> Any:
 
     def connect(name: str, kind: Any, pixels: np.ndarray, channel: str, space: str) -> Any:
         file = place / f"{Path(path).name}-{name}.png"
-        file.write_bytes(textures.png(pixels))
+        file.write_bytes(png(pixels))
         texture: Any = UsdShade.Shader.Define(stage, f"{path}/{name}")
         texture.CreateIdAttr("UsdUVTexture")
         texture.CreateInput("file", types.Asset).Set(f"./{file.name}")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import base64
-import io
 from dataclasses import dataclass
 
 import numpy as np
 
 from unrender.display import formatting
+from unrender.display.pictures import data_uri
 from unrender.runs.folder.reader import RunFolder
 from unrender.scene.surfaces import area_normals
 
@@ -104,6 +104,4 @@ def _picture(solids: list[tuple[np.ndarray, np.ndarray]]) -> str:
         for face in np.argsort(rotated[faces][:, :, 2].sum(axis=1)):  # painter's algorithm: the farthest face first
             grey = int(255 * shade[face])
             draw.polygon([tuple(p) for p in at[faces[face]].tolist()], fill=(grey, grey, grey, 255))
-    buffer = io.BytesIO()
-    image.save(buffer, "PNG")
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return data_uri(image)

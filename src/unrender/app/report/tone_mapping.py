@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import base64
-import io
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from PIL import Image
 
+from unrender.display.pictures import png
 from unrender.io.resampling import reduced
 from unrender.losses.metrics import exposure, srgb
 
@@ -96,9 +95,7 @@ class PictureData:
         else:
             with np.errstate(over="ignore"):
                 colours = srgb(shown * (self.factor * exposure))
-        buffer = io.BytesIO()
-        Image.fromarray((colours * 255 + 0.5).astype(np.uint8)).save(buffer, "PNG", compress_level=effort)
-        return buffer.getvalue()
+        return png(colours, effort)
 
 
 def inline(picture: PictureData) -> str:
