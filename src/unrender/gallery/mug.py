@@ -98,12 +98,7 @@ def _labelled(glaze: dict[str, Any], cup: np.ndarray, texels: int) -> dict[str, 
     middle = np.zeros((3, 3), np.float32)
     middle[1, 1] = 1.0
     weight = textures.bitmap(middle) | {"filter_type": "nearest", "to_uv": ninth @ inside}
-    return {
-        "type": "blendbsdf",
-        "weight": weight,
-        "glaze": glaze,
-        "label": {"type": "diffuse", "reflectance": picture},
-    }
+    return {"type": "blendbsdf", "weight": weight, "glaze": glaze, "label": {"type": "diffuse", "reflectance": picture}}
 
 
 def _pieces() -> list[meshes.Sheet]:

@@ -250,12 +250,7 @@ class AveragedNewton:
         return min(change * radius, self.trust_radius)
 
     def _step(
-        self,
-        matrix: np.ndarray,
-        gradient: np.ndarray,
-        noise: np.ndarray,
-        outwards: np.ndarray,
-        radius: float,
+        self, matrix: np.ndarray, gradient: np.ndarray, noise: np.ndarray, outwards: np.ndarray, radius: float
     ) -> np.ndarray:
         """Return the step of one block, in units of the trust region. Elements at a bound that would leave it stay there."""
         step, free = np.zeros_like(gradient), np.full(gradient.size, True)

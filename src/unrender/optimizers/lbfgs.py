@@ -14,13 +14,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.directions import (
-    NewtonState,
-    apply_direction,
-    check_options,
-    coordinate_scales,
-    init_state,
-)
+from unrender.optimizers.directions import NewtonState, apply_direction, check_options, coordinate_scales, init_state
 from unrender.schedules.functions import Schedule
 
 _FIRST_STEP = 0.1

@@ -13,13 +13,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, HessianProduct, LossFunction
 from unrender.optimizers.adam import Adam
-from unrender.optimizers.directions import (
-    NewtonState,
-    apply_direction,
-    check_options,
-    coordinate_scales,
-    init_state,
-)
+from unrender.optimizers.directions import NewtonState, apply_direction, check_options, coordinate_scales, init_state
 from unrender.schedules.functions import Schedule
 
 

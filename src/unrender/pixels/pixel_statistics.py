@@ -98,10 +98,7 @@ def reference_means(problem: Problem, tiles: Tiles) -> np.ndarray:
         image = np.asarray(view.reference)
         rows, columns = np.arange(grid.rows) * grid.side, np.arange(grid.columns) * grid.side
         sums = np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
-        sizes = np.outer(
-            np.diff([*rows, image.shape[0]]),
-            np.diff([*columns, image.shape[1]]),
-        )
+        sizes = np.outer(np.diff([*rows, image.shape[0]]), np.diff([*columns, image.shape[1]]))
         means.append(sums / sizes[..., None])
     return tiles.join(means).astype(np.float32)
 

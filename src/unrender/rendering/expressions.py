@@ -18,23 +18,10 @@ from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.io import bounded_files
 from unrender.rendering.expression_texts import Function, parse
-from unrender.rendering.renderer import (
-    ParameterInfo,
-    Renderer,
-    RenderSession,
-    SampleRequest,
-    Space,
-    differentiated,
-)
+from unrender.rendering.renderer import ParameterInfo, Renderer, RenderSession, SampleRequest, Space, differentiated
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
-__all__ = [
-    "Expression",
-    "ExpressionRenderer",
-    "are_storable",
-    "expression_layer",
-    "with_expressions",
-]
+__all__ = ["Expression", "ExpressionRenderer", "are_storable", "expression_layer", "with_expressions"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,11 +88,7 @@ def view_request(problem: Problem, view: int, spp: int, seed: int) -> SampleRequ
 
 @exclusive("render_pair")
 def render_pair(
-    problem: Problem,
-    current: Mapping[str, np.ndarray],
-    previous: Mapping[str, np.ndarray],
-    spp: int,
-    seed: int,
+    problem: Problem, current: Mapping[str, np.ndarray], previous: Mapping[str, np.ndarray], spp: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Render view 0 in two states with the same paths, which are traced in the current state. Both images are unbiased.
 

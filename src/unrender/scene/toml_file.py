@@ -56,8 +56,7 @@ _Number = StrictFloat | StrictInt
 
 class _Parameter(Table):
     key: StrictStr = Field(
-        "",
-        description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"; with keys, any name',
+        "", description='the name of a scene parameter, such as "wall.bsdf.reflectance.value"; with keys, any name'
     )
     keys: list[StrictStr] | dict[str, _Number] | None = Field(
         None, description='scene parameters that share one value, such as ["a.value", "b.value"], or factors by key'
@@ -75,8 +74,7 @@ class _Parameter(Table):
         description='a list of steps such as [200, 400], or a table such as { steps = [200, 400], states = "reset" }',
     )
     parameterisation: StrictStr | dict[str, Any] | None = Field(
-        None,
-        description='"identity", "log", "logit", "softplus" or, with a scale, "softplus(0.1)"',
+        None, description='"identity", "log", "logit", "softplus" or, with a scale, "softplus(0.1)"'
     )
     regularizer: dict[str, Any] | None = Field(
         None, description="for vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"

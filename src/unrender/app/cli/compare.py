@@ -59,8 +59,7 @@ _Methods = Annotated[
 def compare(
     context: typer.Context,
     what: Annotated[
-        list[str],
-        typer.Argument(metavar="PROBLEM | DIR...", help="A problem to run, or earlier run folders."),
+        list[str], typer.Argument(metavar="PROBLEM | DIR...", help="A problem to run, or earlier run folders.")
     ],
     methods: _Methods = None,
     settings: Annotated[

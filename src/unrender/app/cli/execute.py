@@ -180,10 +180,7 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
         if key in result.data_share:
             table.add_row(f"± {escape(key)}", _map_line(error, result.data_share[key]))
             continue
-        table.add_row(
-            f"± {escape(key)}",
-            f"{', '.join(map(formatting.deviation, np.ravel(error)))} (standard error)",
-        )
+        table.add_row(f"± {escape(key)}", f"{', '.join(map(formatting.deviation, np.ravel(error)))} (standard error)")
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
     console.print(table)

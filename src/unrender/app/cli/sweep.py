@@ -60,8 +60,7 @@ _Trials = Annotated[
     int | None, typer.Option(min=1, max=MOST_TRIALS, help="Number of trials of random and tpe. [default: 16]")
 ]
 _Prune = Annotated[
-    bool,
-    typer.Option("--prune", help="Stop runs whose error is, and would end, above the median of earlier trials."),
+    bool, typer.Option("--prune", help="Stop runs whose error is, and would end, above the median of earlier trials.")
 ]
 _Window = Annotated[
     int | None,

@@ -99,12 +99,7 @@ def open_job(job: Job) -> Iterator[None]:
 
 
 def carry_out(
-    job: Job,
-    task: RunTask,
-    problem: Problem,
-    console: Console,
-    progress: Progress,
-    callbacks: Sequence[Callback] = (),
+    job: Job, task: RunTask, problem: Problem, console: Console, progress: Progress, callbacks: Sequence[Callback] = ()
 ) -> RunOutcome:
     """Run a task, or continue its earlier attempt, and return its outcome. Raise `InputError` as `optimize` and `resume_run` do."""
     folder = Path(job.folder, task.name)

@@ -24,8 +24,7 @@ def watch(
     directories: Annotated[
         list[Path],
         typer.Argument(
-            metavar="DIR...",
-            help="Run folders of running, finished or future runs; or folders of sweeps or stages.",
+            metavar="DIR...", help="Run folders of running, finished or future runs; or folders of sweeps or stages."
         ),
     ],
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on 127.0.0.1; 0 selects a free one.")] = 0,

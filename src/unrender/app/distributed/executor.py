@@ -23,11 +23,7 @@ from unrender.estimators.path import PathGradient
 from unrender.estimators.sample_groups import GradientRequest, GradientSample
 from unrender.images.denoised import Denoised
 from unrender.images.plain import Plain
-from unrender.images.recursive_control_variate import (
-    RecursiveControlVariate,
-    RecursiveControlVariateState,
-    Snapshot,
-)
+from unrender.images.recursive_control_variate import RecursiveControlVariate, RecursiveControlVariateState, Snapshot
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.pixel_statistics import PilotRequest

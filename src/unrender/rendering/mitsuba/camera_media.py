@@ -44,8 +44,7 @@ def camera_media(scene: Any, quiet: bool = False) -> list[Any]:
             medium = _surrounding(scene, sensor)
             if medium is not None and not quiet:
                 _log.warning(
-                    "sensor %s: it names no medium, but is inside one; it is rendered inside this medium",
-                    sensor.id(),
+                    "sensor %s: it names no medium, but is inside one; it is rendered inside this medium", sensor.id()
                 )
         result.append(medium)
     return result

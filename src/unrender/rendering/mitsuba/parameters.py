@@ -41,10 +41,7 @@ MOVED_MIRROR = (
 )
 _MIXED = "its BSDF mixes perfectly specular lobes with others"
 _COMPUTED_OR_FIXED = (NORMALS, TEXCOORDS)
-_REFUTED = {
-    "RoughDielectric": {"alpha", "alpha_u", "alpha_v", "eta"},
-    "PrincipledThin": {"roughness", "anisotropic"},
-}
+_REFUTED = {"RoughDielectric": {"alpha", "alpha_u", "alpha_v", "eta"}, "PrincipledThin": {"roughness", "anisotropic"}}
 """{class of a BSDF: slots whose path gradients disagree with finite differences}."""
 _LIGHT = ("radiance", "intensity", "irradiance")
 _REFLECTANCE = (

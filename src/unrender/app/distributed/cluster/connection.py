@@ -204,11 +204,7 @@ def connect(
         if name == "auto":
             name = variant.with_colours_of(variant.CUDA if gpu else variant.LLVM, variant.current())
         yield Cluster(
-            ray,
-            name,
-            share(machines, workers.count, gpu, most),
-            workers.address or address,
-            HeadNode(gcs_address),
+            ray, name, share(machines, workers.count, gpu, most), workers.address or address, HeadNode(gcs_address)
         )
 
 

@@ -65,12 +65,7 @@ class AovKernel:
         return dr.select(hit, mi.Spectrum(vector.x, vector.y, vector.z), 0)
 
     def vertices(
-        self,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        geometry: Any = None,
+        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
     ) -> Float:
         """Return the number of vertices per lane, see `PathKernel.vertices`: 1 where the ray hits a surface, else 0."""
         del tables, sampler

@@ -72,12 +72,7 @@ class PathKernel(Protocol):
         ...
 
     def vertices(
-        self,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        geometry: Any = None,
+        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
     ) -> Float:
         """Return the number of vertices of each lane's path, without the camera's. For the arguments, see `sample`."""
         ...

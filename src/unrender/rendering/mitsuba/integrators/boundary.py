@@ -228,9 +228,7 @@ class BoundaryIntegrator:
         number = dr.arange(mi.UInt32, 2 * count)
         lane = number % count
         target = dr.select(
-            number < count,
-            dr.gather(mi.Point3f, segment.inside, lane),
-            dr.gather(mi.Point3f, segment.outside, lane),
+            number < count, dr.gather(mi.Point3f, segment.inside, lane), dr.gather(mi.Point3f, segment.outside, lane)
         )
         active = dr.gather(mi.Bool, eye.active, lane)
         origin = dr.gather(mi.Point3f, mi.Point3f(eye.first.spawn_ray(segment.direction).o), lane)

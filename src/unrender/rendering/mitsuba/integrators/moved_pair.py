@@ -65,12 +65,7 @@ class MovedPair:
         self.max_depth, self.rr_depth, self.share, self.areas, self.shared = max_depth, rr_depth, share, areas, shared
 
     def sample(
-        self,
-        scenes: tuple[Any, Any],
-        tables: Mapping[str, Any],
-        sampler: Any,
-        choices: Any,
-        rays: tuple[Any, Any],
+        self, scenes: tuple[Any, Any], tables: Mapping[str, Any], sampler: Any, choices: Any, rays: tuple[Any, Any]
     ) -> tuple[Spectrum, Spectrum]:
         """Trace one path of each state per lane. Call under `dr.suspend_grad()`.
 

@@ -74,14 +74,7 @@ class BsdfDirection:
         weights: for each state, sampling weights; detached.
     """
 
-    def __init__(
-        self,
-        bs: mi.BSDFSample3f,
-        pdf: Float,
-        delta: Bool,
-        values: list[Spectrum],
-        weights: list[Spectrum],
-    ):
+    def __init__(self, bs: mi.BSDFSample3f, pdf: Float, delta: Bool, values: list[Spectrum], weights: list[Spectrum]):
         self.bs, self.pdf, self.delta, self.values, self.weights = bs, pdf, delta, values, weights
 
 
@@ -133,12 +126,7 @@ class PathPair:
         return path.δL if context.forward else path.L[0], path.L[1] if pair else None
 
     def vertices(
-        self,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        geometry: Any = None,
+        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
     ) -> Float:
         context = PathContext(dr.ADMode.Primal, scene, tables, (), False, geometry)
         path, _ = while_loop(**self._loop(context, self._begin(context, ray), sampler))

@@ -42,12 +42,7 @@ class PrbKernel:
         return self._integrator.sample(mode, scene, sampler, ray, δL, state_in, mi.Bool(active))[0], None
 
     def vertices(
-        self,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        geometry: Any = None,
+        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
     ) -> Float:
         """Return the number of vertices per lane of paths with the same distribution, see `PathKernel.vertices`."""
         return PathPair(*self._depths).vertices(scene, tables, sampler, ray, geometry)

@@ -97,12 +97,7 @@ def on_its_side(si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f) -> Bool:
 
 
 def sampling_weights(
-    values: Sequence[Spectrum],
-    pdf: Float,
-    weight: Spectrum,
-    smooth: Bool,
-    delta: Bool,
-    own_pdf: Float,
+    values: Sequence[Spectrum], pdf: Float, weight: Spectrum, smooth: Bool, delta: Bool, own_pdf: Float
 ) -> list[Spectrum]:
     """Return the sampling weight of each state for a direction that the current state sampled.
 

@@ -15,11 +15,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
 from unrender.rendering.mitsuba.integrators.base import largest, total
-from unrender.rendering.mitsuba.integrators.majorant_supergrid import (
-    DdaState,
-    HomogeneousMajorant,
-    SupergridTraversal,
-)
+from unrender.rendering.mitsuba.integrators.majorant_supergrid import DdaState, HomogeneousMajorant, SupergridTraversal
 
 _FAINT = 0.1
 """Transmittance below which Russian roulette may terminate tracking."""
@@ -275,12 +271,7 @@ class DifferentialRatioTracking:
 
 @dr.syntax
 def update_reservoir(
-    reservoir: Reservoir,
-    segment: MediumSegment,
-    depth: UInt32,
-    β: Sequence[Spectrum],
-    sampler: Any,
-    active: Bool,
+    reservoir: Reservoir, segment: MediumSegment, depth: UInt32, β: Sequence[Spectrum], sampler: Any, active: Bool
 ) -> Reservoir:
     """Sample points of a segment in proportion to transmittance only, by differential ratio tracking (Nimier-David et al. 2022).
 

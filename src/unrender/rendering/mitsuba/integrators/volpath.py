@@ -112,12 +112,7 @@ class VolumePair:
         return path.δL if context.forward else path.L[0], path.L[1] if pair else None
 
     def vertices(
-        self,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        geometry: Any = None,
+        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
     ) -> Float:
         """Return the number of vertices of each lane's path. Index-matched boundaries do not count."""
         del geometry
