@@ -23,9 +23,9 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.internals import dr
+from benchmarks.internals import Tree, dr
 from benchmarks.pixel_schemes import PAPERS, pixels
-from benchmarks.races import Entrant, Runs, follow, over, race, reached, scaled, tenths
+from benchmarks.races import Entrant, Measure, Runs, follow, over, race, reached, scaled, tenths
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 
@@ -45,7 +45,7 @@ TASKS: dict[str, tuple[str, dict[str, Any], int]] = {
 }
 """Problem, its options, pixels a step."""
 RATES = (0.01, 0.03)
-MERGE = ("entries.*.methods", "seconds_per_path.*", "levels")
+MERGE = ("entries.*.methods", "seconds_per_path.*", "levels.*")
 QUICK = {"problem": ("two-planets",), "seconds": 0.3, "seeds": 2, "resolution": 16, "count": 32, "rounds": 2}
 
 
@@ -79,8 +79,21 @@ def race_levels(count: int, steps: int, seeds: int, only: tuple[str, ...], optio
     for name, own in ((name, own) for name, own in LEVELS.items() if not only or name in only):
         sampler = ur.pixels.Uniform(count) if own is None else ur.pixels.Adaptive(count, **own)
         chosen.append(Entrant(name, name, ur.PathGradient(pixels=sampler, spp=2), adam, RATES[:1]))
-    methods = race(ur.gallery.problem("plain-and-textured", **options), chosen, seeds, points=4, steps=steps)
+    problem = ur.gallery.problem("plain-and-textured", **options)
+    methods = race(problem, chosen, seeds, measure=by_object(problem), by="both", points=4, steps=steps)
     return {"options": options, "count": count, "steps": steps, "seeds": seeds, "methods": methods}
+
+
+def by_object(problem: ur.Problem) -> Measure:
+    """Measure the error of each object's reflectance relative to the start, and the mean over both objects under the name "both"."""
+    start = problem.parameter_error(problem.initial())
+
+    def measure(parameters: Tree) -> dict[str, float]:
+        errors = problem.parameter_error(parameters)
+        relative = {key.partition(".")[0]: error / start[key] for key, error in errors.items()}
+        return {"both": sum(relative.values()) / len(relative), **relative}
+
+    return measure
 
 
 def costs(
@@ -175,10 +188,11 @@ def table(record: Record) -> str:
     """All races in one table; then per task final errors, and ratios to uniform at checkpoints."""
     parts = [all_races(record)] if record["entries"] else []
     for name, entry in record.get("levels", {}).items():
-        row = "{method} | {rate:g} | {final!m}"
+        head = "pixels | rate | error of both objects | of the textured one | of the plain one"
+        row = "{method} | {rate:g} | {final[both]!m} | {final[cushion]!m} | {final[bin]!m}"
         parts += [
             f"**One level against five**, `plain-and-textured`, {name} and {entry['steps']} steps, falling rates, {entry['seeds']} seeds.",
-            markdown.records("pixels | rate | error", row, markdown.named(entry["methods"], "method")),
+            markdown.records(head, row, markdown.named(entry["methods"], "method")),
         ]
     for name, entry in record["entries"].items():
         over = entry["over uniform"]
@@ -227,7 +241,9 @@ def plot(record: Record) -> figures.Figure:
         }
         for name, entry in record["entries"].items()
     } | {
-        f"one level or five, {name}": {of: figures.points(run["runs"]) for of, run in entry["methods"].items()}
+        f"one level or five, texture, {name}": {
+            of: figures.points(run["runs"]["cushion"]) for of, run in entry["methods"].items()
+        }
         for name, entry in record.get("levels", {}).items()
     }
     return figures.curves(panels, "seconds")
