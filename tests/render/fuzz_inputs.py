@@ -2,6 +2,7 @@
 
 `python tests/render/fuzz_inputs.py --seconds 600` takes in inputs until the time is over and prints a line for each that was neither
 refused in one line nor taken: those whose process died or hung, raised anything but `InputError`, or took more than a gigabyte.
+How files are damaged is in `fuzz_changes.py`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ import functools
 import io
 import json
 import random
-import re
 import shutil
 import struct
 import sys
@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fuzz_changes import damaged
 from hostile_inputs import KEY, Hostile, ply, scene, serialized, write_scene
 from hostile_worker import Outcome, take_in
 
@@ -46,91 +47,12 @@ LONGEST = 120.0
 SLOWEST = 10.0
 """Processor seconds from which on an input counts as hung."""
 
+_FEWEST, _REPORT = 20, 100.0
+"""Least number of inputs of each target between two reports, and seconds that are aimed at."""
+
 Files = dict[str, bytes]
 Use = Callable[[Path, str], Any]
 """Takes in a folder of files, of which the named one is damaged."""
-
-# ---------------------------------------------------------------------- damage
-
-_WHOLE = (
-    0,
-    1,
-    2,
-    3,
-    127,
-    128,
-    255,
-    256,
-    32767,
-    32768,
-    65535,
-    65536,
-    2**31 - 1,
-    2**31,
-    2**32 - 1,
-    2**62,
-    2**63 - 1,
-    2**64 - 1,
-)
-_WORDS = (
-    *(b"-1", b"0", b"1e999", b"nan", b"-inf", b"99999999999999999999", b"1e-320", b"true", b"null", b"[]", b"{}", b'""', b"' '"),
-    *(b"../../../etc/passwd", b"/dev/zero", b"\0", b"\xff\xfe", b"\xed\xa0\x80", b"[" * 300, b"{" * 300, b"#", b'"', b"\n", b"<", b"&a;"),
-)  # fmt: skip
-
-
-def damaged(data: bytes, draw: random.Random) -> bytes:
-    """The bytes after one to eight random changes."""
-    found = bytearray(data)
-    for _ in range(draw.choice((1, 1, 1, 2, 3, 8))):
-        draw.choice(_CHANGES)(found, draw)
-    return bytes(found)
-
-
-def _flip(data: bytearray, draw: random.Random) -> None:
-    if data:
-        data[draw.randrange(len(data))] ^= 1 << draw.randrange(8)
-
-
-def _byte(data: bytearray, draw: random.Random) -> None:
-    if data:
-        data[draw.randrange(len(data))] = draw.choice((0, 1, 0x7F, 0x80, 0xFF, draw.randrange(256)))
-
-
-def _number(data: bytearray, draw: random.Random) -> None:
-    kind, value = draw.choice("HIQ"), draw.choice(_WHOLE)
-    packed = struct.pack(draw.choice("<>") + kind, value % (1 << 8 * struct.calcsize("<" + kind)))
-    at = draw.randrange(max(min(len(data), draw.choice((64, 512, len(data) or 1))), 1))
-    data[at : at + len(packed)] = packed
-
-
-def _word(data: bytearray, draw: random.Random) -> None:
-    """Put a word in place of a number or name of a text."""
-    spans = [match.span() for match in re.finditer(rb"[\w.+-]+", bytes(data[:4096]))]
-    start, end = draw.choice(spans) if spans else (0, 0)
-    data[start:end] = draw.choice((*_WORDS, str(draw.choice(_WHOLE)).encode()))
-
-
-def _cut(data: bytearray, draw: random.Random) -> None:
-    start = draw.randrange(len(data) + 1)
-    del data[start : draw.choice((len(data), start + 1, start + draw.randrange(1, 64)))]
-
-
-def _repeat(data: bytearray, draw: random.Random) -> None:
-    start = draw.randrange(len(data) + 1)
-    part = bytes(data[start : start + draw.randrange(1, 200)])
-    data[start:start] = part * draw.choice((1, 1, 2, 1000))
-
-
-def _swap(data: bytearray, draw: random.Random) -> None:
-    length = draw.randrange(1, 40)
-    first, second = (draw.randrange(len(data) + 1) for _ in range(2))
-    data[first : first + length], data[second : second + length] = (
-        bytes(data[second : second + length]),
-        bytes(data[first : first + length]),
-    )
-
-
-_CHANGES = (_flip, _byte, _number, _number, _word, _word, _cut, _repeat, _swap)
 
 # ---------------------------------------------------------------------- sound files
 
@@ -380,7 +302,7 @@ class _Inputs(Mapping[str, Hostile]):
             which = draw.choice(sorted(given))
             for file, data in given.items():
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
-                (folder / file).write_bytes(damaged(data, draw) if file == which else data)
+                (folder / file).write_bytes(damaged(file, data, draw) if file == which else data)
             if use is _use_capture:
                 (folder / "photo.png").write_bytes(_picture_files()["a.png"])
             return lambda: use(folder, which)
@@ -402,9 +324,10 @@ def names(first: int, count: int, targets: Sequence[str] = ()) -> list[str]:
     return [f"{target} {seed}" for seed in range(first, first + count) for target in targets or TARGETS]
 
 
-def warm_up(place: Path) -> None:
-    """Take in sound files, once: what is loaded then is no input's doing. Raises where one is refused."""
-    for target, (files, use) in TARGETS.items():
+def warm_up(place: Path, names: Sequence[str]) -> None:
+    """Take in the sound files of these inputs, once: what is loaded then is no input's doing. Raises where one is refused."""
+    for target in dict.fromkeys(name.partition(" ")[0] for name in names):
+        files, use = TARGETS[target]
         for index, name in enumerate(files()):
             folder = place / f"{target}-{index}"
             for file, data in files().items():
@@ -455,25 +378,26 @@ def _main() -> int:
     options = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else "")
     options.add_argument("--seconds", type=float, default=60.0)
     options.add_argument("--first", type=int, default=0, help="seed of the first input")
-    options.add_argument("--batch", type=int, default=100, help="inputs of each target between two reports")
     options.add_argument("--targets", nargs="+", default=list(TARGETS), choices=TARGETS, help="kinds of inputs")
     given = options.parse_args()
-    end, first = time.monotonic() + given.seconds, given.first
+    end, first, count = time.monotonic() + given.seconds, given.first, _FEWEST
     found: list[str] = []
     tallies = {target: Tally() for target in given.targets}
-    while time.monotonic() < end:
-        with tempfile.TemporaryDirectory(prefix="fuzz") as place:
-            outcomes = take_in(
-                Path(__file__).stem, "INPUTS", names(first, given.batch, given.targets), Path(place), LONGEST
-            )
-        first += given.batch
-        for outcome in outcomes:
-            tallies[outcome.name.partition(" ")[0]].add(outcome)
-        for line in faults(outcomes):
+
+    def note(outcome: Outcome) -> None:
+        tallies[outcome.name.partition(" ")[0]].add(outcome)
+        for line in faults([outcome]):
             print(line, flush=True)
             found.append(line)
+
+    while (began := time.monotonic()) < end:
+        with tempfile.TemporaryDirectory(prefix="fuzz") as place:
+            take_in(Path(__file__).stem, "INPUTS", names(first, count, given.targets), Path(place), LONGEST, note)
+        first += count
         for target, tally in tallies.items():
             print(f"# {target}: {tally}; seeds {given.first} to {first - 1}", flush=True)
+        rate = count / (time.monotonic() - began)
+        count = max(int(rate * min(_REPORT, end - time.monotonic())), _FEWEST)
     return int(bool(found))
 
 

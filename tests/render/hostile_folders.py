@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +136,8 @@ HARMLESS = ("resume: a pipe as the controls",)
 """These do no harm, and the run goes on."""
 
 
-def warm_up(place: Path) -> None:
+def warm_up(place: Path, names: Sequence[str]) -> None:
     """What is done once in a process is no folder's doing."""
+    del names
     for use in (_resume, _page):
         _spoilt(lambda _: None, use)(place / use.__name__)()

@@ -8,7 +8,7 @@ import socket
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +64,9 @@ def problem(folder: Path, given: Any = None, key: str = KEY, **options: Any) -> 
     return lambda: ur.Problem(given, [ur.Parameter(key)], [ur.View(folder / "photo.npy")], **options)
 
 
-def warm_up(place: Path) -> None:
+def warm_up(place: Path, names: Sequence[str]) -> None:
     """What is done once in a process is no input's doing."""
+    del names
     write_scene(place, scene())
     problem(place)()
 

@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,21 +46,34 @@ class Outcome:
     bytes: int = 0
 
 
-def take_in(module: str, table: str, names: list[str], folder: Path, limit: float = 20.0) -> list[Outcome]:
-    """Take in the inputs of these names of a module's table, in processes that end where one hangs for `limit` seconds of the clock."""
+def take_in(
+    module: str,
+    table: str,
+    names: list[str],
+    folder: Path,
+    limit: float = 20.0,
+    note: Callable[[Outcome], None] = lambda outcome: None,
+) -> list[Outcome]:
+    """Take in the inputs of these names of a module's table, in processes that end where one hangs for `limit` seconds of the clock.
+
+    `note` is called with each outcome as it comes.
+    """
     left, found = list(names), []
     while left:
-        outcomes, end = _one_process(module, table, left, folder, limit)
+        outcomes, end = _one_process(module, table, left, folder, limit, note)
         found += outcomes
         left = left[len(outcomes) :]
         if left and end:
             found.append(Outcome(left.pop(0), "", end))
+            note(found[-1])
         elif left:
             raise RuntimeError("the process of hostile inputs ended too soon")
     return found
 
 
-def _one_process(module: str, table: str, names: list[str], folder: Path, limit: float) -> tuple[list[Outcome], str]:
+def _one_process(
+    module: str, table: str, names: list[str], folder: Path, limit: float, note: Callable[[Outcome], None]
+) -> tuple[list[Outcome], str]:
     command = [sys.executable, str(_HERE), module, table, str(folder)]
     (folder / "names").write_text("".join(f"{name}\n" for name in names))  # more than a pipe holds
     with (folder / "errors").open("wb") as errors, (folder / "names").open("rb") as given:
@@ -81,7 +95,9 @@ def _one_process(module: str, table: str, names: list[str], folder: Path, limit:
             continue
         data += block
         *lines, data = data.split(b"\n")
-        outcomes += [Outcome(**json.loads(line)) for line in lines]
+        for line in lines:
+            outcomes.append(Outcome(**json.loads(line)))
+            note(outcomes[-1])
         last = time.monotonic()
     process.stdout.close()
     status = process.wait()
@@ -99,16 +115,15 @@ def _tell(module: str, table: str, folder: Path) -> None:
     inputs = getattr(home, table)
     warm = folder / f"{os.getpid()}-warm"
     warm.mkdir()
-    home.warm_up(warm)
+    names = sys.stdin.read().splitlines()
+    home.warm_up(warm, names)
     limit = _status("VmSize") + _MEMORY
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    for number, line in enumerate(sys.stdin):
-        name = line.rstrip("\n")
+    for number, name in enumerate(names):
         place = folder / f"{os.getpid()}-{number}"
         place.mkdir()
         call = inputs[name](place)
-        Path("/proc/self/clear_refs").write_text("5")
-        before, started, clock = _status("VmRSS"), _seconds(), time.monotonic()
+        before, started, clock = _memory(), _seconds(), time.monotonic()
         kind, said = "taken", ""
         try:
             call()
@@ -116,7 +131,7 @@ def _tell(module: str, table: str, folder: Path) -> None:
             kind, said = "refused", str(error)
         except BaseException as error:
             kind, said = "raised", f"{type(error).__name__}: {str(error)[:300]}"
-        found = Outcome(name, said, kind, _seconds() - started, time.monotonic() - clock, _status("VmHWM") - before)
+        found = Outcome(name, said, kind, _seconds() - started, time.monotonic() - clock, _peak() - before)
         shutil.rmtree(place, ignore_errors=True)
         report.write(json.dumps(found.__dict__) + "\n")
         report.flush()
@@ -124,6 +139,22 @@ def _tell(module: str, table: str, folder: Path) -> None:
 
 def _seconds() -> float:
     return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+def _memory() -> int:
+    """Bytes that the process has, from which on `_peak` counts; those at its peak where the system cannot count anew."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return _peak()
+    return _status("VmRSS")
+
+
+def _peak() -> int:
+    try:
+        return _status("VmHWM")
+    except StopIteration:  # a kernel without it
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
 
 
 def _status(name: str) -> int:
