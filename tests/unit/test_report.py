@@ -16,6 +16,7 @@ from report_folders import KEY, Page, write_run
 from unrender.app import report
 from unrender.app.report import curves, panels, tone_mapping
 from unrender.display import formatting
+from unrender.losses import metrics
 from unrender.runs.folder.reader import read
 
 
@@ -106,11 +107,11 @@ def test_srgb_has_the_standards_values():
 
 def test_exposure_takes_the_references_percentile_to_its_place_and_ignores_a_lamp():
     flat = np.full((10, 10, 3), 0.02)
-    assert tone_mapping.exposure(flat) == pytest.approx(0.7 / 0.02)
+    assert metrics.exposure(flat) == pytest.approx(0.7 / 0.02)
     with_lamp = flat.copy()
     with_lamp[0, :4] = 50.0
-    assert tone_mapping.exposure(with_lamp) == pytest.approx(0.7 / 0.02)
-    assert tone_mapping.exposure(np.zeros((2, 2, 3))) == 1.0
+    assert metrics.exposure(with_lamp) == pytest.approx(0.7 / 0.02)
+    assert metrics.exposure(np.zeros((2, 2, 3))) == 1.0
 
 
 def test_all_pictures_of_a_view_have_the_references_exposure(tmp_path):
@@ -118,7 +119,7 @@ def test_all_pictures_of_a_view_have_the_references_exposure(tmp_path):
     reference = rng.uniform(0.01, 0.1, (6, 8, 3)).astype(np.float32)
     views = {"view0/reference": reference, "view0/initial": 2 * reference, "view0/result": 0.7 * reference}
     page = Page(report.page(write_run(tmp_path / "run", views=views)))
-    factor = tone_mapping.exposure(reference)
+    factor = metrics.exposure(reference)
     for alt, linear in {"the reference": 1.0, "the result": 0.7, "before the first step": 2.0}.items():
         expected = tone_mapping.srgb(linear * reference * factor) * 255
         assert np.abs(page.picture(f"View 0: {alt}") - expected).max() <= 0.51

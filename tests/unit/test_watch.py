@@ -21,6 +21,7 @@ from browser import chromium
 from unrender.app.report import tone_mapping
 from unrender.app.watch import Address, application
 from unrender.app.watch.server import listen
+from unrender.losses import metrics
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # newer ones of Starlette would rather have httpx's successor
@@ -132,7 +133,7 @@ def test_the_page_shows_a_finished_run(tmp_path):
     with np.load(run / "pictures.npz") as found:
         reference = found["view0/reference"]
     (address,) = {m[1] for m in re.finditer(r'src="(picture/\w+)"[^>]*alt="View 0: the reference"', page)}
-    factor = tone_mapping.exposure(reference)
+    factor = metrics.exposure(reference)
     for stops in (0, 1.5, -2):
         answer = asked.get(f"{address}?stops={stops}")
         assert answer.headers["content-type"] == "image/png"

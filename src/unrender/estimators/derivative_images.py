@@ -11,21 +11,6 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.statistics import scores
 
-__all__ = [
-    "MOST_AVERAGED",
-    "HalvedImage",
-    "HalvesMean",
-    "LossWeights",
-    "Products",
-    "differences",
-    "mean_residuals",
-    "noise_weights",
-    "products",
-    "references_have_noise",
-    "running_mean",
-    "squared_slope",
-]
-
 MOST_AVERAGED = 1 << 19
 """Largest number of pixels, times elements for derivative images, of images that are averaged over steps. Both halves take 12 MiB."""
 _RESIDUAL_ERRORS = 2.0

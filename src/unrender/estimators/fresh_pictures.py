@@ -20,8 +20,6 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, view_request
 from unrender.statistics import paired_losses
 
-__all__ = ["FreshPictures", "Picture", "is_finite"]
-
 _GROUPS = 4
 """Number of independent groups of each new image."""
 _LEAST_PATHS, _MOST_PATHS = 1 << 13, 1 << 22

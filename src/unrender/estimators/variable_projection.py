@@ -29,8 +29,6 @@ from unrender.scene.problem import Problem
 from unrender.scene.unknown import Unknown
 from unrender.scene.upsampling import Upsampler
 
-__all__ = ["IMAGES", "Response", "can_be_eliminated", "update_response"]
-
 IMAGES = 3
 """Number of images that a step renders of each view."""
 

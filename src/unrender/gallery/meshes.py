@@ -16,25 +16,6 @@ from unrender.rendering.mitsuba.described import load_described
 from unrender.rendering.mitsuba.description import load
 from unrender.scene.surfaces import Surface
 
-__all__ = [
-    "Ellipsoid",
-    "Sheet",
-    "around",
-    "centred",
-    "ellipsoid",
-    "icosphere",
-    "lathe",
-    "option",
-    "sheet",
-    "sheets",
-    "standing",
-    "surface",
-    "sweep",
-    "triangles",
-    "united",
-    "unrolled",
-]
-
 
 def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool = False) -> Any:
     """Return a smooth mesh through a grid of points.

@@ -12,8 +12,6 @@ from unrender.gallery import fields, parts, staging, textures
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
-__all__ = ["StageLights"]
-
 _START: dict[str, tuple[str, dict[str, float]]] = {
     "spot": ("rotation", {"x": 0.15, "z": -0.12}),
     "softbox": ("translation", {"x": -0.4, "y": 0.3, "z": 0.2}),

@@ -12,8 +12,6 @@ import numpy as np
 from unrender.gallery import parts
 from unrender.scene.parameter import Parameter
 
-__all__ = ["sun", "unknown"]
-
 
 def sun(towards: parts.Vector, *rgb: float) -> dict[str, Any]:
     """Return light from one direction.

@@ -16,9 +16,6 @@ from unrender.optimizers.adam import Adam
 from unrender.optimizers.directions import NewtonState, apply_direction, check_options, coordinate_scales, init_state
 from unrender.schedules.functions import Schedule
 
-__all__ = ["Newton", "NewtonState", "trust_region_step"]
-
-
 _SECULAR_ITERATIONS = 60
 
 

@@ -21,8 +21,6 @@ from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import SQUARES, Upsampler
 
-__all__ = ["GuidedOptions", "GuidedSampler", "GuidedSamplerState", "ImportanceRule", "Maps"]
-
 _FEWEST_PATHS, _FIRST_PATHS = 4096, 8
 """Default minimum of `samples`: fewer paths do not resolve the importance over the images.
 

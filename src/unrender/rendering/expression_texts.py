@@ -12,8 +12,6 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.errors import KeyedError
 
-__all__ = ["Function", "parse"]
-
 Function = Callable[[Any], Any]
 """A function of values by name; see `Expression`."""
 

@@ -21,8 +21,6 @@ from unrender.rendering.expression_texts import Function, parse
 from unrender.rendering.renderer import ParameterInfo, Renderer, RenderSession, SampleRequest, Space, differentiated
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
-__all__ = ["Expression", "ExpressionRenderer", "are_storable", "expression_layer", "with_expressions"]
-
 
 @dataclass(frozen=True, eq=False)
 class Expression:

@@ -17,16 +17,6 @@ from unrender.rendering.tied import TiedRenderer
 from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer
 from unrender.rendering.worlds import WorldsRenderer
 
-__all__ = [
-    "OF_PHOTOGRAPHS",
-    "check_response",
-    "member_values",
-    "scene_renderer",
-    "scene_values",
-    "sensors_with_rows",
-    "with_photographs",
-]
-
 OF_PHOTOGRAPHS = (POSES, VIGNETTING, EXPOSURE, RESPONSE)
 """Keys of the photographs' parameters, from the innermost renderer to the outermost. No scene has these keys."""
 

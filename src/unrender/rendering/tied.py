@@ -26,8 +26,6 @@ from unrender.rendering.renderer import (
 )
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
-__all__ = ["Tie", "TiedRenderer", "with_ties"]
-
 _ENCODED = ("normal", "direction")
 """Roles whose values represent vectors. Heights are numbers."""
 

@@ -30,8 +30,6 @@ from unrender.rendering.renderer import (
 )
 from unrender.rendering.wrapper import RendererWrapper
 
-__all__ = ["World", "WorldsRenderer", "with_worlds"]
-
 
 @dataclass(frozen=True, eq=False)
 class World:

@@ -15,8 +15,6 @@ from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree
 
-__all__ = ["add_field_directions", "fields_of"]
-
 _MOST_VALUES = 1 << 25
 """Values of all states of textures and grids up to which they are tested."""
 _PATHS, _MOST_LAUNCHES = 1 << 16, 4

@@ -26,8 +26,6 @@ from unrender.runs.numbers import Differences, Numbers
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
 
-__all__ = ["NumbersCheck", "check_numbers", "checked_keys", "compile_check", "pixel_weights"]
-
 _STREAM, _FIELDS = 4, 1 << 16
 """Stream of all random numbers, and index of those of textures and grids."""
 _PASSES, _CHANGES = 3, (64.0, 8.0, 4.0)

@@ -27,8 +27,6 @@ from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, interruptible
 from unrender.scene.problem import Problem
 
-__all__ = ["descend", "initialize", "prepare", "warm_up"]
-
 _ERRORS_PER_SECOND = 10.0
 _ERROR_PAUSE = 20.0
 """Ratio of the pause before the next measurement of the parameters' error to the measurement's duration."""

@@ -27,8 +27,6 @@ from unrender.runs.verification import misfit_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render, selected_views
 
-__all__ = ["Uncertainty", "no_maps", "of_residuals", "pixel_noise", "uncertainty"]
-
 _STREAM, _PASSES = 6, 4
 """Stream of the random numbers, and number of adjoints of each half of the residual."""
 _SPP, _PATHS = (8, 256), 1 << 20

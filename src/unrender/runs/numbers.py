@@ -15,8 +15,6 @@ from unrender.runs.image_sensitivity import mask_roots
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, selected_views
 
-__all__ = ["Differences", "Numbers"]
-
 _MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
 """Elements of all numbers and of one, up to which they are tested."""
 _MOST_VALUES = 1 << 25

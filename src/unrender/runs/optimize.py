@@ -44,8 +44,6 @@ from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree
 
-__all__ = ["RunAnnotations", "check", "connected", "estimate", "open_writer", "optimize"]
-
 
 @exclusive("optimize", long=True)
 def optimize(

@@ -12,8 +12,6 @@ from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, sensitivity
 from unrender.scene.problem import Problem
 
-__all__ = ["FEW_NEWTON_STEPS", "FEW_STEPS", "further_from_truth"]
-
 FEW_STEPS = 32
 """Number of steps below which a run with an improved image is unfinished, so that its parameters may still be converging."""
 FEW_NEWTON_STEPS = 8

@@ -16,16 +16,6 @@ from unrender.display import formatting
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
-__all__ = [
-    "DIFFERS",
-    "HasControlVariates",
-    "Misfit",
-    "control_variates",
-    "misfit",
-    "misfit_of_numbers",
-    "misfit_of_views",
-]
-
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
 _FEW_PIXELS, _OF_FEW = 96, 0.2

@@ -30,8 +30,6 @@ from unrender.statistics import paired_losses
 if TYPE_CHECKING:
     from unrender.runs.run import Run
 
-__all__ = ["Memory", "Verify", "compare_memory"]
-
 _SHARE = 0.004
 """Fraction of the run's paths for one new image; there are at most four."""
 _LARGER_SHARE, _PARTS = 0.01, 8

@@ -16,8 +16,6 @@ from unrender.rendering.expressions import expression_layer
 from unrender.scene.parameter import ties_of
 from unrender.scene.problem import Problem
 
-__all__ = ["differences", "digest", "fingerprint", "shortened"]
-
 _DIGEST = "sha256:"
 _MOST_OBJECTS, _MOST_SHOWN = 64, 6
 _known: weakref.WeakKeyDictionary[Problem, dict[str, str]] = weakref.WeakKeyDictionary()

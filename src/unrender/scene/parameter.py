@@ -21,8 +21,6 @@ from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.prior import Prior
 from unrender.scene.remeshing import Remeshing
 
-__all__ = ["Parameter", "ParameterSettings", "tied", "ties_of"]
-
 _LARGEST = float(np.finfo(np.float32).max)
 
 

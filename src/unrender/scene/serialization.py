@@ -21,8 +21,6 @@ from unrender.rendering.expressions import expression_layer
 from unrender.scene.problem import Problem
 from unrender.scene.unknown import Unknown
 
-__all__ = ["ARRAYS", "FILE", "origin", "save"]
-
 FILE, ARRAYS = "problem.toml", "problem"
 _INLINE = 64
 """Maximum number of elements of an array that is written into the file itself."""

@@ -10,8 +10,6 @@ import numpy as np
 
 from unrender.core.errors import InputError
 
-__all__ = ["Surface", "area_normals", "crossing_triangles", "folds", "surface_error"]
-
 _SAMPLES = 2000
 """Number of sample points on each surface."""
 _NEAR = 8

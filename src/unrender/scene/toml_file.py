@@ -49,8 +49,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["read"]
-
 _Number = StrictFloat | StrictInt
 
 

@@ -12,8 +12,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, mesh_files
 
-__all__ = ["Mesh", "check_installed", "decimate", "normals", "ply", "read", "smooth", "without_crumbs"]
-
 _SHRINK, _GROW = 0.5, -0.53
 _KINDS = (".ply", ".obj")
 

@@ -10,8 +10,6 @@ from unrender.app.capture.cameras import Lens
 from unrender.app.capture.capture import CapturedViews
 from unrender.app.capture.mesh import Mesh
 
-__all__ = ["Silhouettes", "overlap"]
-
 
 class Silhouettes:
     """Intersections of rays through pixel centres with a mesh.

@@ -28,8 +28,6 @@ from unrender.scene.notebook import describe_views
 from unrender.scene.problem import Problem
 from unrender.statistics import debiased
 
-__all__ = ["RunOrder", "execution", "image_error", "introduce", "summarise", "verified"]
-
 
 @dataclass(frozen=True)
 class RunOrder:

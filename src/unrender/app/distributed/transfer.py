@@ -17,8 +17,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem, open_scene
 from unrender.scene.view import View
 
-__all__ = ["packed", "unpacked"]
-
 _Owner = TypeVar("_Owner", View, Parameter)
 
 

@@ -39,8 +39,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.render import render
 
-__all__ = ["RECORD", "Judgement", "judge"]
-
 RECORD, LIGHT = "judge.json", "environment"
 _OWN = {RECORD, pictures.SHEET, pictures.FOLDER, f"{LIGHT}.png", f"{LIGHT}.exr"}
 _ALBEDO = ("base_color", "reflectance")

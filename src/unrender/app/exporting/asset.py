@@ -19,8 +19,6 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import mesh_layout, turntable_light
 from unrender.rendering.mitsuba.description import load
 
-__all__ = ["Asset", "Camera", "Part", "read", "read_environment"]
-
 _CONSTANT_SIZE = (16, 32)
 
 

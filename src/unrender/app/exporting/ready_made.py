@@ -20,8 +20,6 @@ from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.described import Recorded, recorded_descriptions
 
-__all__ = ["FilesOnly", "as_bitmap", "diffuse_description", "file_name", "make", "write_bitmap"]
-
 BITMAPS, VOLUMES, MESHES = "textures", "volumes", "meshes"
 """Names of the sub-folders of the files of a scene."""
 

@@ -33,8 +33,6 @@ from unrender.runs.folder import reader as folders
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree
 
-__all__ = ["SCENE", "Exported", "export"]
-
 SCENE = "scene.xml"
 _FOLDERS = {
     mi.ObjectType.Shape: ready_made.MESHES,

@@ -14,8 +14,6 @@ from unrender.core.errors import InputError
 from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba import mesh_layout
 
-__all__ = ["store"]
-
 _REFRACTING = ("dielectric", "roughdielectric", "thindielectric", "plastic", "roughplastic")
 _METALS = ("conductor", "roughconductor")
 _SPECTRA = ("regular", "irregular")

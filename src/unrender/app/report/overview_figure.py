@@ -14,6 +14,7 @@ from unrender.app.report import panels, tone_mapping
 from unrender.app.report.curves import Band
 from unrender.app.report.equal_time import Comparison, Metric
 from unrender.display import formatting, pictures, plots
+from unrender.losses import metrics
 
 _COLOURS = ("#2a6fdb", "#d9622b", "#1a9a6c", "#8a4fc4", "#b8860b", "#c2407f")
 _COLUMNS = 6
@@ -54,7 +55,7 @@ def _pictures(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
     if not first.views:
         return []
     view, of = next(iter(first.views.items()))
-    factor = tone_mapping.exposure(of.reference)
+    factor = metrics.exposure(of.reference)
     row = [("reference", of.reference)] + ([("start", of.initial)] if of.initial is not None else [])
     row += [(label, run.views[view].result) for label, run in comparison.representatives.items()]
     return [(title, tone_mapping.srgb(picture * factor)) for title, picture in row]

@@ -12,21 +12,9 @@ from unrender.app.report.tone_mapping import INLINE, ColourBar, Picture, Picture
 from unrender.core import periodic
 from unrender.display import formatting, pictures
 from unrender.display.pictures import is_map
+from unrender.losses import metrics
 from unrender.runs.folder.reader import RunFolder, ViewPictures
 from unrender.runs.image_sensitivity import around, insensitive
-
-__all__ = [
-    "ColourScale",
-    "Figure",
-    "Panel",
-    "Slider",
-    "is_map",
-    "map_of_methods",
-    "map_of_run",
-    "view_of_methods",
-    "view_of_run",
-]
-
 
 _TENS = -3.0
 """The lower end of the colour scale of a sensitivity: log₁₀ of the ratio to the greatest."""
@@ -85,7 +73,7 @@ def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE
         encoder: the encoder of the pictures.
         name: name of the result, "Current" while the run continues.
     """
-    factor = tone_mapping.exposure(shown.reference)
+    factor = metrics.exposure(shown.reference)
     what = name.lower()
     error = tone_mapping.absolute_error(shown.result, shown.reference)
     before = None if shown.initial is None else tone_mapping.absolute_error(shown.initial, shown.reference)
@@ -134,7 +122,7 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: Pictu
     It compares the result of each method with the reference and shows its error. All methods share one exposure and one error scale.
     """
     reference = next(iter(shown.values())).reference
-    factor = tone_mapping.exposure(reference)
+    factor = metrics.exposure(reference)
     errors = {label: tone_mapping.absolute_error(of.result, of.reference) for label, of in shown.items()}
     high = max(tone_mapping.colour_limit(error) for error in errors.values())
     stacks = tuple(
@@ -240,7 +228,7 @@ class ColourScale:
         finite = fixed_by[np.isfinite(fixed_by)]
         self.low, self.high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
         self.scalar = fixed_by.ndim == 2 or fixed_by.shape[-1] == 1
-        self.factor = 1.0 if self.scalar or self.high <= 1.0 else tone_mapping.exposure(fixed_by[..., :3])
+        self.factor = 1.0 if self.scalar or self.high <= 1.0 else metrics.exposure(fixed_by[..., :3])
         if self.scalar and self.high - self.low < 1e-6 * max(abs(self.high), 1.0):
             self.low, self.high = min(0.0, self.low), max(1.0, self.high)
 

@@ -10,28 +10,10 @@ import numpy as np
 
 from unrender.display.pictures import png
 from unrender.io.resampling import reduced
-from unrender.losses.metrics import exposure, srgb
+from unrender.losses.metrics import srgb
 
 _LARGEST = 1024
 _PIXELATED_BELOW = 400
-
-__all__ = [
-    "ERROR_COLORMAP",
-    "INLINE",
-    "VALUE_COLORMAP",
-    "ColourBar",
-    "Picture",
-    "PictureData",
-    "PictureEncoder",
-    "absolute_error",
-    "apply_colormap",
-    "colour_bar",
-    "colour_limit",
-    "error_bar",
-    "exposure",
-    "inline",
-    "srgb",
-]
 
 ERROR_COLORMAP = "inferno"
 """Colour map of error images."""

@@ -21,8 +21,6 @@ from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
-__all__ = ["StagedProblem"]
-
 
 @dataclass(frozen=True)
 class StagedProblem:

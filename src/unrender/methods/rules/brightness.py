@@ -14,8 +14,6 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
 from unrender.statistics.halves import normal_equations
 
-__all__ = ["start_factors"]
-
 _SEEDS = (11, 12)
 """Seeds of two independent halves."""
 _MOST_PIXELS = 1 << 19

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from unrender.estimators.derivative_images import MOST_AVERAGED
 from unrender.preconditioners import Sobolev
 
-__all__ = ["CONSTANTS", "Constants"]
-
 
 @dataclass(frozen=True)
 class Constants:

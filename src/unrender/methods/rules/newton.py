@@ -29,8 +29,6 @@ from unrender.scene.problem import Problem
 from unrender.schedules import Exponential
 from unrender.statistics.scores import positive_inverse
 
-__all__ = ["cameras", "cameras_by_paths", "few_numbers", "with_separate_block"]
-
 _TRIAL, _LEAST_EIGENVALUE = 3, 0.01
 """Stream of the random numbers of `_explained`, and relative eigenvalue below which its matrix counts as singular."""
 

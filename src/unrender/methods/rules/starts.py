@@ -18,8 +18,6 @@ from unrender.scene.parameter import ParameterSettings
 from unrender.statistics.halves import normal_equations
 from unrender.statistics.paired_losses import difference, mean_and_error
 
-__all__ = ["best_start"]
-
 _PER_DIMENSION, _MOST_PLACES = 16, 24
 """Number of compared places per dimension, and maximum number in all dimensions together."""
 _PATHS, _NUMBER = 1 << 15, 3

@@ -16,8 +16,6 @@ from unrender.scene.problem import Problem
 if TYPE_CHECKING:
     from unrender.methods.auto import AutoMethod
 
-__all__ = ["Traits", "refusal"]
-
 
 @dataclass(frozen=True)
 class Traits:

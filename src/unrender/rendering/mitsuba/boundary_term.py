@@ -27,8 +27,6 @@ from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.view_weights import ViewWeights, views_of
 from unrender.rendering.renderer import SampleRequest
 
-__all__ = ["BoundaryTerm", "moved_shape", "obstacles"]
-
 _STREAM = 3
 """Stream of a request's key, whose random numbers are independent of its paths."""
 

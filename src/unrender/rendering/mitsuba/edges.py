@@ -16,8 +16,6 @@ import numpy as np
 
 from unrender.rendering.mitsuba import mesh_layout
 
-__all__ = ["EdgePoints", "EdgeTable", "MeshEdges", "edges_of"]
-
 
 @dataclass(frozen=True)
 class MeshEdges:

@@ -17,8 +17,6 @@ import mitsuba as mi
 
 from unrender.backend import variant
 
-__all__ = ["is_gpu", "lookup_mask"]
-
 
 def is_gpu() -> bool:
     """Return whether the current variant runs on a GPU: textures are copies, and a kernel traces one scene."""

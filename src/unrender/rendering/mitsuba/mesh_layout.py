@@ -16,23 +16,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = [
-    "FACES",
-    "NORMALS",
-    "POSITIONS",
-    "TEXCOORDS",
-    "areas",
-    "at_vertices",
-    "build",
-    "faces",
-    "has_normals",
-    "has_texcoords",
-    "parameters",
-    "positions",
-    "traverse",
-    "vertex_positions",
-]
-
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 _RENAMED = {"positions": POSITIONS, "normals": NORMALS, "texcoords": TEXCOORDS}
 """{name from Mitsuba 3.10 on: name in this package}."""

@@ -17,19 +17,6 @@ from unrender.rendering.mitsuba.mesh_layout import FACES, NORMALS, POSITIONS, TE
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.parameter_errors import Role
 
-__all__ = [
-    "ParameterTraits",
-    "brightness",
-    "is_nonlinear",
-    "is_of_vertices",
-    "is_one_direction",
-    "normals_key",
-    "parameter_traits",
-    "role",
-    "transform_obstacle",
-    "update_obstacle",
-]
-
 # BSDFs whose delta lobes have directions that do not depend on the parameter. Sampling that lobe alone gives its value in the
 # previous state.
 _SIMPLE_DELTA = {"SmoothConductor", "SmoothDielectric", "ThinDielectric", "SmoothPlastic"}

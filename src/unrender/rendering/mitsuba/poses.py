@@ -30,20 +30,6 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.renderer import ParameterInfo
 
-__all__ = [
-    "Assembly",
-    "Pose",
-    "PoseKey",
-    "PosedScene",
-    "centres",
-    "info",
-    "is_bare",
-    "is_posable",
-    "keys",
-    "matrices",
-    "slots",
-]
-
 _AXES = ("x", "y", "z")
 _MOTIONS = ("translation", "rotation")
 _LIGHTS = {

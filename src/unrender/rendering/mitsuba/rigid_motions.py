@@ -14,8 +14,6 @@ from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.mesh_layout import NORMALS, POSITIONS
 from unrender.rendering.mitsuba.poses import Pose, PoseKey
 
-__all__ = ["RigidMotions", "lengths"]
-
 
 class RigidMotions:
     """Pose parameters of a loaded scene whose targets have vertices, a transformation or a position to write.

@@ -19,18 +19,6 @@ from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.renderer import ReplacedMesh
 
-__all__ = [
-    "Holders",
-    "ObjectGraph",
-    "all_shapes",
-    "children",
-    "class_name",
-    "has_instances",
-    "object_ids",
-    "refusal",
-    "replace_meshes",
-]
-
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "medium": "Medium", "shape": "Shape"}
 
 

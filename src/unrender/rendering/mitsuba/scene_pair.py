@@ -50,8 +50,6 @@ from unrender.rendering.mitsuba.scene_loading import (
 from unrender.rendering.mitsuba.tensors import native_shape
 from unrender.rendering.renderer import ParameterInfo, ReplacedMesh, SampleRequest
 
-__all__ = ["SINGLE", "ScenePair"]
-
 SINGLE = (
     "scene: a loaded mi.Scene has one state, but a control variate or meta-estimation needs two; give the .xml file or "
     "the dictionary instead, or use images.Plain()"

@@ -12,8 +12,6 @@ import numpy as np
 from unrender.rendering.mitsuba import gpu, mesh_layout
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
-__all__ = ["meshed", "moving_targets"]
-
 _ROWS, _COLUMNS = 64, 128
 """Rows and columns of the mesh. Its silhouette deviates from the sphere's by less than 1/1700 of the radius."""
 _PARTS = ("translation", "rotation", "scale", mesh_layout.POSITIONS)

@@ -25,20 +25,6 @@ from unrender.runs.folder import schema
 from unrender.runs.folder.schema import CHECKPOINTS, MANIFEST, STATE, Manifest
 from unrender.runs.folder.state import Packed
 
-__all__ = [
-    "FOLDER",
-    "KEEP",
-    "MANIFEST",
-    "STATE",
-    "Checkpoint",
-    "candidates",
-    "clear",
-    "latest",
-    "read",
-    "remove_partial",
-    "write",
-]
-
 FOLDER = CHECKPOINTS
 KEEP = 3
 """Maximum number of checkpoints in a run folder."""

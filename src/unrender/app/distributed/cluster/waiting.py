@@ -7,8 +7,6 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["Waiter"]
-
 _SLICE = 0.25
 """Longest wait of one call in seconds, and thereby longest delay of an exception that a handler raises."""
 _ANSWER = 10.0

@@ -12,8 +12,6 @@ import numpy as np
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 
-__all__ = ["FlatMirrors", "MirroredView", "glossy_radiance", "is_glossy"]
-
 _NEAR = 1e-3
 """Relative margin at the end of a shadow ray within which occluders are ignored."""
 _BOUNCES = 2
