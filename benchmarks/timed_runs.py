@@ -25,10 +25,11 @@ class Kept(ur.protocols.Callback):
     Args:
         seconds: of the processor.
         points: how many times parameters are kept.
+        steps: after which the run ends at the latest; None for no limit.
     """
 
-    def __init__(self, seconds: float, points: int = POINTS):
-        self._recorder = Recorder(seconds, points, timer=work_time)
+    def __init__(self, seconds: float, points: int = POINTS, steps: int | None = None):
+        self._recorder = Recorder(seconds, points, steps, timer=work_time)
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         try:

@@ -14,6 +14,8 @@ from zoo import scene
 from zscores import z_scores
 
 import unrender as ur
+from benchmarks.adaptive.over_uniform.run import by_paths, rough_box
+from benchmarks.internals import pixel_shares, second_moments
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -111,3 +113,23 @@ def test_chosen_pixels_of_several_sensors_are_those_of_each() -> None:
     z = np.abs(z_scores(drawn, apart))
     assert z.max() < stats.norm.isf((1 - (1 - 1e-3) ** (1 / z.size)) / 2)
     assert np.abs(z_scores(drawn[:, ::-1], apart)).max() > 10
+
+
+def test_first_map_of_a_rough_box_is_as_good_as_that_of_the_loss_derivative() -> None:
+    """Variance over that of uniform pixels, by paths that the maps have not seen: of twelve first maps of each sampler."""
+    box = rough_box(reference_spp=256)
+    at = box.initial()
+    (moments,) = second_moments(box, at, [np.ones(1)], 1 << 17, 8, Key(0, 7))
+
+    def logarithms(sampler: Any) -> np.ndarray:
+        drawn = (sampler.draw(box, at, sampler.init(box, at), Key(seed))[1] for seed in range(12))
+        return np.log([by_paths(moments, pixel_shares(box, sampler, state))[0] for state in drawn])
+
+    ours, loss = logarithms(ur.pixels.Adaptive(1000)), logarithms(ur.pixels.LossProportional(1000))
+    error = np.sqrt((ours.var(ddof=1) + loss.var(ddof=1)) / len(ours))
+    print(np.exp([ours.mean(), loss.mean()]), error)
+    assert ours.mean() < loss.mean() + 3 * error
+    assert np.exp(ours.max()) < 1.0, "no better than uniform pixels"
+    raw = logarithms(ur.pixels.Adaptive(1000, uniform=0.1, learn_from_draws=False, by_cost=False, denoiser="none"))
+    print(np.exp(raw.mean()))
+    assert raw.mean() > loss.mean() + 3 * error, "a planted worse map went unseen"

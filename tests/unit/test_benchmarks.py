@@ -6,6 +6,7 @@ import argparse
 import inspect
 import json
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,18 @@ def test_every_benchmark_is_whole_and_its_toy_sizes_are_options(benchmark: Bench
     names = add_options(parser, run.run)
     without_default = set(names) - set(defaults(run.run))
     assert not vars(parser.parse_args(["."] * len(without_default))).keys() - without_default
+
+
+def test_commands_of_figures_are_parsed(benchmark: Benchmark) -> None:
+    """Option names and choices: a method that no option names could not be run again."""
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    parser.add_argument("--plots-only", action="store_true")
+    add_options(parser, benchmark.module.run)
+    notes = (benchmark.folder / "notes.md").read_text()
+    for arguments in re.findall(
+        rf"^- .*: `python -m benchmarks {re.escape(benchmark.name)}(.*)`$", notes, re.MULTILINE
+    ):
+        parser.parse_args(shlex.split(arguments))
 
 
 def test_notes_are_dated_by_the_figures_they_speak_of(benchmark: Benchmark) -> None:

@@ -7,7 +7,8 @@ steps see and what the sampler minimises (of a single parameter the two are the 
 many independent ones of each sampler; standard errors from eighths of them. "By paths": the second moment of each pixel,
 from many paths of whole views, the two factors from different ones, weighted by the probabilities; the same paths judge
 both samplers, so it resolves what a few bright paths decide. Beside the default: pooling, which is the default where no
-denoiser is installed, and probabilities as they were before: a tenth uniform, maps of a few paths every 20 steps, raw.
+denoiser is installed, probabilities as they were before (a tenth uniform, maps of a few paths every 20 steps, raw), and
+those in proportion to the loss derivative (Eq. 5).
 Problems of the gallery, a Cornell box with a rough conductor, and scenes of others where assets are given.
 """
 
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +37,11 @@ GALLERY: dict[str, dict[str, Any]] = {
 }
 """Problems and their options."""
 FOREIGN = ("plates, L2", "painting, L2", "tray, L2", "numbers, L2")
-SAMPLERS: dict[str, dict[str, Any]] = {
-    "adaptive": {},
-    "adaptive, pooling": {"denoiser": "pooling"},
-    "before": {"uniform": 0.1, "learn_from_draws": False, "by_cost": False, "denoiser": "none"},
+SAMPLERS: dict[str, Callable[[int], PixelSampler]] = {
+    "adaptive": ur.pixels.Adaptive,
+    "adaptive, pooling": partial(ur.pixels.Adaptive, denoiser="pooling"),
+    "before": partial(ur.pixels.Adaptive, uniform=0.1, learn_from_draws=False, by_cost=False, denoiser="none"),
+    "loss": ur.pixels.LossProportional,
 }
 STEPS = (0, 1, 3, 10, 30, 100)
 """At which the variance is measured: those done before."""
@@ -140,7 +143,7 @@ def point(
 
 def descent(problem: ur.Problem, label: str, settings: dict[str, int], seed: int) -> list[dict[str, Any]]:
     """Ratios at each of `STEPS`."""
-    sampler = ur.pixels.Adaptive(settings["count"], **SAMPLERS[label])
+    sampler = SAMPLERS[label](settings["count"])
     kept = Kept(ur.PathGradient(pixels=sampler, spp=2), STEPS)
     ur.optimize(problem, kept, ur.optimizers.Adam(0.01), steps=STEPS[-1] + 1, seed=seed)
     return [

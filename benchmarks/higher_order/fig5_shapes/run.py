@@ -83,7 +83,6 @@ METHODS: dict[str, tuple[Make, tuple[float, ...]]] = {
     ),
 }
 """From a setting and the number of unknowns; and the settings that are tried."""
-TUNED = tuple(name for name in METHODS if name != "OurJoint, Adam")
 
 
 def problem(task: str, resolution: int, views: int, vertices: int, meshes: Path) -> ur.Problem:
@@ -93,9 +92,11 @@ def problem(task: str, resolution: int, views: int, vertices: int, meshes: Path)
     return shapes.banana(resolution, views, vertices)
 
 
-def one(problem: ur.Problem, make: Callable[[int], tuple[Any, Any]], seconds: float, seed: int) -> dict[str, Any]:
+def one(
+    problem: ur.Problem, make: Callable[[int], tuple[Any, Any]], seconds: float, steps: int | None, seed: int
+) -> dict[str, Any]:
     """One run: the images' loss at some steps."""
-    kept = Kept(seconds, _POINTS)
+    kept = Kept(seconds, _POINTS, steps)
     estimator, optimizer = make(trees.ravel(problem.initial()).size)
     ur.optimize(problem, estimator, optimizer, seconds=20 * seconds, seed=seed, callbacks=[kept])
     points = [problem.initial(), *(values for _, values in kept.found)]
@@ -108,20 +109,22 @@ def one(problem: ur.Problem, make: Callable[[int], tuple[Any, Any]], seconds: fl
     }
 
 
-def measure(made: ur.Problem, method: str, seconds: float, runs: int, setting: float | None) -> dict[str, Any]:
+def measure(
+    made: ur.Problem, method: str, seconds: float, steps: int | None, runs: int, setting: float | None
+) -> dict[str, Any]:
     """One method, tuned where no setting is given, over seeds 0, 1, ..."""
     make, settings = METHODS[method]
     if method != "CMA-ES":
         large = ur.preconditioners.LargeSteps(STRENGTH)
         made = with_preconditioner(made, large, *(p.key for p in made.parameters))
 
-    def descent(setting: float, budget: float, seed: int) -> dict[str, Any]:
-        return one(made, lambda n: make(setting, n), budget, seed)
+    def descent(setting: float, share: float, seed: int) -> dict[str, Any]:
+        return one(made, lambda n: make(setting, n), share * seconds, steps and max(round(share * steps), 1), seed)
 
     best, tried = setting, []
     if best is None:
-        best, tried = search(settings, lambda setting: descent(setting, seconds / 3, TUNING_SEED)["final"])
-    found = [descent(best, seconds, seed) for seed in range(runs)]
+        best, tried = search(settings, lambda setting: descent(setting, 1 / 3, TUNING_SEED)["final"])
+    found = [descent(best, 1.0, seed) for seed in range(runs)]
     print(made.name, method, best, tried, [run["final"] for run in found], flush=True)
     return {"setting": best, "tried": tried, "runs": found}
 
@@ -129,18 +132,20 @@ def measure(made: ur.Problem, method: str, seconds: float, runs: int, setting: f
 def run(
     task: tuple[str, ...] = TASKS,
     seconds: float = 60.0,
+    steps: int | None = None,
     runs: int = 1,
     resolution: int = 32,
     views: int = 2,
     vertices: int = shapes.VERTICES,
     meshes: Path = Path("../shared/assets/tutorials/meshes"),
-    only: tuple[str, ...] = TUNED,
+    only: tuple[str, ...] = tuple(METHODS),
     setting: float | None = None,
 ) -> Iterator[dict[str, Any]]:
     """A part per task and method.
 
     Args:
         seconds: processor time of a run
+        steps: after which a run ends if its time has not; such runs have an entry of their own
         views: pictures from around
         vertices: of BANANA's sphere, and the most of SUZANNE's
         meshes: folder of suzanne.ply
@@ -152,9 +157,11 @@ def run(
         made = problem(name, resolution, views, vertices, meshes)
         numbers = trees.ravel(made.initial()).size
         for method in only:
-            found = measure(made, method, seconds, runs, setting)
-            entry = {"numbers": numbers, "strength": STRENGTH, "methods": {method: found}}
-            yield {"tasks": {f"{name}, not tuned" if setting else name: entry}}
+            found = measure(made, method, seconds, steps, runs, setting)
+            budget = f"{steps} steps" if steps else f"{seconds:g} s"
+            entry = {"numbers": numbers, "strength": STRENGTH, "budget": budget, "methods": {method: found}}
+            label = f"{name}, {budget}" if steps else name
+            yield {"tasks": {f"{label}, not tuned" if setting else label: entry}}
 
 
 def table(record: Record) -> str:
@@ -163,9 +170,10 @@ def table(record: Record) -> str:
     for found in markdown.named(record["tasks"], "task", "methods", "method"):
         finals = ", ".join(f"{run['final']:.3f}" for run in found["runs"])
         steps = ", ".join(str(run["steps"]) for run in found["runs"])
-        rows.append([markdown.fill("{task} | {numbers} | {method} | {setting:g}", found), finals, steps])
-    text = "{views} views of {resolution}², {seconds:g} s of the processor, runs: {runs}."
-    head = "task | numbers | method | rate or radius, in σ | loss / at the start | steps"
+        budget = found.get("budget", f"{record['settings']['seconds']:g} s")
+        rows.append([markdown.fill("{task} | {numbers} | {method} | {setting:g}", found), finals, steps, budget])
+    text = "{views} views of {resolution}², seconds of the processor, runs: {runs}."
+    head = "task | numbers | method | rate or radius, in σ | loss / at the start | steps | budget"
     return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
 
 
