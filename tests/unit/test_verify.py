@@ -337,9 +337,9 @@ def test_pictures_of_other_pixels_are_not_subtracted(views: int, share: float, m
     fresh: list[Any] = []
     real = verify.misfit
 
-    def noted(*arguments: Any) -> Any:
+    def noted(*arguments: Any, sampled: bool) -> Any:
         fresh.append(arguments[-1])
-        return real(*arguments)
+        return real(*arguments, sampled=sampled)
 
     monkeypatch.setattr(verify, "_SHARE", share)
     monkeypatch.setattr(verify, "misfit", noted)
@@ -645,7 +645,40 @@ def test_noise_of_the_references_is_no_fault_where_the_true_values_leave_as_much
 
 def test_a_run_that_starts_at_the_truth_has_not_improved(monkeypatch: pytest.MonkeyPatch) -> None:
     noted: list[bool] = []
-    monkeypatch.setattr(verify, "misfit_of_numbers", lambda *_, improved, at_truth: noted.append(improved) or "wrong")
+    monkeypatch.setattr(verify, "misfit_of_numbers", lambda *_, improved, **__: noted.append(improved) or "wrong")
     result = ur.optimize(made(start=None, noise=0.1), ur.GaussNewton(), ur.optimizers.AveragedNewton(), steps=12)
     assert noted == [False]
     assert not result.standard_error
+
+
+def seen_through_a_filter(generator: np.random.Generator, side: int) -> np.ndarray:
+    """Independent noise of a film's points, as a Gaussian filter of a standard deviation of half a pixel leaves it, (side², 3)."""
+    places = np.arange(4 * side) / 4
+    weights = np.exp(-2.0 * np.square(places[::4, None] - places))
+    image = np.einsum("ia,jb,abc->ijc", weights, weights, generator.normal(size=(4 * side, 4 * side, 3)), optimize=True)
+    image = image.reshape(-1, 3)
+    return image / image.std()
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_difference_that_changes_its_sign_within_tiles_is_told(sampled: bool) -> None:
+    """Differences along an edge, such as that of a cone of light: one side is too bright, the other too dark."""
+    generator, problem = np.random.default_rng(0), made()
+    edges = np.where(np.arange(1152) // 6 % 2 < 1, 0.02, -0.02)[:, None]
+    residuals = edges + generator.normal(0.0, 0.01, (4, 1152, 3))
+    assert paired_losses.systematic(residuals.mean(axis=0), layout=(3, 1)).score < paired_losses.SIGNIFICANT
+    arguments = problem, residuals, np.full((1152, 3), 0.2), np.ones(1152)
+    found = verification.misfit_of_numbers(*arguments, sampled=sampled)
+    assert "the final picture differs from the references by 0.0" in found
+
+
+@pytest.mark.parametrize("side", [24, 48])
+def test_noise_of_references_with_a_reconstruction_filter_is_no_difference(side: int) -> None:
+    generator, problem = np.random.default_rng(0), made()
+    for _ in range(40):
+        noise = 0.05 * seen_through_a_filter(generator, side)
+        adjacent = float(np.mean(noise[1:] * noise[:-1]) / np.mean(noise**2))
+        assert 0.2 < adjacent < 0.5
+        residuals = noise + generator.normal(0.0, 0.01, (4, side * side, 3))
+        arguments = problem, residuals, np.ones((side * side, 3)), np.ones(side * side)
+        assert not verification.misfit_of_numbers(*arguments)

@@ -29,6 +29,8 @@ _LONGER = 4
 recording."""
 _FEW_PIXELS = 1 << 12
 """Number of pixels of all views up to which full views are rendered, for any number of paths."""
+_LAG = 2
+"""Distance of the pixels of a pair; a reconstruction filter correlates the references' noise in adjacent pixels."""
 _STREAM = 2
 """Stream of the run's key for new images; the steps use 0, the warm-up 1."""
 _MOST_NON_FINITE = 0.01
@@ -150,6 +152,11 @@ class FreshPictures:
         return float((weights * squares).sum() / max(float(weights.sum()), 1e-300))
 
     @property
+    def in_pairs(self) -> bool:
+        """Whether the pixels are pairs of nearby ones at distant places, instead of rows of views."""
+        return self.sampled and self.frames[0].view is None
+
+    @property
     def weights(self) -> np.ndarray:
         """Weight of each pixel, (N,), of all frames concatenated; at most 1."""
         factors = np.concatenate([frame.factors[:, 0] for frame in self.frames])
@@ -234,7 +241,7 @@ def _full_view(problem: Problem, view: int) -> _Frame:
 
 
 def _pixel_list(problem: Problem, count: int | None, generator: np.random.Generator) -> _Frame:
-    """Return pairs of neighbouring pixels, stratified over all pixels of all views; None for all pixels."""
+    """Return pairs of nearby pixels, stratified over all pixels of all views; all pixels if `count` is None."""
     sizes = np.array([height * width for height, width in problem.sizes])
     starts = np.cumsum([0, *sizes])
     place = np.arange(starts[-1])
@@ -245,7 +252,7 @@ def _pixel_list(problem: Problem, count: int | None, generator: np.random.Genera
     views = np.searchsorted(starts, place, side="right") - 1
     pixels = place - starts[views]
     if count is not None:
-        partners = np.where(pixels + 1 < sizes[views], pixels + 1, np.maximum(pixels - 1, 0))
+        partners = np.where(pixels + _LAG < sizes[views], pixels + _LAG, np.maximum(pixels - _LAG, 0))
         pixels, views = np.stack([pixels, partners], axis=1).reshape(-1), np.repeat(views, 2)
     like = problem.renderer.array(np.zeros(1))
     reference, factors = problem.references.at(arrays.like_integers(views, like), arrays.like_integers(pixels, like))

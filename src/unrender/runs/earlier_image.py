@@ -78,7 +78,8 @@ def not_converged(last: EarlierImage, earlier: EarlierImage, pictures: FreshPict
     noise = math.hypot(last.loss_error, _FALLS * earlier.loss_error)
     if not last.loss + _SURE * noise < _FALLS * earlier.loss:
         return []
-    difference = misfit(last.residuals, last.residuals, pictures.references, pictures.weights, _OF_PICTURE_FALLING)
+    of = last.residuals, last.residuals, pictures.references, pictures.weights, _OF_PICTURE_FALLING
+    difference = misfit(*of, sampled=pictures.in_pairs)
     if difference is None:
         return []
     fallen = f"its loss has fallen by {1 - last.loss / earlier.loss:.0%} since step {earlier.step} of {last.step}"

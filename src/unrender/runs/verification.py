@@ -24,6 +24,8 @@ relative to the image in this case."""
 _FEW_NUMBERS, _OF_PICTURE = 24, 0.01
 """Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image."""
 
+_ROWS, _PAIRS = ((3, 1), (2, 1)), ((1, 0), (1, 2))
+"""Layout for `paired_losses.systematic`, and distances for `paired_losses.nearby`: of rows of pixels, and of pairs of a sample."""
 _OF_TRUTH = 4.0
 """Smallest mean square of a residual judged pixel by pixel, relative to that at the true values, if these are known."""
 
@@ -68,6 +70,7 @@ def misfit(
     least: float,
     fresh: np.ndarray | None = None,
     by_pixel: bool = False,
+    sampled: bool = False,
 ) -> Misfit | None:
     """Return the difference from the references that two pictures share; None if it may be noise or is small.
 
@@ -81,6 +84,7 @@ def misfit(
         least: smallest difference relative to the references.
         fresh: differences of K >= 2 images with independent noise, (K, N, 3). With these, few pixels are also judged one by one.
         by_pixel: whether many pixels are, too.
+        sampled: whether the pixels are pairs of nearby ones at distant places, instead of rows.
     """
     one, other = residuals.mean(axis=0), others.mean(axis=0)
     if not (np.isfinite(one).all() and np.isfinite(other).all()):
@@ -92,7 +96,13 @@ def misfit(
         beyond = shared.score > paired_losses.SIGNIFICANT and error > smallest * size
         return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), one_by_one) if beyond else None
 
-    difference = significant(paired_losses.systematic(one, weights, other), least, False)
+    layout, places = _PAIRS if sampled else _ROWS
+    shared = (
+        paired_losses.systematic(one, weights, other, layout),
+        paired_losses.nearby(one, weights, other, *places),
+    )
+    scales = (significant(part, least, False) for part in shared)
+    difference = max(filter(None, scales), key=lambda found: found.error, default=None)
     if difference or fresh is None or not (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
         return difference
     return significant(paired_losses.repeated(residuals, fresh, weights), _OF_FEW, True)
@@ -106,6 +116,7 @@ def misfit_of_numbers(
     known: Sequence[str] = (),
     improved: bool = True,
     at_truth: Callable[[], float] | None = None,
+    sampled: bool = False,
 ) -> str:
     """Return a warning if only few numbers are unknown and the images differ from the references; else "".
 
@@ -120,6 +131,7 @@ def misfit_of_numbers(
         known: warnings of the run; one that says so already is returned.
         improved: whether the images are better than at the start.
         at_truth: see `Misfit.is_references_noise`.
+        sampled: see `misfit`.
     """
     elements = sum(math.prod(shape) for shape in problem.shapes().values())
     if elements > _FEW_NUMBERS or len(residuals) < 2:
@@ -128,7 +140,7 @@ def misfit_of_numbers(
         return line
     one, other = residuals[0::2], residuals[1::2]
     fresh = None if improved or len(residuals) < 4 else other
-    difference = misfit(one, other, references, weights, _OF_PICTURE, fresh, by_pixel=True)
+    difference = misfit(one, other, references, weights, _OF_PICTURE, fresh, by_pixel=True, sampled=sampled)
     if difference is None or difference.is_references_noise(at_truth):
         return ""
     noise = (

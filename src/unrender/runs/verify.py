@@ -147,7 +147,7 @@ class Verify(Callback):
             improved = _is_worse(pictures, last, first)
             arguments = problem, differences, pictures.references, pictures.weights
             at_truth = partial(_at_truth, problem, pictures, result) if problem.has_truth else None
-            differs = misfit_of_numbers(*arguments, improved=improved, at_truth=at_truth)
+            differs = misfit_of_numbers(*arguments, improved=improved, at_truth=at_truth, sampled=pictures.in_pairs)
             lines = [differs] if differs else []
         if lines:
             result = replace(result, standard_error={})
@@ -203,7 +203,8 @@ class Verify(Callback):
         references, weights = self._pictures.references, self._pictures.weights
         sampled = pictures.sampled or self._pictures.sampled  # each has other pixels then
         fresh = None if sampled else pictures.differences(end.images)
-        difference = misfit(last.residuals, earlier.residuals, references, weights, earlier.least, fresh)
+        of = last.residuals, earlier.residuals, references, weights, earlier.least, fresh
+        difference = misfit(*of, sampled=self._pictures.in_pairs)
         at_truth = partial(_at_truth, problem, self._pictures, result) if problem.has_truth else None
         if difference is None or difference.is_references_noise(at_truth):
             return []

@@ -127,25 +127,37 @@ def repeated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> Systema
 
 
 def systematic(
-    values: np.ndarray, weights: np.ndarray | None = None, earlier: np.ndarray | None = None
+    values: np.ndarray,
+    weights: np.ndarray | None = None,
+    earlier: np.ndarray | None = None,
+    layout: tuple[int, int] = (1, 0),
 ) -> SystematicDifference:
     """Estimate the part of the differences that neighbouring pixels share.
 
     Each tile is divided into two interleaved halves with independent noise, so the noise in the product of their means has expectation
-    zero.
+    zero. A difference that changes its sign within tiles is missed; see `nearby`.
 
     Args:
         values: differences of pixels, (N, C), in an order that mostly keeps neighbours in the image adjacent.
         weights: weight of each pixel, (N,), in [0, 1]; None for equal weights.
         earlier: the same at an earlier step, (N, C). The second halves are taken from it, which excludes what changes between the steps.
             None takes them from `values`.
+        layout: number of consecutive pixels that alternate between the halves, and how many of these are left out. Noise of references
+            with a reconstruction filter is correlated between adjacent pixels, but hardly at a distance of 2.
     """
-    count = len(values) // 2 * 2
+    block, gap = layout
+    count = len(values) // (2 * block) * 2 * block
     weight = np.ones(len(values)) if weights is None else np.asarray(weights, np.float64)
-    used = weight[:count].reshape(-1, 2).min(axis=1) > 0
+
+    def halves_of(array: np.ndarray) -> np.ndarray:
+        columns = array.shape[1]
+        parts = array[:count].reshape(-1, 2, block, columns)[:, :, : block - gap]
+        return parts.swapaxes(1, 2).reshape(-1, 2, columns)
+
+    used = halves_of(weight[:, None])[..., 0].min(axis=1) > 0
 
     def paired(differences: np.ndarray) -> np.ndarray:
-        return (np.asarray(differences, np.float64) * weight[:, None])[:count].reshape(-1, 2, values.shape[1])[used]
+        return halves_of(np.asarray(differences, np.float64) * weight[:, None])[used]
 
     pairs = paired(values)
     if earlier is not None:
@@ -163,3 +175,24 @@ def systematic(
         return SystematicDifference(square, math.inf if square > 0 else 0.0)
     total = float(products.sum())
     return SystematicDifference(square, min(total / sharp, _ROBUST * total / robust))
+
+
+def nearby(
+    values: np.ndarray, weights: np.ndarray, earlier: np.ndarray | None = None, distance: int = 2, stride: int = 1
+) -> SystematicDifference:
+    """Estimate the part of the differences that pixels at a distance share, such as differences along edges.
+
+    Products of two pixels have expectation zero if their noise is independent, and are uncorrelated with each other. The score is their
+    sum divided by the root of the sum of their squares.
+
+    Args:
+        values, weights, earlier: see `systematic`.
+        distance: distance in the order of the pixels.
+        stride: distance in the order between two products.
+    """
+    other = values if earlier is None else earlier
+    one, two = (np.asarray(of, np.float64) * weights[:, None] for of in (values, other))
+    products = (one[:-distance:stride] * two[distance::stride]).sum(axis=1)
+    counted = float((weights[:-distance:stride] * weights[distance::stride]).sum()) * values.shape[1]
+    total, deviation = float(products.sum()), float(np.sqrt(np.square(products).sum()))
+    return SystematicDifference(total / max(counted, 1e-300), total / deviation if deviation > 0 else 0.0)
