@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -284,7 +285,7 @@ class Renderer:
         for name in set(self._streams) - set(streams):
             del self._streams[name]
         self._step, self._last, self._variances = loaded.step, None, []
-        self._options = saved.with_seed(self._options, loaded.seed)
+        self._options = replace(self._options, seed=loaded.seed)
 
     # ------------------------------------------------------------------ the two passes
 

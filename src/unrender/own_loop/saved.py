@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,6 @@ import safetensors.numpy
 
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, files
-from unrender.own_loop.options import Options
 from unrender.own_loop.stream import StreamState
 from unrender.runs.folder.state import Packed, pack, unpack
 
@@ -75,11 +73,6 @@ def read(path: Path, options: dict[str, Any], pattern: RendererState) -> Rendere
     if not _fits(state, pattern):
         raise InputError(f"{path}: not the state of a Renderer with these options")
     return state
-
-
-def with_seed(options: Options, seed: int) -> Options:
-    """Return the options with another seed."""
-    return dataclasses.replace(options, seed=seed)
 
 
 def _check_options(path: Path, saved: Any, options: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import DrawStatistics, MiniBatch
-from unrender.pixels.guided import GuidedSampler, GuidedSamplerState, Maps
+from unrender.pixels.guided import GuidedOptions, GuidedSampler, GuidedSamplerState, ImportanceRule, Maps
 from unrender.pixels.map_denoising import MapDenoiser
 from unrender.pixels.pixel_statistics import PixelStatistics
 from unrender.pixels.tiles import Tiles
@@ -26,18 +26,6 @@ _FEWEST = 4096
 def default_count(problem: Problem) -> int:
     """Return the default number of pixels of a mini-batch."""
     return min(problem.pixels, max(problem.pixels // 4, _FEWEST))
-
-
-@dataclass(frozen=True)
-class _Options:
-    """Options of the guided sampler, see `GuidedOptions`."""
-
-    count: int
-    refresh: int
-    samples: int | None
-    uniform: float | None
-    stratified: bool
-    denoiser: MapDenoiser
 
 
 @register
@@ -101,8 +89,9 @@ class Adaptive:
         self._sampler(_FEWEST if self.count is None else self.count).check()
 
     def _sampler(self, count: int) -> GuidedSampler:
-        options = _Options(count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser)
-        return GuidedSampler("Adaptive", options, _GradientVariance(self.levels, self.learn_from_draws, self.by_cost))
+        options = GuidedOptions(count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser)
+        rule = _GradientVariance(self.levels, self.learn_from_draws, self.by_cost, needs_second_moment=True)
+        return GuidedSampler("Adaptive", options, rule)
 
     def _sampler_for(self, problem: Problem) -> GuidedSampler:
         return self._sampler(default_count(problem) if self.count is None else self.count)
@@ -130,13 +119,8 @@ class Adaptive:
 
 
 @dataclass(frozen=True)
-class _GradientVariance:
+class _GradientVariance(ImportanceRule):
     """Importance of Eq. 12, averaged over levels by Eq. 18."""
-
-    levels: int
-    learns: bool
-    by_cost: bool
-    needs_second_moment: bool = True
 
     def maps(self, statistics: PixelStatistics) -> Maps:
         """Return the second moment of the parameter derivatives, then that of the loss derivative per level."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -87,58 +87,42 @@ class GuidedSamplerState:
         return replace(self, second_moment=upsampler.tree(self.second_moment, SQUARES))
 
 
-class GuidedOptions(Protocol):
+@dataclass(frozen=True)
+class GuidedOptions:
     """Options that the samplers with an importance map share; `Adaptive` documents them."""
 
-    @property
-    def count(self) -> int: ...
-
-    @property
-    def refresh(self) -> int: ...
-
-    @property
-    def samples(self) -> int | None: ...
-
-    @property
-    def uniform(self) -> float | None: ...
-
-    @property
-    def stratified(self) -> bool: ...
-
-    @property
-    def denoiser(self) -> MapDenoiser: ...
+    count: int
+    refresh: int
+    samples: int | None
+    uniform: float | None
+    stratified: bool
+    denoiser: MapDenoiser
 
 
-class ImportanceRule(Protocol):
-    """Rule that distinguishes the samplers: which statistics they need, and how these become an importance map."""
+@dataclass(frozen=True)
+class ImportanceRule(ABC):
+    """Rule that distinguishes the samplers: which statistics they need, and how these become an importance map.
 
-    @property
-    def levels(self) -> int:
-        """Number of coarser resolutions at which the loss derivative is estimated, >= 0."""
-        ...
+    Attributes:
+        levels: number of coarser resolutions at which the loss derivative is estimated, >= 0.
+        learns: whether the samples of the steps update the maps.
+        by_cost: whether a pixel's importance is divided by the root of its cost.
+        needs_second_moment: whether the second moment of the pixels' parameter derivatives is estimated, which doubles the number of
+            paths.
+    """
 
-    @property
-    def learns(self) -> bool:
-        """Return whether the samples of the steps update the maps."""
-        ...
+    levels: int = 0
+    learns: bool = False
+    by_cost: bool = False
+    needs_second_moment: bool = False
 
-    @property
-    def by_cost(self) -> bool:
-        """Return whether a pixel's importance is divided by the root of its cost."""
-        ...
-
-    @property
-    def needs_second_moment(self) -> bool:
-        """Return whether the second moment of the pixels' parameter derivatives is estimated, which doubles the number of paths."""
-        ...
-
+    @abstractmethod
     def maps(self, statistics: pixel_statistics.PixelStatistics) -> Maps:
         """Return the maps that are averaged over updates."""
-        ...
 
+    @abstractmethod
     def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
         """Return the unnormalised pixel probability of each tile, (tiles,), >= 0; `denoised` holds the denoised first maps."""
-        ...
 
 
 @dataclass(frozen=True)

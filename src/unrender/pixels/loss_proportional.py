@@ -11,7 +11,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels.base import MiniBatch
-from unrender.pixels.guided import GuidedSampler, GuidedSamplerState, Maps
+from unrender.pixels.guided import GuidedOptions, GuidedSampler, GuidedSamplerState, ImportanceRule, Maps
 from unrender.pixels.map_denoising import MapDenoiser
 from unrender.pixels.pixel_statistics import PixelStatistics
 from unrender.pixels.tiles import Tiles
@@ -42,7 +42,8 @@ class LossProportional:
 
     @property
     def _sampler(self) -> GuidedSampler:
-        return GuidedSampler("LossProportional", self, _LossDerivative())
+        own = self.count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser
+        return GuidedSampler("LossProportional", GuidedOptions(*own), _LossDerivative())
 
     def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
         del parameters
@@ -63,13 +64,8 @@ class LossProportional:
 
 
 @dataclass(frozen=True)
-class _LossDerivative:
+class _LossDerivative(ImportanceRule):
     """Importance of Eq. 5."""
-
-    levels: int = 0
-    learns: bool = False
-    by_cost: bool = False
-    needs_second_moment: bool = False
 
     def maps(self, statistics: PixelStatistics) -> Maps:
         """Return the mean magnitude of the loss derivative."""
