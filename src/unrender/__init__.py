@@ -51,24 +51,13 @@ if TYPE_CHECKING:
     from unrender.scene.render import render, render_pair
     from unrender.scene.view import View
 
-_MODULES = {
-    "app": "app",
-    "estimators": "estimators",
-    "gallery": "gallery",
+_PACKAGES = (
+    *("app", "estimators", "gallery", "images", "io", "losses", "optimizers", "parameterisations", "pixels"),
+    *("preconditioners", "protocols", "runs", "scene", "schedules", "statistics"),
+)
+_MODULES = {name: name for name in _PACKAGES} | {
     "grey_box": "estimators.smoothing.grey_box",
-    "images": "images",
-    "io": "io",
-    "losses": "losses",
-    "optimizers": "optimizers",
-    "parameterisations": "parameterisations",
-    "pixels": "pixels",
-    "preconditioners": "preconditioners",
-    "protocols": "protocols",
-    "runs": "runs",
-    "scene": "scene",
-    "schedules": "schedules",
     "smoothed": "estimators.smoothing",
-    "statistics": "statistics",
 }
 """{attribute: module}. Each is imported at its first use."""
 _HOMES = {

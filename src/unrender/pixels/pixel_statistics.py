@@ -147,8 +147,7 @@ def estimate_statistics(
 def costs(
     problem: Problem, parameters: Tree, tiles: Tiles, uniform_table: InverseCdfTable, key: Key
 ) -> tuple[np.ndarray, int]:
-    """Return the cost of a path through each tile relative to one without an intersection, (tiles,), >= 1, and the number of paths
-    traced.
+    """Return the cost of a path through each tile relative to one without an intersection, (tiles,), >= 1, and the number of paths traced.
 
     The cost is 1 + v / 2 for v vertices, each of which adds a segment and a connection to an emitter. (On a processor, a path that leaves
     the scene costs as much as half a vertex in mini-batches of 16384 pixels. In batches of 2048, where launches dominate, it costs as much

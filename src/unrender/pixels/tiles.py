@@ -141,8 +141,7 @@ def _cut(resolutions: tuple[tuple[int, int], ...], most: int) -> Tiles:
 
 @dataclass(frozen=True)
 class InverseCdfTable:
-    """Inverse of the tiles' cumulative distribution. The unit interval is represented by integers in [0, 2³²), so probabilities are
-    exact.
+    """Inverse of the tiles' cumulative distribution. The unit interval is represented by integers in [0, 2³²), so probabilities are exact.
 
     Attributes:
         starts: cumulative distribution before each tile, (tiles,), ascending.

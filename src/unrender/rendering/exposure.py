@@ -19,15 +19,12 @@ _LN2 = math.log(2.0)
 
 
 def gains(exposure: np.ndarray) -> np.ndarray:
-    """Return the factors of the views' pictures, (V, 3), for exposures in stops (V, 3): 2 ** (e - mean over views of
-    e).
-    """
+    """Return the factors of the views' pictures, (V, 3), for exposures in stops (V, 3): 2 ** (e - mean over views of e)."""
     return np.exp2(exposure - np.mean(exposure, axis=0, keepdims=True))
 
 
 class ExposedRenderer(PictureFactors):
-    """A renderer whose pictures have a factor per sensor and channel: the exposure and the white balance of a
-    photograph.
+    """A renderer whose pictures have a factor per sensor and channel: the exposure and the white balance of a photograph.
 
     The parameter `exposure` (V, 3) has a row for each of V sensors, in stops. The picture of row v is multiplied by
 
@@ -85,9 +82,7 @@ class ExposedRenderer(PictureFactors):
         return self._centred_rows(tangent, places) * (_LN2 * images)
 
     def gradient(self, values: Array, places: Array, weighted: Array) -> Array:
-        """Return the gradient by the exposures, (V, 3), without its mean over rows, since the factors use centred
-        exposures.
-        """
+        """Return the gradient by the exposures, (V, 3), without its mean over rows, since the factors use centred exposures."""
         del values
         count = len(self.rows)
         parts = arrays.mean_over_first(weighted)

@@ -1,6 +1,4 @@
-"""Renderers that restrict another: one differentiates a subset of the parameters, the other fixes some parameters at
-constant values.
-"""
+"""Renderers that restrict another: one differentiates a subset of the parameters, the other fixes some parameters at constant values."""
 
 from __future__ import annotations
 

@@ -52,9 +52,7 @@ def _without_photographs(renderer: Renderer) -> Renderer:
 
 
 def sensors_with_rows(renderer: Renderer) -> tuple[int, ...] | None:
-    """Return the indices of the sensors that have rows of exposures or poses, in the order of the rows; None if there
-    are no such rows.
-    """
+    """Return the indices of the sensors that have rows of exposures or poses, in the order of the rows; None if there are no such rows."""
     while isinstance(renderer, WithParameter):
         if isinstance(renderer, (ExposedRenderer, PosedCameras)):
             return tuple(renderer.rows)
@@ -93,9 +91,7 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
 
 
 def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the values that a scene can store: camera poses and the members of ties, without response, exposure and
-    vignetting.
-    """
+    """Return the values that a scene can store: camera poses and the members of ties, without response, exposure and vignetting."""
     scene = {key: value for key, value in values.items() if key not in OF_PHOTOGRAPHS}
     while isinstance(renderer, WithParameter):
         if isinstance(renderer, PosedCameras) and POSES in values:

@@ -86,9 +86,7 @@ _Renderer = TypeVar("_Renderer", bound=PictureRenderer)
 
 
 class PictureSession(SessionWrapper, Generic[_Renderer]):
-    """A session that renders and differentiates with respect to the picture's parameter and the inner session's
-    parameters.
-    """
+    """A session that renders and differentiates with respect to the picture's parameter and the inner session's parameters."""
 
     def __init__(self, renderer: _Renderer, inner: RenderSession):
         super().__init__(inner)
@@ -184,9 +182,7 @@ class PictureFactors(PictureRenderer):
         raise NotImplementedError
 
     def factors_of_batch(self, values: np.ndarray, sensor: int) -> np.ndarray:
-        """Return the factors for n values of the parameter, first axis, of a shape that broadcasts to full pictures (n,
-        H, W, 3).
-        """
+        """Return the factors for n values of the parameter, first axis, of a shape that broadcasts to full pictures (n, H, W, 3)."""
         raise NotImplementedError
 
     def along(self, tangent: Array, places: Array, images: Array) -> Array:
@@ -199,9 +195,7 @@ class PictureFactors(PictureRenderer):
 
 
 class FactorSession(PictureSession[PictureFactors]):
-    """A session that renders and differentiates with respect to the factors' parameter and the inner session's
-    parameters.
-    """
+    """A session that renders and differentiates with respect to the factors' parameter and the inner session's parameters."""
 
     def image_batch(self, parameters: Tree, request: SampleRequest) -> Array:
         renderer = self._renderer

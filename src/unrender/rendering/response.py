@@ -43,10 +43,9 @@ def curve(contrast: Array, brightness: Array, x: Array) -> Curve:
 
         f(x) = m(x)^γ,   m(x) = e^b x / (1 + (e^b - 1) x),   γ = exp(c),   b = d + 1.6 c,   for x from 2⁻¹⁰ to 1.
 
-    The curve is a power after a shoulder (b > 0) or a toe (b < 0): f(0) = 0 and f(1) = 1. It increases strictly for all
-    c and d. Below 2⁻¹⁰ it is linear towards 0. Above 1 it is linear with its slope at 1, γ e^-b. A pure power x^γ has d
-    = -1.6 c. Powers and shoulders have nearly opposite effects on middle radiances. Contrast c and brightness d are
-    nearly independent, which conditions the optimisation.
+    The curve is a power after a shoulder (b > 0) or a toe (b < 0): f(0) = 0 and f(1) = 1. It increases strictly for all c and d. Below 2⁻¹⁰
+    it is linear towards 0. Above 1 it is linear with its slope at 1, γ e^-b. A pure power x^γ has d = -1.6 c. Powers and shoulders have
+    nearly opposite effects on middle radiances. Contrast c and brightness d are nearly independent, which conditions the optimisation.
 
     Args:
         contrast, brightness: c and d of each channel, or of a shape that broadcasts to the images'.
@@ -79,23 +78,19 @@ def curve(contrast: Array, brightness: Array, x: Array) -> Curve:
 
 
 class RespondingRenderer(PictureRenderer):
-    """A renderer whose pictures are photographs that were decoded with the sRGB curve instead of their camera's
-    response.
+    """A renderer whose pictures are photographs that were decoded with the sRGB curve instead of their camera's response.
 
-    A camera with the response R encodes radiance x as R(x). Decoding by the sRGB curve S gives the photograph's values
-    S⁻¹(R(x)) = f(x). The parameter `response` (3, 2) holds c and d of `curve` for each channel, as natural logarithms:
-    0 if the camera's curve is sRGB. It is the outermost of the photographs' parameters, since exposure and vignetting
-    are factors of radiance.
+    A camera with the response R encodes radiance x as R(x). Decoding by the sRGB curve S gives the photograph's values S⁻¹(R(x)) = f(x).
+    The parameter `response` (3, 2) holds c and d of `curve` for each channel, as natural logarithms: 0 if the camera's curve is sRGB. It is
+    the outermost of the photographs' parameters, since exposure and vignetting are factors of radiance.
 
-    Ambiguities: unknown exposures leave any response undetermined up to a power, x^γ (M. Grossberg, S. Nayar,
-    "Determining the camera response from images: what is knowable?", 2003). `with_photographs` refuses this case. If
-    each point has the same radiance in all photographs (diffuse surfaces, constant light), the response is not
-    distinguishable from a change of reflectance.
+    Ambiguities: unknown exposures leave any response undetermined up to a power, x^γ (M. Grossberg, S. Nayar, "Determining the camera
+    response from images: what is knowable?", 2003). `with_photographs` refuses this case. If each point has the same radiance in all
+    photographs (diffuse surfaces, constant light), the response is not distinguishable from a change of reflectance.
 
-    Pictures are the curve of noisy pixels. Their bias is f''(x) / 2 times the pixel's variance, to second order, and
-    decreases with the samples. Adjoints are the exact derivatives of the returned images. `tangent_moment` evaluates
-    the slope at the mean of a pixel's samples and omits the products of this parameter's tangent with others. It is
-    exact for one sample.
+    Pictures are the curve of noisy pixels. Their bias is f''(x) / 2 times the pixel's variance, to second order, and decreases with the
+    samples. Adjoints are the exact derivatives of the returned images. `tangent_moment` evaluates the slope at the mean of a pixel's
+    samples and omits the products of this parameter's tangent with others. It is exact for one sample.
 
     Args:
         inner: renderer of the scene, including exposure.
@@ -140,9 +135,7 @@ class RespondingSession(PictureSession[RespondingRenderer]):
         return _curve_at(parameters, images).slopes
 
     def _pull_back(self, parameters: Tree, places: None, images: Array, weights: Array) -> tuple[Array, Array]:
-        """Return the weights of the inner images, and the gradient by the response (3, 2): the sum over pixels, the
-        mean over groups.
-        """
+        """Return the weights of the inner images, and the gradient by the response (3, 2): the sum over pixels, the mean over groups."""
         del places
         at = _curve_at(parameters, images)
         columns = []

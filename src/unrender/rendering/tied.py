@@ -208,9 +208,7 @@ class TiedSession(SessionWrapper):
         return self._renderer.scene_values(tangents)
 
     def _state(self, parameters: Tree) -> Tree:
-        """Return the values of the scene's parameters. An identical value gives identical arrays, so the scene need not
-        set them again.
-        """
+        """Return the values of the scene's parameters. An identical value gives identical arrays, so the scene need not set them again."""
         state: Tree = {}
         for key, value in parameters.items():
             if key not in self._ties:
@@ -224,9 +222,7 @@ class TiedSession(SessionWrapper):
         return state
 
     def _gradient(self, parameters: Tree, inner_gradient: Tree, paths: Any) -> Tree:
-        """Return the gradient by the unknowns. The gradient by a tie is the sum of its members' gradients times their
-        factors.
-        """
+        """Return the gradient by the unknowns. The gradient by a tie is the sum of its members' gradients times their factors."""
         gradient: Tree = {}
         for key in parameters:
             factors = self._ties.get(key, {key: 1.0})

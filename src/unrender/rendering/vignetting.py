@@ -18,9 +18,7 @@ _LN2 = math.log(2.0)
 
 
 def powers(height: int, width: int) -> np.ndarray:
-    """Return r², r⁴ and r⁶ at a film's pixel centres, (H W, 3). The distance r from the film's centre is 1 at its
-    corners.
-    """
+    """Return r², r⁴ and r⁶ at a film's pixel centres, (H W, 3). The distance r from the film's centre is 1 at its corners."""
     y, x = np.mgrid[:height, :width] + 0.5
     square = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / ((width / 2) ** 2 + (height / 2) ** 2)
     return np.stack([square ** (k + 1) for k in range(_TERMS)], -1).reshape(-1, _TERMS)

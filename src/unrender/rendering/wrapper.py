@@ -94,8 +94,7 @@ class RendererWrapper:
 class SessionWrapper:
     """A session that maps parameters, images and gradients to and from an inner session.
 
-    Subclasses override the maps `_state`, `_tangents`, `_gradient`, `_shown`, `_paths` and `_weights`, or public
-    methods.
+    Subclasses override the maps `_state`, `_tangents`, `_gradient`, `_shown`, `_paths` and `_weights`, or public methods.
 
     Args:
         inner: session that renders the scene.

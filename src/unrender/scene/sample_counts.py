@@ -74,8 +74,7 @@ class SampleShares:
     offsets: tuple[float, ...]
 
     def counts(self, view: int, spp: int, array: Callable[[np.ndarray], Array]) -> SampleCounts:
-        """Return the counts of one view: `spp` times its pixels in total, rounded randomly so that each count has its share as
-        expectation.
+        """Return the counts of one view: `spp` times its pixels in total, rounded randomly so that each count has its share as expectation.
 
         Args:
             view: index of the view.

@@ -123,8 +123,7 @@ class Unknown:
         return levels.refined(values, shape) if levels is not None and values.shape in levels.shapes(shape) else values
 
     def error(self, values: np.ndarray) -> float | None:
-        """Return the error of values at the scene's resolution; NaN if the shape differs from the true value's, None if no truth is
-        known.
+        """Return the error of values at the scene's resolution; NaN if the shape differs from the true value's, None if no truth is known.
 
         The error of a mesh with a known true surface is the root mean square distance between the surfaces.
         """

@@ -329,8 +329,7 @@ def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tup
 
 
 def open_renderer(scene: Any, max_depth: int | None, keys: Iterable[str] = ()) -> Renderer:
-    """Return the renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or a
-    renderer.
+    """Return the renderer of a scene: an .xml file, a Mitsuba dictionary, a function that returns one, a loaded `mi.Scene`, or a renderer.
 
     `keys` are the parameters that will be used. Raises `FieldError`.
     """

@@ -1,5 +1,4 @@
-"""Texture atlases by xatlas, in a subprocess with a time limit, since xatlas does not terminate on some meshes and cannot be
-interrupted.
+"""Texture atlases by xatlas, in a subprocess with a time limit, since xatlas does not terminate on some meshes and cannot be interrupted.
 
 `python -m unrender.app.capture.atlas IN.npz OUT.npz` runs this module as the subprocess.
 """

@@ -34,8 +34,7 @@ Camera = tuple[Lens, np.ndarray]
 
 
 def shape(views: CapturedViews, resolution: int, faces: int) -> Mesh:
-    """Return an initial shape from the masks of `views`: the hull without components of less than 2 % of its faces, smoothed and
-    decimated.
+    """Return an initial shape from the masks of `views`: the hull without components of less than 2 % of its faces, smoothed and decimated.
 
     Args:
         views: views with masks.

@@ -76,8 +76,7 @@ def exhaustion(how: str = "") -> str:
 
 
 def supervised() -> int | None:
-    """Run the rest of the command in a child process. Return None in the child, and the exit status in the parent once the child has
-    ended.
+    """Run the rest of the command in a child process. Return None in the child, and the exit status in the parent once the child has ended.
 
     The child's standard error is shown when it ends, and is dropped if native code aborted it. The child has its own process group, so
     that a signal reaches it only once, through its parent. Signals are blocked until both can handle them.

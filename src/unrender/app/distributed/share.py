@@ -193,8 +193,7 @@ class Hosts(Protocol):
         ...
 
     def emptied(self) -> set[int]:
-        """Return the shares that were lost since the last call of this method, including those that replied before. They have no
-        memory."""
+        """Return the shares that were lost since the last call of this method, including those that replied before. They have no memory."""
         ...
 
     def store(self, share: int, number: int, packed: Packed) -> bool:

@@ -68,8 +68,7 @@ class Recipe:
 
 
 class Memory:
-    """Placeholder of the workers' memory of all views in the state of an image estimator. Workers drop the memory when this object
-    dies.
+    """Placeholder of the workers' memory of all views in the state of an image estimator. Workers drop the memory when this object dies.
 
     This is not a dataclass, since Dr.Jit would search it for arrays.
 

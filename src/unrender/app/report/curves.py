@@ -85,8 +85,7 @@ def relative_error(run: RunFolder, keys: Sequence[str]) -> Series | None:
 
 
 def image_error(run: RunFolder) -> float | None:
-    """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without
-    pictures."""
+    """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without pictures."""
     errors = [root_mean_square(view.result, view.reference) for view in run.views.values()]
     known = [error for error in errors if error is not None]
     return float(np.mean(known)) if known else None

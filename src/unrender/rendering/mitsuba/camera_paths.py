@@ -98,8 +98,7 @@ class CameraPaths:
         return functools.partial(self._kernel.vertices, *camera, self._geometry)
 
     def _replayed(self, radiance: Any) -> Any:
-        """Return the unweighted radiance of the kernel, which is the remaining radiance at the start of a replay; 0 for dropped
-        samples."""
+        """Return the unweighted radiance of the kernel, which is the remaining radiance at the start of a replay; 0 for dropped samples."""
         return self.response.replayed(radiance, is_finite(radiance))
 
     def _sample(

@@ -32,8 +32,7 @@ def load_described(description: dict[str, Any]) -> Any:
 def recorded_descriptions() -> Iterator[Recorded]:
     """Yield a list of (object, description), which collects every object that `load_described` makes inside the context.
 
-    The list keeps the objects alive; discard it early. Mitsuba objects outside the scenes of a run prevent Dr.Jit from freezing
-    kernels.
+    The list keeps the objects alive; discard it early. Mitsuba objects outside the scenes of a run prevent Dr.Jit from freezing kernels.
     """
     recorded: Recorded = []
     token = _recorded.set(recorded)

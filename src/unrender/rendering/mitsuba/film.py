@@ -1,5 +1,4 @@
-"""Conversion of pixels to camera rays, and of path radiance to pixels. Each pixel has its own samples, distributed by the film's
-filter.
+"""Conversion of pixels to camera rays, and of path radiance to pixels. Each pixel has its own samples, distributed by the film's filter.
 
 Per-pixel statistics require samples that belong to one pixel. A pixel is therefore the mean of samples that are distributed according
 to its reconstruction filter (`pixel_filter.py`). The samples of a box filter are uniform in the pixel's square.

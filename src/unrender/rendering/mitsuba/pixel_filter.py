@@ -5,9 +5,8 @@ samples a pixel is
 
     I = ∫ k(x - c) L(x) dx / ∫ k(x - c) dx        over the crop window, or over the full plane with `sample_border`
 
-for the pixel's centre c. Here the samples of a pixel have the density |k| / ∫ |k|, and the weight sign(k) ∫ |k| / ∫ k (filter
-importance sampling: M. Ernst, M. Stamminger, G. Greiner 2006). Every pixel therefore has its own samples, and their mean has the
-expectation I.
+for the pixel's centre c. Here the samples of a pixel have the density |k| / ∫ |k|, and the weight sign(k) ∫ |k| / ∫ k (filter importance
+sampling: M. Ernst, M. Stamminger, G. Greiner 2006). Every pixel therefore has its own samples, and their mean has the expectation I.
 """
 
 from __future__ import annotations
@@ -121,8 +120,7 @@ def _reach(film: Any) -> int:
 
 
 def _span(radius: float, below: int, above: int, reach: int) -> tuple[float, float]:
-    """Return the interval of a pixel's filter after truncation. `below` and `above` are its distances from the borders, at most
-    `reach`."""
+    """Return the interval of a pixel's filter after truncation. `below` and `above` are its distances from the borders, at most `reach`."""
     low = -radius if below >= reach else max(-radius, -below - 0.5)
     return low, radius if above >= reach else min(radius, above + 0.5)
 

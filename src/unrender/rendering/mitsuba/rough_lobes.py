@@ -19,8 +19,7 @@ _ROLES = ("alpha", "alpha_u", "alpha_v", "roughness")
 
 
 class RoughLobes:
-    """Roughness parameters that `DifferentialBsdf` supports: those of isotropic rough conductors, one-sided or two-sided with equal
-    sides.
+    """Roughness parameters that `DifferentialBsdf` supports: those of isotropic rough conductors, one-sided or two-sided with equal sides.
 
     Other parameters use standard BSDF sampling.
 

@@ -112,9 +112,8 @@ class ExponentialRenderer(_OnePixel):
 class QuadraticRenderer(_OnePixel):
     """A quadratic form: the L2 loss against a black reference is exactly xᵀ A x.
 
-    The picture is linear. Its channels are J x with Jᵀ J = 3 A, since the loss is the mean over three channels. There
-    is no noise. The derivatives of the loss are known in closed form, ∇ = 2 A x and ∇² = 2 A. Smoothing by a Gaussian
-    only adds the constant Σᵢ Aᵢᵢ σᵢ².
+    The picture is linear. Its channels are J x with Jᵀ J = 3 A, since the loss is the mean over three channels. There is no noise. The
+    derivatives of the loss are known in closed form, ∇ = 2 A x and ∇² = 2 A. Smoothing by a Gaussian only adds the constant Σᵢ Aᵢᵢ σᵢ².
 
     Args:
         matrix: A, (n, n) for n from 1 to 3, symmetric, without negative eigenvalues.

@@ -145,8 +145,7 @@ def _planes(mesh: Any) -> list[np.ndarray]:
 
 
 def is_glossy(scene: Any) -> bool:
-    """Return whether a BSDF of the scene has a glossy lobe. Other lobes, except perfect mirrors, do not depend on the direction of
-    view."""
+    """Return whether a BSDF of the scene has a glossy lobe. Other lobes, except perfect mirrors, do not depend on the direction of view."""
     return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Glossy) for shape in scene.shapes())
 
 

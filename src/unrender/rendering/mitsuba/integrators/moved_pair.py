@@ -228,8 +228,7 @@ class MovedPair:
         path: PairState,
         followed: Bool,
     ) -> Continuation:
-        """Return the next segment of the previous state's path: in its own direction, or a reconnection to the current path's next
-        vertex.
+        """Return the next segment of the previous state's path: in its own direction, or a reconnection to the current path's next vertex.
 
         Args:
             scenes, tables: of `sample`.

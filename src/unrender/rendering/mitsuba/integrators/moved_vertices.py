@@ -185,8 +185,7 @@ def moves(tables: Mapping[str, Any], shape: Any) -> Bool:
 
 
 def is_clear(tables: Mapping[str, Any], ray: Any, pi: Any) -> Bool:
-    """Return whether a ray of the current scene is far from moving shapes up to its hit. It then has the same hit in the previous
-    scene."""
+    """Return whether a ray of the current scene is far from moving shapes up to its hit. It then has the same hit in the previous scene."""
     return ~moves(tables, pi.shape) & ~tables["bounds"].meet(ray, pi.t)
 
 

@@ -275,9 +275,8 @@ def update_reservoir(
 ) -> Reservoir:
     """Sample points of a segment in proportion to transmittance only, by differential ratio tracking (Nimier-David et al. 2022).
 
-    Tracking covers the full segment with a majorant. Each tentative point is offered to the reservoir with the ratio-tracked
-    transmittance up to it, independent of the density at the point. Points are therefore sampled where the medium is empty, and none is
-    weighted by 1/σₜ.
+    Tracking covers the full segment with a majorant. Each tentative point is offered to the reservoir with the ratio-tracked transmittance
+    up to it, independent of the density at the point. Points are therefore sampled where the medium is empty, and none is weighted by 1/σₜ.
     """
     near, far = segment.near, segment.far
     active = active & (near < far)
