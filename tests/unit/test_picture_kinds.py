@@ -228,6 +228,20 @@ def test_a_bomb_is_refused_by_its_header(
     assert time.process_time() - started < 2
 
 
+_CHUNKS = b"iCCP cHRM gAMA sRGB tRNS pHYs tEXt zTXt iTXt eXIf acTL fcTL fdAT PLTE".split()
+
+
+@pytest.mark.parametrize("content", [b"", b"\0", b"a", b"a\0", b"a\0\1"])
+@pytest.mark.parametrize("kind", _CHUNKS)
+def test_a_damaged_chunk_after_the_pixels_of_a_png_is_one_line(kind: bytes, content: bytes, tmp_path: Path) -> None:
+    """Pillow raises `IndexError` at some."""
+    path, whole = tmp_path / "a.png", _encoded("PNG")
+    path.write_bytes(whole[:-12] + _png_chunk(kind, content) + whole[-12:])
+    for read in (lambda: pictures.upright(path, None), lambda: pictures.read(path), lambda: pictures.read_mask(path)):
+        with contextlib.suppress(InputError):
+            read()
+
+
 @pytest.mark.parametrize("form", ["TIFF", "WEBP", "BMP", "PPM", "TGA", "PNG"])
 def test_sound_photographs_are_read(form: str, tmp_path: Path) -> None:
     """By what they are, whatever they are called."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, tiff_header
@@ -84,7 +84,9 @@ def _read_header(path: Path, readers: Sequence[_Kind]) -> Header:
         raise InputError(str(error).removeprefix(f"{path}: ")) from error
     except Image.DecompressionBombError as error:
         raise InputError(f"cannot be read as a picture: {error}") from error
-    except (struct.error, ValueError, IndexError, OSError, UnidentifiedImageError, SyntaxError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # Pillow raises many types of exceptions
         raise InputError(f"cannot be read as a picture: its header is malformed ({type(error).__name__})") from error
     header = (
         Header(kind, contents)

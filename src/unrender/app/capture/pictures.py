@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,7 +36,6 @@ _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 _MIRRORED = (2, 4, 5, 7)
 _LONGEST_SIDE = 1 << 15
 """Exclusive limit of a side in pixels, set by OpenCV's `remap`."""
-_BROKEN = (OSError, ValueError, SyntaxError, struct.error, Image.DecompressionBombError)
 _RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".heic", ".heif")
 
 
@@ -192,9 +190,9 @@ def _opened(path: Path, header: image_size.Header) -> Iterator[Image.Image]:
                 if (picture.width, picture.height) != header.sizes[0][:2]:
                     raise InputError(f"{path}: cannot be read as a picture: its header declares two sizes")
                 yield picture
-    except InputError:
+    except (InputError, MemoryError):
         raise
-    except _BROKEN as error:
+    except Exception as error:  # Pillow raises many types of exceptions
         raise InputError(f"{path}: cannot be read as a picture: {reason_of(error, 200)}") from error
 
 
