@@ -38,10 +38,11 @@ def carry_out(order: dict[str, Any]) -> int:
 def import_all() -> None:
     """Import what takes seconds to import, once, but for what needs a variant in use, which starts threads."""
     import unrender
+    from unrender.core.errors import InputError
 
     for module in pkgutil.walk_packages(unrender.__path__, "unrender."):
         if "integrators" not in module.name and not module.name.endswith("__main__"):
-            with contextlib.suppress(ImportError, AttributeError):
+            with contextlib.suppress(ImportError, AttributeError, InputError):
                 importlib.import_module(module.name)
 
 
