@@ -7,6 +7,7 @@
 # make lint        lint and all types
 # make docs        the documentation site, in build/site; its notebooks are executed, warnings are errors
 # make package     wheel and source archive, in dist; the wheel is installed into an empty environment and started there
+# make audit       known vulnerabilities of the locked versions, by pip-audit and PyPI's database
 # make clean       remove what these wrote (the virtual environment stays)
 #
 # Everything is set up on the way, in .venv. Settings, after the target:
@@ -17,7 +18,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo asset test test-all test-slow test-unit lint docs package clean
+.PHONY: help demo asset test test-all test-slow test-unit lint docs package audit clean
 
 FIND_PYTHON = for python in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do \
 	$$python -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' 2>/dev/null && { command -v $$python; break; }; done
@@ -81,6 +82,12 @@ docs: .venv/docs-ready
 
 package: .venv/ready
 	$(BIN)/python -I scripts/package.py
+
+# In an environment of its own, so that its packages are none of ours. A version that the database does not know is an error.
+audit:
+	$(PYTHON) -m venv .venv/audit
+	.venv/audit/bin/python -m pip install --quiet --disable-pip-version-check pip-audit
+	.venv/audit/bin/pip-audit --strict --no-deps --disable-pip --requirement requirements/ci.lock
 
 clean:
 	rm -rf out build dist .pytest_cache .ruff_cache .hypothesis
