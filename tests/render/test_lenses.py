@@ -41,3 +41,4 @@ def test_auto_recovers_the_heights(problem: ur.Problem) -> None:
     result = ur.optimize(problem, steps=60, progress=False)
     start, end = (problem.parameter_error(x)["height"] for x in (problem.initial_values(), result.parameters))
     assert end < 0.4 * start
+    assert any("brings light" in line and "caustics" in line for line in result.warnings)

@@ -14,7 +14,7 @@ from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import final_images, image_sensitivity
 from unrender.runs import map_uncertainty as module
 from unrender.runs.folder import reader as folders
-from unrender.runs.image_sensitivity import curvature
+from unrender.runs.image_sensitivity import curvature, neighbour_means
 from unrender.runs.map_uncertainty import of_residuals, pixel_noise, uncertainty
 from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
@@ -40,9 +40,10 @@ def problem(
     mask: np.ndarray | None = None,
     prior: dict[str, float] | None = None,
     noise: float | np.ndarray = NOISE,
+    smooth: bool = False,
 ) -> Problem:
     rng = np.random.default_rng(seed)
-    truth = {"wall": rng.uniform(0.2, 0.8, (TEXELS, TEXELS, 3))}
+    truth = {"wall": np.full((TEXELS, TEXELS, 3), 0.8) if smooth else rng.uniform(0.2, 0.8, (TEXELS, TEXELS, 3))}
     renderer = AnalyticRenderer(truth, matrix(), 0.0, 0.0, shape=(SIZE, SIZE), sensors=1)
     picture = renderer.exact(truth) + noise * rng.normal(size=(SIZE, SIZE, 3))
     if mask is not None:
@@ -81,6 +82,41 @@ def score_map(made: Problem, converged: float) -> np.ndarray:
 def test_errors_have_the_stated_spread(converged: float) -> None:
     """Of early ends, whose error is what is left, and of the end, whose error is the noise."""
     assert scores(converged).std() == pytest.approx(1.0, abs=0.25)
+
+
+def test_what_smoothing_left_out_of_the_references_noise_is_no_error() -> None:
+    """Smoothed least squares of a smooth wall: a ninth of the noise's variance is left. With the residual as the error z has 0.35."""
+    found = []
+    for seed in range(8):
+        made = problem(seed, smooth=True)
+        solution = estimate(made)["wall"]
+        solution[:, -1] = solution[:, -2]  # not seen
+        values = neighbour_means(solution, channels=True)
+        error = uncertainty(made, {"wall": values}).standard_error["wall"]
+        z = (values - made.truth["wall"]) / error
+        found.append(z[1:-1, 1:-2])  # at borders the filter sees some cells twice
+    assert 0.7 < np.std(found) < 1.6  # few blocks tell how much was left
+
+
+def test_changes_that_neighbours_share_have_their_own_eigenvalue() -> None:
+    """Each pixel sees a texel and half of its eight neighbours. The planted fault is an eigenvalue of 1."""
+    mean = np.zeros((TEXELS, TEXELS, TEXELS, TEXELS))
+    for row, column in np.ndindex(TEXELS, TEXELS):
+        unit = np.zeros((TEXELS, TEXELS))
+        unit[row, column] = 1.0
+        mean[..., row, column] = neighbour_means(unit)
+    s = mean.reshape(TEXELS**2, TEXELS**2)
+    rows = np.eye(TEXELS**2) + 2.0 * s
+    truth = {"wall": np.full((TEXELS, TEXELS, 1), 0.5)}
+    a = np.repeat(rows, 3, axis=0)
+    renderer = AnalyticRenderer(truth, a, 0.0, 0.0, shape=(TEXELS, TEXELS), sensors=1)
+    made = Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(renderer.exact(truth))])
+    matrix_ = a.T @ a
+    roots = np.sqrt(np.diag(matrix_))
+    expected = np.trace(s @ (matrix_ / np.outer(roots, roots)) @ s.T) / np.trace(s @ s.T)
+    assert expected > 1.5
+    assert curvature(made, probes=64).smooth["wall"] == pytest.approx(expected, rel=0.25)
+    assert curvature(problem()).smooth["wall"] == pytest.approx(1.0, abs=0.25)
 
 
 def test_without_the_references_noise_the_end_would_seem_exact(monkeypatch: pytest.MonkeyPatch) -> None:

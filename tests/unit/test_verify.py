@@ -105,6 +105,19 @@ def test_more_paths_are_at_most_a_tenth_of_the_runs_and_have_their_own_random_nu
     assert paths < 0.1 * 40 * 1024 * SIDE * SIDE
 
 
+@pytest.mark.parametrize(("probability", "told"), [(0.5, False), (0.1, False), (0.02, True), (0.005, True)])
+def test_pictures_whose_light_few_paths_bring_are_told(probability: float, told: bool) -> None:
+    """Pixels of different brightness; the number in the line is that of the paths within a third."""
+    generator, spp = np.random.default_rng(0), 16
+    brightness = generator.uniform(0.5, 2.0, (400, 1))
+    hits = generator.binomial(spp, probability, (4, 400, 1)) / (spp * probability)
+    line = verification.rare_light([hits * brightness * np.ones(3)], spp)
+    assert bool(line) == told
+    if told:
+        assert int(line.split(" brings")[0].split()[-1]) == pytest.approx(1.0 / probability, rel=0.35)
+    assert verification.rare_light([np.zeros((4, 9, 3))], spp) == ""
+
+
 def test_parts_of_the_launches_have_the_same_mean() -> None:
     problem = made()
     one, several = FreshPictures(problem, 1, 1 << 17), FreshPictures(problem, 1, 1 << 17, parts=8)

@@ -122,10 +122,7 @@ def render_final_images(
         everything = tested and len(chosen) == len(problem.views)
         halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
         noise = pixel_noise(problem, halves) if halves else ()
-        known, maps = (
-            Curvature({}, {}, 0),
-            _untested(problem, result, "the end of the run was not tested, or had no time left"),
-        )
+        known, maps = Curvature(), _untested(problem, result, "the end of the run was not tested, or had no time left")
         if everything:
             known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
         sensitivities, deviations = known.sensitivity(), dict(result.standard_error)

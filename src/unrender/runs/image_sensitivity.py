@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,8 @@ FEWEST_PROBES = 8
 """Fewest probes from which the curvature and the overlap are known."""
 _PROJECTIONS = 1 << 25
 """Numbers of the probes' projections that are stored for the overlap."""
+COUNTED = 0.1
+"""Curvature relative to the median above which a cell counts in means over cells."""
 _INSENSITIVE = 0.05
 """Sensitivity relative to the median below which an element hardly affects the images."""
 
@@ -37,13 +40,16 @@ class Curvature:
         squares: {key: diagonal elements} of the parameters' shapes. Estimates below 0 are 0.
         overlap: {key: Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²}, at least 1, of textures and grids: 1 if no pixel depends on two elements. It is
             infinite if it is unknown: too few probes are made, or fit into memory.
+        smooth: {key: tr(SAS) / tr(SS)}, at least 1, of textures and grids, for A = JᵀJ with unit diagonal and the means S over neighbouring
+            cells: the eigenvalue of smooth changes, 1 if no pixel depends on two elements. Infinite like `overlap`.
         probes: number of probes of the estimate.
         noise: {key: diagonal elements of JᵀΣJ} for pixels of variance Σ; {} if that is unknown.
     """
 
-    squares: Mapping[str, np.ndarray]
-    overlap: Mapping[str, float]
-    probes: int
+    squares: Mapping[str, np.ndarray] = field(default_factory=dict)
+    overlap: Mapping[str, float] = field(default_factory=dict)
+    smooth: Mapping[str, float] = field(default_factory=dict)
+    probes: int = 0
     noise: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def sensitivity(self) -> dict[str, np.ndarray]:
@@ -110,7 +116,7 @@ def curvature(
     checks.integer("sensitivity", "spp", spp, at_least=1)
     session, keys = derivative_session(problem)
     if session is None:
-        return Curvature({}, {}, 0)
+        return Curvature()
     parameters = off_ends(as_tree(problem, values), problem.renderer.parameters())
     squares = {key: np.zeros(shape) for key, shape in problem.shapes().items() if key in keys}
     noisy = {key: np.zeros_like(square) for key, square in squares.items()} if noise else {}
@@ -131,6 +137,7 @@ def curvature(
                 stored[key].append((one[key][0].astype(np.float32), other[key][0].astype(np.float32)))
         made += 1
     overlap = {key: _overlap(squares[key] / made, made, of) for key, of in stored.items()}
+    smooth = {key: _smooth_eigenvalue(squares[key] / made, of) for key, of in stored.items()}
     means, variances = (
         {
             key: periodic.repeat(np.maximum(x / made, 0.0), problem.unknowns[key].measure.repeated)
@@ -138,7 +145,7 @@ def curvature(
         }
         for sums in (squares, noisy)
     )
-    return Curvature(means, overlap, made, variances)
+    return Curvature(means, overlap, smooth, made, variances)
 
 
 def _overlap(squares: np.ndarray, probes: int, stored: list[tuple[np.ndarray, np.ndarray]]) -> float:
@@ -153,6 +160,27 @@ def _overlap(squares: np.ndarray, probes: int, stored: list[tuple[np.ndarray, np
     ]
     diagonal = float(np.sum(np.square(squares))) / (1.0 + 2.0 / probes)
     return max(1.0, sum(pairs) / len(pairs) / diagonal) if diagonal > 0.0 else np.inf
+
+
+def _smooth_eigenvalue(squares: np.ndarray, stored: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Return tr(SAS) / tr(SS) of `Curvature`, at least 1, from diagonal elements and the projections of probes.
+
+    It is infinite for too few projections, or without a curvature.
+    """
+    if len(stored) < FEWEST_PROBES or not (squares > 0.0).any():
+        return np.inf
+    diagonal = squares.mean(axis=-1)
+    counted = diagonal > COUNTED * np.median(diagonal[diagonal > 0.0])
+    roots = np.where(counted, np.sqrt(np.maximum(diagonal, 1e-300)), np.inf)[..., None]
+    signs, total, white = np.random.default_rng(0), 0.0, 0.0
+    for pair in stored:
+        one, other = (neighbour_means(x / roots, channels=True) for x in pair)
+        sign = signs.choice((-1.0, 1.0), size=squares.shape) * counted[..., None]
+        total, white = (
+            total + float(np.sum(one * other)),
+            white + float(np.sum(np.square(neighbour_means(sign, channels=True)))),
+        )
+    return max(1.0, total / white)
 
 
 def map_keys(problem: Problem) -> list[str]:
@@ -189,11 +217,12 @@ def around(values: np.ndarray) -> np.ndarray:
     return np.sqrt(means.clip(min=0.0))  # running sums may round to below 0 next to large values
 
 
-def neighbour_means(cells: np.ndarray) -> np.ndarray:
-    """Return the means over neighbouring cells, those of a cell included."""
+def neighbour_means(cells: np.ndarray, channels: bool = False) -> np.ndarray:
+    """Return the means over neighbouring cells, those of a cell included. With `channels`, the last axis is one of channels."""
     from scipy.ndimage import uniform_filter  # takes long to import
 
-    return uniform_filter(cells, 3, mode="nearest")
+    sides: Any = [3] * (cells.ndim - channels) + [1] * channels
+    return uniform_filter(cells, sides, mode="nearest")
 
 
 def insensitive(values: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.image_sensitivity import (
+    COUNTED,
     FEWEST_PROBES,
     MAP_AXES,
     Curvature,
@@ -31,8 +32,6 @@ _STREAM, _PASSES = 6, 4
 """Stream of the random numbers, and number of adjoints of each half of the residual."""
 _SPP, _PATHS = (8, 256), 1 << 20
 """Samples per pixel of each half of the pictures, and their paths of all views."""
-_COUNTED = 0.1
-"""Curvature relative to the median above which a cell counts in means over cells."""
 _PROBES = 4.0
 """Number of probes that the curvature of the neighbours weighs as much as."""
 _ERRORS = 3.0
@@ -41,6 +40,9 @@ _MOST_OVERLAP = 1.3
 """Overlap from which on texels are not independent, such as with more texels than pixels that see them."""
 _ELEMENTS, _LEAST = 9.0, 0.1
 """Number of elements whose weight the mean over all cells has in a mean with the neighbours, and the least ratio to it."""
+_CORNERS = tuple(np.s_[a, b] for a in (slice(1, None), slice(-1)) for b in (slice(1, None), slice(-1)))
+_SIGNS = ((1.0, -1.0, -1.0, 1.0), (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0))
+"""Cells of all blocks of 2 × 2, and signs of their three details (Haar wavelets)."""
 _NEARBY, _LEAST_NOISE = 5, 0.02
 """Side of the squares of pixels that share a variance, and least variance relative to the mean."""
 
@@ -78,14 +80,14 @@ def uncertainty(
     Gauss-Newton matrix JᵀJ. The variance of an element is that of a posterior with independent elements:
 
         1 / se² = H / c + 1 / τ² + p        share of the data = (H / c) se²
-        c = m + max(σ − √m, 0)²      m = ⟨(Jᵀr)² / (κ H)⟩        κ = Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²      σ² = (JᵀΣJ) / H
+        c = max(m + (2 f − 1) σ², f σ²)        m = ⟨H d²⟩        σ² = (JᵀΣJ) / H        κ = Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²
 
-    m is the variance of the residual that the parameters could still explain, as mean over neighbours: what has not converged, and the
-    run's noise. The references' noise, of variance σ² at an element, is missing there as far as the parameters have followed it. The
-    variance Σ of a pixel is that of the residual that neighbouring pixels do not share. τ² is the mean square change from the start plus
-    the mean variance, and p the curvature of the parameter's prior.
-
-    Standard errors are too large where noise of the references remains in m: after few steps, and with strong smoothing.
+    d is the distance from the least-squares solution, (JᵀJ)⁻¹ Jᵀr, with two eigenvalues of JᵀJ / H: one of changes that neighbours
+    share, and 1 of all others. So m, a mean over neighbours, contains what has not converged, and the run's noise. σ² is the variance of
+    the solution by the references' noise, and f in [0, 1] the fraction of the solution's fine detail that the parameters have. For the
+    solution times a filter f, m contains (1 − f)² σ² of that noise, and the error f² σ², which is f σ² where f is 0 or 1. The variance
+    Σ of a pixel is that of the residual that neighbouring pixels do not share. τ² is the mean square change from the start plus the mean
+    variance, and p the curvature of the parameter's prior.
 
     Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels,
     and a diagonal does not bound their errors; nor have textures with κ ≥ 1.3, such as those with more texels than pixels that see them,
@@ -106,7 +108,7 @@ def uncertainty(
     """
     as_tree(problem, values)  # refuses other keys and shapes
     until = time.perf_counter() + seconds
-    known, maps = Curvature({}, {}, 0), Uncertainty()
+    known, maps = Curvature(), Uncertainty()
     keys = checked_keys(problem, values, problem.initial_values())
     mapped = map_keys(problem)
     if mapped or keys:
@@ -184,7 +186,7 @@ def of_residuals(
     for key in keys:
         own = _Cells.of(values[key], problem.unknowns[key].initial, known.squares[key], known.noise[key], known.probes)
         prior = 0.0 if (of := problem.unknowns[key].prior) is None else of.diagonal(values[key])
-        posterior = own.posterior(one[key] * other[key], known.overlap[key], noise.is_known, prior)
+        posterior = own.posterior((one[key], other[key]), known.smooth[key], noise.is_known, prior)
         if posterior is None:
             reasons[key] = "the pictures have too few samples to tell their differences from the references from noise"
             continue
@@ -222,51 +224,85 @@ class _Cells:
     """Texels of one parameter, with one curvature per texel.
 
     Attributes:
-        change: mean square change of each cell from the start, (...).
+        change: change of each element from the start, (..., C).
         curvature: mean diagonal element of each cell, (...), > 0.
         noise: variance of the references' noise at each cell, (...).
-        channels: number of channels.
     """
 
     change: np.ndarray
     curvature: np.ndarray
     noise: np.ndarray
-    channels: int
 
     @classmethod
     def of(cls, values: np.ndarray, start: np.ndarray, squares: np.ndarray, noise: np.ndarray, probes: int) -> _Cells:
         """Return the cells. The fewer probes, the more a cell's curvature follows those of its neighbours, as geometric mean."""
-        change = np.square(values.astype(np.float64) - start).mean(axis=-1)
         curvature = _smoothed(squares.mean(axis=-1), probes)
         variances = _smoothed(noise.mean(axis=-1), probes) / curvature if noise.any() else np.zeros(curvature.shape)
-        return cls(change, curvature, variances, values.shape[-1])
+        return cls(values.astype(np.float64) - start, curvature, variances)
+
+    @property
+    def counted(self) -> np.ndarray:
+        """Cells that count in means over cells, (...)."""
+        return self.curvature > COUNTED * np.median(self.curvature)
 
     def posterior(
-        self, gradient: np.ndarray, overlap: float, noise_is_known: bool, prior: np.ndarray | float
+        self, gradients: tuple[np.ndarray, np.ndarray], smooth: float, noise_is_known: bool, prior: np.ndarray | float
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the variance and the share of the data of each element, (..., C); None if samples are too few to tell the residual.
 
         Args:
-            gradient: product of two independent Jᵀr, (..., C).
-            overlap: κ.
+            gradients: two independent Jᵀr, (..., C).
+            smooth: eigenvalue of smooth changes, see `Curvature`.
             noise_is_known: whether the residual's noise is significant.
             prior: curvature of the prior, (..., C).
         """
-        counted = self.curvature > _COUNTED * np.median(self.curvature)
-        explained = gradient.mean(axis=-1) / (overlap * self.curvature)
+        counted, channels = self.counted, self.change.shape[-1]
+        one, other = (self._distance(gradient, smooth) for gradient in gradients)
+        explained = self.curvature * (one * other).mean(axis=-1)
         m = _Mean.of(explained[counted])
         if not (m.is_known or noise_is_known):
             return None
-        elements = 3.0**explained.ndim * self.channels
+        elements = 3.0**explained.ndim * channels
         local = neighbour_means(np.where(counted, explained, m.value))
         pooled = (elements * local + _ELEMENTS * m.value) / (elements + _ELEMENTS)
         pooled = np.maximum(pooled, max(_LEAST * m.value, 0.0))
-        followed = np.square(np.maximum(np.sqrt(self.noise) - np.sqrt(pooled), 0.0))
-        c = np.maximum(pooled + followed, 1e-12)
-        before = float(self.change[counted].mean()) + float(c[counted].mean()) / float(self.curvature[counted].mean())
-        precision = (self.curvature / c)[..., None] * np.ones(self.channels)
+        f = self._followed(one, other)
+        c = np.maximum(np.maximum(pooled + (2.0 * f - 1.0) * self.noise, f * self.noise), 1e-12)
+        before = float(np.square(self.change)[counted].mean()) + float(c[counted].mean()) / float(
+            self.curvature[counted].mean()
+        )
+        precision = (self.curvature / c)[..., None] * np.ones(channels)
         variance = 1.0 / (precision + 1.0 / max(before, 1e-12) + prior)
         return variance, precision * variance
+
+    def _distance(self, gradient: np.ndarray, smooth: float) -> np.ndarray:
+        """Return the distance from the least-squares solution, (..., C), from Jᵀr; 0 at cells that do not count."""
+        roots = np.where(self.counted, np.sqrt(self.curvature), np.inf)[..., None]
+        shared = neighbour_means(gradient / roots, channels=True)
+        return (gradient / roots - (1.0 - 1.0 / smooth) * shared) / roots
+
+    def _followed(self, one: np.ndarray, other: np.ndarray) -> float:
+        """Return the fraction in [0, 1] of the solution's differences of neighbours that the parameters have; 1 if noise hides it.
+
+        Args:
+            one, other: two independent distances from the solution, (..., C).
+        """
+        solutions = self.change + one, self.change + other
+        products, squares = (self._details(a, b) for a, b in ((self.change, one + other), solutions))
+        own = self._details(self.change, self.change)
+        total = _Mean.of(squares)
+        return (
+            min(max((float(own.mean()) + 0.5 * float(products.mean())) / total.value, 0.0), 1.0)
+            if total.is_known
+            else 1.0
+        )
+
+    def _details(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Return products of two maps' details in the blocks of 2 × 2 cells that all count, weighted by the inverse of their variance."""
+        seen = np.logical_and.reduce([self.counted[of] for of in _CORNERS])
+        weights = 1.0 / np.sum([1.0 / self.curvature[of] for of in _CORNERS], axis=0)
+        first, second = (np.tensordot(_SIGNS, np.stack([x[of] for of in _CORNERS]), axes=1) for x in (one, other))
+        return (np.mean(first * second, axis=(0, -1)) * weights)[seen]
 
 
 @dataclass(frozen=True)

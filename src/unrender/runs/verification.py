@@ -26,6 +26,8 @@ _FEW_NUMBERS, _OF_PICTURE = 24, 0.01
 
 _ROWS, _PAIRS = ((3, 1), (2, 1)), ((1, 0), (1, 2))
 """Layout for `paired_losses.systematic`, and distances for `paired_losses.nearby`: of rows of pixels, and of pairs of a sample."""
+_RARE, _ERRORS = 25.0, 2.0
+"""Number of paths, of which one brings light, from which a warning says so, and standard errors by which it must be reached."""
 _OF_TRUTH = 4.0
 """Smallest mean square of a residual judged pixel by pixel, relative to that at the true values, if these are known."""
 
@@ -163,6 +165,31 @@ def misfit_of_views(
     pixels = np.concatenate([image.reshape(-1, 3) for image in references])
     residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
     return misfit_of_numbers(problem, residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), known)
+
+
+def rare_light(images: Sequence[np.ndarray], spp: float) -> str:
+    """Return a warning if only one path of many brings light to the pictures, as in caustics; "" otherwise.
+
+    A pixel of mean m whose light comes from a fraction p of its paths has a variance of at least m² (1 − p) / p per path.
+
+    Args:
+        images: independent images (K, N, 3) of each frame, K >= 2.
+        spp: samples per pixel of one of these.
+    """
+    joined = np.concatenate(images, axis=1).sum(axis=2)
+    joined = joined[:, np.isfinite(joined).all(axis=0)]
+    joined /= max(float(np.abs(joined).max(initial=0.0)), 1e-300)  # squares of the largest numbers overflow
+    count = len(joined)
+    variances = joined.var(axis=0, ddof=1)
+    squares = np.square(joined.mean(axis=0)) - variances / count
+    most = float(squares.sum()) + _ERRORS * math.sqrt(float(np.square(squares).sum()))
+    paths = 1.0 + spp * float(variances.sum()) / max(most, 1e-300)
+    if not most > 0.0 or paths < _RARE:
+        return ""
+    return (
+        f"at most one path in {paths:.0f} brings light, so pictures and gradients are noisy: paths from the camera rarely find lights "
+        "behind glass, in caustics, or through small openings; use more samples per pixel, larger lights, or rough materials"
+    )
 
 
 @runtime_checkable

@@ -23,7 +23,7 @@ from unrender.runs.number_means import averaged
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
-from unrender.runs.verification import control_variates, misfit, misfit_of_numbers
+from unrender.runs.verification import control_variates, misfit, misfit_of_numbers, rare_light
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
@@ -157,6 +157,7 @@ class Verify(Callback):
             ends = places[best][1] if places else result.parameters
             lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds)
         lines += _lines(first, last, best, best_picture.loss[0], memory if disagrees else None, worse)
+        lines += filter(None, [rare_light(last.images, pictures.paths / (pictures.pixels * len(last.images[0])))])
         verification: dict[str, Any] = {
             "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
             "start": _numbers(*first.loss),
