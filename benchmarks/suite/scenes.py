@@ -235,7 +235,7 @@ def references(file: Path, kept: Path, spp: int, depth: int) -> list[np.ndarray]
 
 
 def problem(
-    name: str, assets: Path | None, resolution: int = 64, texture: int = 64, spp: int = 4096, **options: Any
+    name: str, assets: Path | None, resolution: int = 64, texture: int = 64, spp: int = 4096, /, **options: Any
 ) -> ur.Problem:
     """Return the problem of a name of the gallery, made with `options`, or of another's such as "cbox, L2".
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from benchmarks.internals import CachingSession, prepare
-from benchmarks.suite import ablation, run
+from benchmarks.suite import ablation, run, scenes
 from tests.unit.test_auto import problem
 from unrender import InputError, gallery, losses, optimize, optimizers
 from unrender.images import Plain
@@ -57,3 +57,9 @@ def test_the_table_has_the_geometric_mean_without_each_part() -> None:
 def test_an_unknown_part_is_refused_before_any_run() -> None:
     with pytest.raises(InputError, match="--without caches: expected kept-paths, control-variate, sobolev"):
         next(run.run(without=("caches",)))
+
+
+def test_options_of_a_problem_of_the_gallery_reach_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The film's resolution, too, which problems of others have by position."""
+    monkeypatch.setattr(gallery, "problem", lambda name, **options: (name, options))
+    assert scenes.problem("wall", None, 64, 64, 4096, resolution=512) == ("wall", {"resolution": 512})
