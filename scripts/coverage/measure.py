@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.internals import SampleRequest, descend, load_scene, media, mi, mitsuba_renderer
+from benchmarks.internals import SampleRequest, descend, load_scene, media, mi
 from scripts.coverage.checks import descended, gradients_agree, images_agree
 from scripts.coverage.plugins import IN_INSTANCES, PLUGINS
 from scripts.coverage.scenes import Plugin
+from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
 __all__ = ["descent", "measure"]
 
@@ -53,7 +54,7 @@ def _measure(plugin: Plugin, folder: Path, known: dict[str, Any] | None) -> dict
     def description() -> Any:
         return plugin.build(folder)
 
-    renderer = mitsuba_renderer(description, DEPTH)
+    renderer = MitsubaRenderer(description, DEPTH)
     found = known or {"notices": list(getattr(renderer, "notices", ())), "parameters": {}}
     if known is None:
         session = renderer.prepare([], None, False)
