@@ -340,6 +340,22 @@ def test_colours_of_a_field_stay_multiplied_with_alpha(tmp_path: Path) -> None:
     np.testing.assert_allclose(pictures.read(written[0]).values, 0.6 * alpha.repeat(3, axis=2), atol=1e-3)
 
 
+def test_colours_of_a_field_are_multiplied_with_the_alpha_of_png_files(tmp_path: Path) -> None:
+    """Their colours are not multiplied, and those of transparent pixels mean nothing."""
+    (tmp_path / "capture").mkdir()
+    alpha = _soft_edges(tmp_path / "capture")
+    for file in (tmp_path / "capture").glob("*.exr"):
+        coverage = (255 * alpha).round().astype(np.uint8)
+        colours = np.where(coverage > 0, 255, 90).astype(np.uint8).repeat(3, axis=2)
+        Image.fromarray(np.concatenate([colours, coverage], axis=2)).save(file.with_suffix(".png"))
+        file.unlink()
+    table = tmp_path / "capture" / "transforms.json"
+    table.write_text(table.read_text().replace(".exr", ".png"))
+    unrender.app.import_capture(tmp_path / "capture", tmp_path / "out", unrender.app.ImportOptions(field=4, hold_out=0))
+    written = sorted((tmp_path / "out" / "references").iterdir())
+    np.testing.assert_allclose(pictures.read(written[0]).values, alpha.repeat(3, axis=2), atol=3e-3)
+
+
 def test_colours_of_masked_photographs_are_divided_by_alpha(tmp_path: Path) -> None:
     alpha = _soft_edges(tmp_path)
     (stored, *_), _ = views.prepare(formats.read(tmp_path), 32, None, 0)

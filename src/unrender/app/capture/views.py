@@ -39,7 +39,7 @@ def prepare(
         hold_out: interval of held-out photographs, beginning with the first; 0 for none; None for the capture's own split, or 8.
         progress: function of the number of processed photographs and their total.
         response: response of files of 8 or 16 bits, see `pictures.decode`.
-        masks: whether views have masks, from files or alpha. Without masks, colours that are multiplied with alpha stay so.
+        masks: whether views have masks, from files or alpha. Without masks, colours are multiplied with alpha.
 
     Returns:
         The views in the capture's order, and notices.
@@ -95,7 +95,10 @@ def _view(
     if read.values.shape[:2] != (height, width):
         have = f"{read.values.shape[1]} x {read.values.shape[0]}"
         raise InputError(f"{photograph.file}: holds {have} pixels where its header says {width} x {height}")
-    values, shown = Resampling(lens, target).apply(read.values)
+    colours = read.values
+    if read.alpha is not None and not (masks or read.premultiplied):
+        colours = colours * read.alpha[..., None]
+    values, shown = Resampling(lens, target).apply(colours)
     mask = None
     if masks and photograph.mask is not None:
         mask = _mask(photograph, lens, target, orientation)
