@@ -89,6 +89,18 @@ def test_a_budget_of_few_steps_is_told_after_the_first() -> None:
     assert not ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), steps=5).warnings
 
 
+def test_a_budget_of_few_steps_is_told_at_the_end_if_the_first_were_quick() -> None:
+    class Busy(Callback):
+        def on_step(self, run: Any, record: Any) -> None:
+            object.__setattr__(estimator, "pause", 0.1 if run.step > 3 else 0.0)
+
+    estimator = slow(0.0)
+    found = ur.optimize(problem(), estimator, ur.optimizers.Adam(0.01), seconds=0.6, callbacks=[Busy()])
+    assert found.steps < 20
+    (line,) = (line for line in found.warnings if "allows about" in line)
+    assert f"allows about {found.steps} steps" in line
+
+
 @pytest.mark.parametrize(
     ("seconds", "slowdown", "left"), [(10.0, 1.0, 8.0), (1.0, 1.0, 0.5), (30.0, 2.0, 22.0), (30.0, 9.0, 18.0)]
 )

@@ -146,7 +146,7 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
     """A wrong number is told however late it is."""
     made, allowed = problem(), []
     monkeypatch.setattr(final_images, "slowdown", lambda: 1.0)
-    none = Curvature({}, {}, 0)
+    none = Curvature()
     monkeypatch.setattr(final_images, "curvature", lambda *_, seconds, **__: allowed.append(seconds) or none)
     monkeypatch.setattr(
         final_images, "check_numbers", lambda *given: allowed.append(given[3]) or least_squares.NumbersCheck()
@@ -165,7 +165,7 @@ def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypa
     made = problem()
     values = {"wall": np.full(3, 0.4, np.float32)}
     result = replace(Result(values, values, [{}], 30.0, 0.0, "steps"), standard_error={"wall": np.full(3, 1e-3)})
-    line = "whether wall converged: no time was left to test it; use more seconds or fewer pixels"
+    line = "whether wall converged: no time was left to test it; use a longer run or fewer pixels"
     if tested:
         assert line not in final_images.render_final_images(made, result).undetermined
         monkeypatch.setattr(final_images, "slowdown", lambda: 1e-9)

@@ -260,7 +260,9 @@ def test_the_error_of_a_step_is_at_least_that_of_the_check():
     assert numbers is not None
     own, step = np.full(4, 0.004), np.array([0.1, 0.0, 0.0, 0.0])
     found = _checked(numbers, _Fit(np.zeros((4, 4)), np.zeros(4), own, step, np.zeros((4, 0))), np.full(4, 0.01))
-    assert found.unfinished["a"].endswith("standard error 0.004, 0.004, 0.004; give more seconds, or resume the run")
+    assert found.unfinished["a"].endswith(
+        "standard error 0.004, 0.004, 0.004; give more steps or seconds, or resume the run"
+    )
 
 
 def test_no_time_no_check():

@@ -455,6 +455,25 @@ def test_a_run_that_stopped_on_its_way_is_told(steps: int, rate: float, stopped:
         assert result.status == "finished"
 
 
+@pytest.mark.parametrize(("last", "told"), [(1.0, "no longer improves"), (0.5, NOT_CONVERGED)])
+def test_averages_over_steps_are_no_progress(last: float, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loss of the averages is half of that of an earlier step in both runs; the second one has come as far without them."""
+    problem = made()
+    run = ur.optimize(problem, ur.PathGradient(), ur.optimizers.Adam(0.01), steps=2)
+    averages = replace(run, parameters={"x": np.zeros(SIZE)}, history=[{"step": step} for step in range(128)])
+    check, pictures = verify.Verify(), FreshPictures(problem, 0, 0)
+    residuals = np.full((4, SIDE * SIDE, 3), 1.0)
+
+    def of(step: int, _: Any, values: Any) -> verify.EarlierImage:
+        loss = 1.0 if step == 64 else 0.5 if values is averages.parameters else last
+        return verify.EarlierImage(step, loss, 0.01, residuals)
+
+    check._pictures, check._earlier = pictures, [of(64, pictures, None)]
+    monkeypatch.setattr(verify.EarlierImage, "of", of)
+    (line,) = check._residual(problem, averages, run.parameters, pictures, pictures.picture(averages.parameters))
+    assert told in line
+
+
 def test_a_difference_below_the_noise_of_a_pixel_is_not_compared_with_it() -> None:
     assert "(10% of the picture, 2.0 times its noise)" in verification.Misfit(0.1, 1.0, 0.05).describe()
     assert verification.Misfit(0.1, 1.0, 0.5).describe().endswith("by 0.1 (10% of the picture)")

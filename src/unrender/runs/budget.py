@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 _MOST_SKIPPED = 20
 _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning is given, and number of steps that are timed for it."""
+_FEW = "allows about"
+"""Words of that warning."""
 _END_SHARE, _END_SECONDS = 0.1, 1.0
 """Time reserved for verification and final images: a fraction of the budget, plus seconds."""
 _LOOK_SECONDS, MOST_SLOWDOWN = 0.5, 3.0
@@ -67,8 +69,7 @@ class Budget(Callback):
             run.stop("seconds")
         if run.last_step is not None and run.step and time.perf_counter() + 0.5 * run.clock / run.step >= run.last_step:
             run.stop("seconds")
-        early = run.stopped == "seconds" and 0 < run.step <= _MEASURED
-        if early or (run.step == _MEASURED and not run.stopped):
+        if (run.stopped == "seconds" and run.step) or (run.step == _MEASURED and not run.stopped):
             _warn_of_few_steps(run)
         if run.state.skipped_in_a_row >= _MOST_SKIPPED:
             run.stop(NON_FINITE)
@@ -103,11 +104,11 @@ def slowdown() -> float:
 
 
 def _warn_of_few_steps(run: Run) -> None:
-    """Warn if the time of the first steps shows that the budget allows few steps."""
-    if run.seconds is None or run.clock <= 0.0:
+    """Warn once if the time of the first steps shows that the budget allows few steps, or at the end if it did."""
+    if run.seconds is None or run.clock <= 0.0 or any(_FEW in line for line in run.warnings):
         return
-    steps = max(int(run.allowed_seconds() * run.step / run.clock), run.step)
-    if line := few_steps(run.seconds, steps, run.steps):
+    expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
+    if line := few_steps(run.seconds, max(expected, run.step), run.steps):
         run.warnings.append(line)
 
 
@@ -116,7 +117,7 @@ def few_steps(seconds: float, steps: int, most: int | None = None) -> str:
     if steps >= min(_FEW_STEPS, most or _FEW_STEPS):
         return ""
     return (
-        f"the budget of {seconds:g} s allows about {steps} step{'' if steps == 1 else 's'}; use more seconds, fewer samples "
+        f"the budget of {seconds:g} s {_FEW} {steps} step{'' if steps == 1 else 's'}; use more seconds, fewer samples "
         "(--set spp=1), a smaller picture (resolution), or fewer pixels a step of a large one (--set pixels=4096)"
     )
 

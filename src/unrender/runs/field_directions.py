@@ -27,7 +27,7 @@ _SHRINKS = 0.9
 """Ratio of a number's squared remainder to that of the round before, up to which there is another round."""
 _RIDGE = 0.3
 """Sensitivity relative to the median below which cells hardly take part."""
-_LATE, _UNRESOLVED = "no time was left; use more seconds", "whose share in the pictures is not resolved"
+_LATE, _UNRESOLVED = "no time was left; use a longer run", "whose share in the pictures is not resolved"
 """Reasons of a missing standard error: the directions found so far do not contain all that trades off against a number."""
 
 

@@ -95,7 +95,7 @@ class NumbersCheck:
         if not keys:
             return []
         if not self.fixed:
-            return [f"whether {listed(keys)} converged: no time was left to test it; use more seconds or fewer pixels"]
+            return [f"whether {listed(keys)} converged: no time was left to test it; use a longer run or fewer pixels"]
         others = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
         have = "has no standard error: it is" if len(keys) == 1 else "have no standard errors: they are"
         return [f"{listed(keys)} {have} recovered together with {others}"]
@@ -380,7 +380,7 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
         elif further[of].any() and numbers.problem.loss.linear:
             unfinished[key] = (
                 f"{key}: the run ended before it settled: a least-squares step from its end moves it by {_numbers(fit.step[of])}, with the "
-                f"standard error {_numbers(of_step[of])}; give more seconds, or resume the run"
+                f"standard error {_numbers(of_step[of])}; give more steps or seconds, or resume the run"
             )
     known = np.where((error > sizes) | refuted, np.inf, error)  # beyond its own size an error is not linear
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, fit.own))

@@ -207,7 +207,7 @@ def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
     if info.curved:
         return "pictures may not change in proportion to it"
     if known.probes < FEWEST_PROBES:
-        return "no time was left; use more seconds or fewer pixels"
+        return "no time was left; use a longer run or fewer pixels"
     overlap = known.overlap.get(key, math.inf)
     if math.isinf(overlap):
         return "it has too many texels to measure whether pixels see several of them"

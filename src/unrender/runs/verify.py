@@ -196,11 +196,12 @@ class Verify(Callback):
         earlier = next((one for one in reversed(self._earlier) if one.is_compared(result.steps)), None)
         if self._pictures is None or earlier is None:
             return []
-        last = EarlierImage.of(result.steps, self._pictures, result.parameters)
+        # Averages over steps lower the loss without progress, so the comparison with an earlier step is of the last step itself.
+        last = EarlierImage.of(result.steps, self._pictures, unaveraged)
         if not last.is_still(earlier):
-            if unaveraged is not result.parameters:
-                last = EarlierImage.of(result.steps, self._pictures, unaveraged)
             return not_converged(last, earlier, self._pictures)
+        if unaveraged is not result.parameters:
+            last = EarlierImage.of(result.steps, self._pictures, result.parameters)
         references, weights = self._pictures.references, self._pictures.weights
         sampled = pictures.sampled or self._pictures.sampled  # each has other pixels then
         fresh = None if sampled else pictures.differences(end.images)
