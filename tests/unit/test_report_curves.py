@@ -37,6 +37,17 @@ def test_chart_breaks_the_line_at_gaps_and_keeps_zero_on_a_linear_axis():
     assert plots.chart("Nothing", [Line("none", np.arange(2.0), np.full(2, np.nan))], "seconds", 1.0) is None
 
 
+@pytest.mark.parametrize("end", [1e-320, 1.0, 1.7e308])
+@pytest.mark.parametrize("high", [5e-324, 1e-300, 1.0, 1.7e308])
+@pytest.mark.parametrize("low", [-1.7e308, 0.0, 5e-324, 1e-300, 1.0])
+def test_numbers_at_the_ends_of_the_doubles_are_drawn(low: float, high: float, end: float):
+    values = np.array([low, high, high])
+    line = Line("loss", np.linspace(0.0, end, 3), values, values, values)
+    chart = plots.chart("Loss", [line], "seconds", end)
+    assert chart is not None
+    assert all(0 <= place <= plots.HEIGHT for place, _ in chart.y_ticks)
+
+
 def test_long_histories_are_thinned_to_median_and_range():
     rng = np.random.default_rng(0)
     x = np.linspace(0.001, 7.0, 20_000)

@@ -18,7 +18,7 @@ from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import run, verification, verify
 from unrender.runs.folder import reader
-from unrender.runs.folder.schema import NOT_VERIFIED
+from unrender.runs.folder.schema import NOT_VERIFIED, RunRecord
 from unrender.statistics import paired_losses
 
 SIDE, WIDE, SIZE = 12, 20, 6
@@ -714,3 +714,11 @@ def test_noise_of_references_with_a_reconstruction_filter_is_no_difference(side:
         residuals = noise + generator.normal(0.0, 0.01, (4, side * side, 3))
         arguments = problem, residuals, np.ones((side * side, 3)), np.ones(side * side)
         assert not verification.misfit_of_numbers(*arguments)
+
+
+@pytest.mark.parametrize("status", [{}, [], None, 1, "else"])
+def test_a_status_that_is_none_of_ours_is_not_verified(status: object) -> None:
+    record = RunRecord.model_validate(
+        {"status": "finished", "name": "a", "method": "b", "verification": {"status": status}}
+    )
+    assert record.verified == NOT_VERIFIED

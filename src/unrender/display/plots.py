@@ -16,7 +16,8 @@ WIDTH, HEIGHT = 420, 270
 LEFT, RIGHT, TOP, BOTTOM = 54, 14, 10, 40
 _LOGARITHMIC_FROM = 4.0
 _COLOURS = 6
-_LARGEST = 1e280
+_SMALLEST, _LARGEST = 1e-280, 1e280
+"""Range of magnitudes: ticks of numbers near the ends of the doubles would overflow or be zero."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
     more, shown = max(0, len(shown) - _COLOURS), shown[:_COLOURS]
     if not shown:
         return None
-    end = end if end > 0 else 1.0
+    end = min(end, _LARGEST) if end > _SMALLEST else 1.0
     x_axis = Axis(0.0, end, False, _even_ticks(0.0, end, 5, format_value))
     y_axis = _vertical(shown)
     return Chart(
@@ -141,23 +142,28 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
 
 def is_logarithmic(values: np.ndarray) -> bool:
     """Return whether these values, all finite, suit a logarithmic axis: they are positive and span at least a factor of four."""
-    return bool(values.size and values.min() > 0 and values.max() / values.min() >= _LOGARITHMIC_FROM)
+    return bool(values.size and values.min() > 0 and values.max() / _LOGARITHMIC_FROM >= values.min())
 
 
 def _vertical(lines: Sequence[Line]) -> Axis:
     parts = [line.y for line in lines] + [b for line in lines for b in (line.low, line.high) if b is not None]
-    # Values near the largest double would overflow in the computation of ticks.
-    values = np.clip(np.concatenate([part[np.isfinite(part)] for part in parts]), -_LARGEST, _LARGEST)
-    middle = np.clip(np.concatenate([line.y[np.isfinite(line.y)] for line in lines]), -_LARGEST, _LARGEST)
+    values, middle = _drawable(parts), _drawable([line.y for line in lines])
     if is_logarithmic(middle):
         # A band that touches zero must not stretch the logarithmic axis indefinitely.
         low, high = max(values[values > 0].min(), middle.min() / 10), values.max()
-        low, high = low / (high / low) ** 0.04, high * (high / low) ** 0.04
+        margin = 10.0 ** (0.04 * (math.log10(high) - math.log10(low)))
+        low, high = low / margin, high * margin
         return Axis(low, high, True, _logarithmic_ticks(low, high))
     low, high = min(values.min(), 0.0) if values.min() < 0.5 * values.max() else values.min(), values.max()
     span = (high - low) or abs(high) or 1.0
     low, high = (low if low == 0 else low - 0.05 * span), high + 0.05 * span
     return Axis(low, high, False, _even_ticks(low, high, 5, formatting.number))
+
+
+def _drawable(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the finite values, their magnitudes at most `_LARGEST` and those below `_SMALLEST` zero."""
+    values = np.clip(np.concatenate([part[np.isfinite(part)] for part in parts]), -_LARGEST, _LARGEST)
+    return np.where(np.abs(values) < _SMALLEST, 0.0, values)
 
 
 def _even_ticks(

@@ -164,7 +164,7 @@ class RunRecord(BaseModel):
     def verified(self) -> str:
         """Status of the run according to new images; "not verified" if none were rendered, as in folders of earlier versions."""
         status = self.verification.get("status")
-        return status if status in ENDED else NOT_VERIFIED
+        return status if isinstance(status, str) and status in ENDED else NOT_VERIFIED
 
 
 # ---------------------------------------------------------------------- live/status.json
