@@ -125,6 +125,8 @@ def draw(benchmark: Benchmark, record: Record, file: Path) -> bool:
             raise
         print("no figure: this record keeps no images", file=sys.stderr)
         return False
+    if figure is None:
+        return False
     figure.savefig(file, dpi=100)
     plt.close(figure)
     print(f"wrote {file}", flush=True)

@@ -308,7 +308,7 @@ def test_the_baselines_are_those_of_the_records() -> None:
         (wrong_numbers, "with L1 stock ends at 1.93", "with L1 stock ends at 1.98", "['1.98']"),
         (wrong_goals, "with 5.0 and 3.6 times fewer", "with 5.7 and 3.6 times fewer", "['5.7']"),
         (wrong_goals, "more paths behind the maps; a smaller uniform share; ", "", "Adaptive Fig. 3"),
-        (wrong_baselines, "OurHVPA: 8; OurJoint: 8 | 3 | 10 to 20 |", "OurHVPA: 2; OurJoint: 8 | 3 | 10 to 20 |", "BOX2"),
+        (wrong_baselines, "OurHVPA: 8; OurJoint: 8 | 3 | 10 to 20 |", "OurHVPA: 2; OurJoint: 8 | 3 | 10 to 20 |", "BOX10"),
         (wrong_baselines, "uniform: 4; loss: 4; adaptive: 4 | 1 |", "uniform: 4; loss: 4; adaptive: 4 | 2 |", "adaptive_smoke"),
         (wrong_baselines, "| `meta.equal_time` | chalice |", "| meta | chalice |", "chalice"),
     ],

@@ -111,6 +111,12 @@ def by_paths(moments: np.ndarray, shares: np.ndarray) -> tuple[float, float]:
     return float(over.sum() / whole.sum()), float(np.sqrt((parts - 1) * np.var(left_out)))
 
 
+def least(moments: np.ndarray) -> float:
+    """(Σ_j √s_j)² over N Σ_j s_j: the least that any probabilities leave of uniform ones' variance. The s of few paths make it smaller."""
+    second = moments.mean(axis=0)
+    return float(np.sqrt(second).mean() ** 2 / second.mean())
+
+
 def point(
     problem: ur.Problem,
     adaptive: PixelSampler,
@@ -131,6 +137,7 @@ def point(
     found: dict[str, Any] = {"step": step, "uniform": state.uniform, "ratio": [], "error": [], "gradients": []}
     both = [np.ones(theirs.shape[1]), scales]
     moments = second_moments(problem, at, both, settings["paths"], PARTS, Key(step, 7))
+    found["least"] = [least(of_factors) for of_factors in moments]
     for factors, of_factors in zip(both, moments, strict=True):
         ratio, error = by_paths(of_factors, shares)
         found["ratio"].append(ratio)
@@ -212,7 +219,7 @@ def table(record: Record) -> str:
     settings = record["settings"]
     parts = [
         f"{settings['count']} pixels a step; plain / relative, by paths; ± is of the relative one. Steps are those done before; λ, the "
-        "share of uniform draws, at each."
+        "share of uniform draws, at each; least, that any probabilities leave as a plain sum."
     ]
     for label in record["summary"]:
         found = {name: entry[label] for name, entry in record["problems"].items() if label in entry}
@@ -239,7 +246,8 @@ def _by_steps(found: dict[str, Any], cell: Callable[[dict[str, Any]], str]) -> s
 
 def _cell(point: dict[str, Any]) -> str:
     plain, relative = point["ratio"]
-    return f"{plain:.2f} / {relative:.2f} ± {point['error'][1]:.1g}, λ {point['uniform']:.2g}"
+    limit = f", least {point['least'][0]:.2f}" if "least" in point else ""
+    return f"{plain:.2f} / {relative:.2f} ± {point['error'][1]:.1g}, λ {point['uniform']:.2g}{limit}"
 
 
 def _direct(point: dict[str, Any]) -> str:

@@ -209,7 +209,7 @@ OTHER_GRIDS: dict[tuple[str, str], Grid | tuple[Grid, ...]] = {
     ("QUAD", "OurJoint"): _FAR_KEPT,
     ("QUAD", "FR22"): {"half_life": (25.0, 60.0), "rate": (0.5, 0.7, 1.0, 2.0)},
     ("QUAD", "OurG"): {"half_life": (25.0, 60.0), "rate": (0.5, 1.0, 2.0)},
-    ("TEXTURE", "Mitsuba"): {"rate": (0.03, 0.1)},
+    ("TEXTURE", "Mitsuba"): {"rate": (0.03, 0.1, 0.3, 1.0)},
     ("TEXTURE", "FR22"): {"half_life": (30.0, 60.0), "rate": (0.25, 0.5), "spp": (4.0, 16.0)},
     ("TEXTURE", "CMA-ES"): {"deviation": (0.25, 0.5), "population": (16, 32), "spp": (4.0,)},
     ("TEXTURE", "OurG"): {"half_life": (60.0,), "rate": (0.2,)},

@@ -4,10 +4,11 @@ Errors are of the image and of the parameters. Methods: the stock loop on path g
 Mitsuba's projective integrator, and TEXTURE); FR22, the smoothed gradient of Fischer and Ritschel 2023 with Adam;
 CMA-ES; L-BFGS on the aggregate gradient; and the paper's: the gradient (OurG) with Adam, the Hessian (OurH) with
 Newton's method, Hessian-vector products element by element (OurHVP) and from the aggregate (OurHVPA) with Newton-CG;
-and, beyond the paper, gradient and products from the same renders (OurJoint). All render their perturbations by the
-same launches, with antithetic draws and shared random numbers, and shrink σ as they go. Each is tuned on each task over
-a grid (`methods.py`), on starts of its own, for the mean logarithm of its times; then the runs of all methods are done
-in turns.
+and, beyond the paper, gradient and products from the same renders (OurJoint), Gauss-Newton by differences of renders
+(OurGN), and on TEXTURE `auto`, which has path gradients as the stock loop has. The others render their perturbations by
+the same launches, with antithetic draws and shared random numbers, and shrink σ as they go. Each but `auto` is tuned on
+each task over a grid (`methods.py`), on starts of its own, for the mean logarithm of its times; then the runs of all
+methods are done in turns.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ TUNING = 3
 """Starts that a method is tuned on, numbered from 1000; TEXTURE, whose runs are all alike, takes one."""
 _NEVER = 10.0
 """A goal that is not met counts as this many times the budget when methods are tuned."""
-ALL_METHODS = ("Mitsuba", *METHODS, *published.METHODS)
+AUTO = ("TEXTURE",)
+"""Where `auto` takes path gradients, as Mitsuba's loop does."""
+ALL_METHODS = ("Mitsuba", *METHODS, "auto", *published.METHODS)
 MERGE = ("tasks.*.methods",)
 QUICK = {"task": ("MUG",), "method": ("FR22", "OurJoint"), "runs": 2, "resolution": 8, "seconds": 0.02}
 
@@ -49,13 +52,15 @@ def descend_by(name: str, task: Task, method: str, problem: ur.Problem, config: 
         return mitsuba(name, started, config["rate"] * task.sigma, task.seconds)
     if method in published.METHODS:
         return published.descend(name, method, started, number)
+    if method == "auto":
+        return descend(started, "auto", None, task.seconds, number)
     n = sum(value.size for value in problem.truth.values())
     return descend(started, *METHODS[method].make(task, n, config), task.seconds, number)
 
 
 def tune(name: str, task: Task, method: str, problem: ur.Problem) -> tuple[Config, list[dict[str, Any]]]:
     """The configuration of the least mean logarithm of times to the goals, and all that were tried."""
-    if method in published.METHODS:
+    if method in published.METHODS or method == "auto":
         return {}, []
     configs, tried = configurations(name, method), []
     task = replace(task, seconds=task.tuned * task.seconds)
@@ -76,6 +81,7 @@ def race(name: str, task: Task, runs: int, first: int, chosen: tuple[str, ...]) 
     """One task: every method of `chosen` that applies, tuned, over the runs, in turns."""
     problem = task.problem()
     applies = {m for m in METHODS if (name, m) not in LEFT_OUT} | ({"Mitsuba"} if name in MITSUBA else set())
+    applies |= {"auto"} if name in AUTO else set()
     applies |= set(published.METHODS) if name in published.SETTINGS else set()
     found: dict[str, Any] = {}
     for method in (method for method in ALL_METHODS if method in applies and method in chosen):
@@ -178,7 +184,7 @@ def table(record: Record) -> str:
     papers = (
         "By the paper's goals: squared errors of the parameters of .1, .01 and .001, that is RMSE of .316, .1 and .032, of single steps. "
         "Times at which the median curve of the runs reaches them; each cell is the mean ratio over the goals that both reached, with "
-        "their number. Best of ours: OurHVPA, OurJoint and OurGN; of others: FR22, CMA-ES, L-BFGS and Mitsuba."
+        "their number. Best of ours: OurHVPA, OurJoint, OurGN and auto; of others: FR22, CMA-ES, L-BFGS and Mitsuba."
     )
     return markdown.blocks(*parts, text, _apart(record["tasks"]), papers, _at_the_papers_goals(record["tasks"]))
 
@@ -188,7 +194,7 @@ _PAIRS = (
     ("FR22 / OurJoint", ("FR22",), ("OurJoint",)),
     ("CMA-ES / OurHVPA", ("CMA-ES",), ("OurHVPA",)),
     ("FR22 / OurHVPA, both published", ("FR22, published",), ("OurHVPA, published",)),
-    ("best of others / best of ours", ("FR22", "CMA-ES", "L-BFGS", "Mitsuba"), (*OURS, "OurGN")),
+    ("best of others / best of ours", ("FR22", "CMA-ES", "L-BFGS", "Mitsuba"), (*OURS, "OurGN", "auto")),
 )
 _PAPERS_GOALS = {"image": (0.1, 0.01, 0.001), "parameter": tuple(math.sqrt(goal) for goal in (0.1, 0.01, 0.001))}
 

@@ -127,21 +127,22 @@ def table(record: Record) -> str:
             values = ([run[what] for run in of["runs"] if what in run] for what in ("surface", "pictures"))
             finals = (markdown.spread(each) if each else "–" for each in values)
             noise = f"{of['variance'] / uniform:.3g}" if uniform else "–"
-            rows.append([problem, f"{found['seconds']:g} s", name, f"{of['rate']:g}", *finals, noise])
+            budget = [f"{found['seconds']:g} s", str(len(of["runs"]))]
+            rows.append([problem, *budget, name, f"{of['rate']:g}", *finals, noise])
     text = (
-        "Of the start's, after some seconds of the processor, {seeds} seeds: median (least to greatest). "
+        "Of the start's, after some seconds of the processor: median (least to greatest). "
         "Views of {resolution}², mini-batches of 2048 pixels, 4 spp, where no others are named. "
         "Variance of the gradient at the start, over that of uniform mini-batches."
     )
-    head = "problem | seconds | pixels | rate | surface error | picture error | variance"
+    head = "problem | seconds | seeds | pixels | rate | surface error | picture error | variance"
     return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
 
 
-def plot(record: Record) -> figures.Figure:
-    """Error of the surface over seconds, of the problems where it is known."""
+def plot(record: Record) -> figures.Figure | None:
+    """Error of the surface over seconds, of the problems where it is known; None if there are none."""
     panels = {
         name: {method: [run["curve"] for run in entry["runs"]] for method, entry in found["methods"].items()}
         for name, found in record["problems"].items()
         if found["judged by"] == "surface"
     }
-    return figures.curves(panels, "processor seconds", "surface error / at the start")
+    return figures.curves(panels, "processor seconds", "surface error / at the start") if panels else None
