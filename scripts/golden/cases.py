@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core import arrays
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import FreshGradient, PastWeight, Variance
 from unrender.methods.plan import bind
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.callbacks import Callback
 
 __all__ = ["METHODS", "OPTIMIZERS", "PROBLEMS", "Trajectory", "descend", "optimize"]

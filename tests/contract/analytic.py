@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core import registry
-from unrender.rendering.numpy.linear import AnalyticRenderer
 
 SHAPE = (4, 4)
 

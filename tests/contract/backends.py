@@ -11,9 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core import arrays
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.numpy.one_pixel import ExponentialRenderer, QuadraticRenderer
 from unrender.rendering.renderer import Renderer, SampleRequest
 

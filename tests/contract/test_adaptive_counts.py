@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import exact_gradient, problem
 from scipy import stats
 
 import unrender as ur
+from analytic import exact_gradient, problem
+from tests.analytic import AnalyticRenderer
 from unrender.core import arrays
 from unrender.core.random import Key
 from unrender.estimators.sample_groups import GradientRequest
 from unrender.pixels.base import DrawStatistics, MiniBatch
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder.state import pack, unpack
 from unrender.scene.batches import FullView
 from unrender.scene.executor import LOCAL

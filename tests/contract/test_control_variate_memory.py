@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from analytic import problem
 
 import unrender as ur
+from analytic import problem
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.images.recursive_control_variate import ViewMemory
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.scene.batches import FullView
 from unrender.statistics import welford
 

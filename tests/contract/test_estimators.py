@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import exact_gradient, others, problem
 from scipy import stats
 
 import unrender as ur
+from analytic import exact_gradient, others, problem
+from tests.analytic import AnalyticRenderer
 from tiers import quick, slow
 from unrender.core import registry
 from unrender.core.random import Key
@@ -21,7 +22,6 @@ from unrender.estimators.capabilities import FreshGradient
 from unrender.estimators.sample_groups import fresh_weights
 from unrender.images.base import ImageEstimate
 from unrender.optimizers import transforms
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import SampleRequest
 from unrender.runs.callbacks import Callback
 from unrender.runs.run import Run

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import problem
 
 import unrender as ur
+from analytic import problem
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.estimators.sample_groups import GradientRequest
 from unrender.images.plain import PlainState
 from unrender.pixels import pixel_statistics
 from unrender.pixels.map_denoising import pool
 from unrender.pixels.tiles import cut
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.folder.state import pack, unpack
 from unrender.scene.executor import LOCAL
 

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import exact_gradient, problem
 from scipy import stats
 
 import unrender as ur
+from analytic import exact_gradient, problem
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.pixels import pixel_statistics
 from unrender.pixels import tiles as cells_module
 from unrender.pixels.map_denoising import denoise_side_by_side
 from unrender.pixels.tiles import Grid, InverseCdfTable, Tiles, cut
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.scene.batches import FullView, PixelBatch, PixelSample
 from unrender.scene.references import References
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering import picture_format
@@ -17,7 +18,6 @@ from unrender.rendering import renderer as port
 from unrender.rendering.camera_poses import PosedCameras
 from unrender.rendering.exposure import ExposedRenderer
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.partial import HeldParameters, PartialDerivatives
 from unrender.rendering.picture_format import PictureFormat
 from unrender.rendering.renderer import Camera, EmitterMoments, SampleRequest

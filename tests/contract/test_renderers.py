@@ -13,13 +13,13 @@ from backends import BACKENDS, LAMP, TEXTURE, Backend, problem, surface
 from scipy import stats
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from tiers import quick
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space
 
 DIFFERENTIABLE = [name for name, backend in BACKENDS.items() if backend.derivatives]

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.analytic import AnalyticRenderer
 from unrender.core.trees import Tree
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import ParameterInfo, Rendering, SampleRequest, Space
 
 KEY = "field"

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from tiers import slow
 from unrender.estimators.base import Estimate
 from unrender.estimators.coordinates import by_coordinates
-from unrender.rendering.numpy.linear import AnalyticRenderer
 
 SIDE = 6
 N = SIDE * SIDE

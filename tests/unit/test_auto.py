@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import tomli_w
 
+from tests.analytic import AnalyticRenderer
 from unrender import images, losses, optimizers, pixels
 from unrender.core.errors import InputError
 from unrender.estimators.gauss_newton import GaussNewton
@@ -25,7 +26,6 @@ from unrender.methods.rules import first_rates, sampling
 from unrender.methods.rules.constants import CONSTANTS
 from unrender.methods.rules.traits import Traits
 from unrender.preconditioners import LargeSteps, Sobolev
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import unrender as ur
-from unrender.rendering.numpy.linear import AnalyticRenderer
+from tests.analytic import AnalyticRenderer
 
 
 def test_numbers_that_end_at_their_bounds_are_told() -> None:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.methods.plan import Plan
 from unrender.protocols import Callback
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import budget, loop
 from unrender.runs.folder.history import thinned
 from unrender.runs.metadata import RunAnnotations

@@ -10,7 +10,7 @@ import pytest
 
 from scripts.coverage.checks import descended, gradients_agree, images_agree
 from scripts.coverage.cli import RECORD
-from unrender.rendering.numpy.linear import AnalyticRenderer
+from tests.analytic import AnalyticRenderer
 
 RUNS, SIZE = 16, 16
 PICTURE = np.kron(np.random.default_rng(0).uniform(0.2, 0.8, (4, 4, 3)), np.ones((4, 4, 1)))

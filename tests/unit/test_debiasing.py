@@ -9,9 +9,9 @@ import pytest
 
 import unrender as ur
 from benchmarks.debiasing import DebiasedGradient, bias_correction
+from tests.analytic import AnalyticRenderer
 from tiers import quick
 from unrender.core.random import Key
-from unrender.rendering.numpy.linear import AnalyticRenderer
 
 RUNS = 400
 LIMIT = 4.5

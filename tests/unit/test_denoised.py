@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.images import denoising
 from unrender.images.base import ImageEstimator, PairRequest, needs_full_views
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.scene.batches import FullView
 
 Denoised, Plain, CV = ur.images.Denoised, ur.images.Plain, ur.images.RecursiveControlVariate

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
 from unrender.estimators.emitter_selection import EmitterState, connections, learned
 from unrender.images.base import ImageEstimate
 from unrender.methods.base import method
 from unrender.pixels.uniform_share import MOST, SHARES
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import EmitterMoments, RenderSession
 
 MOMENTS = np.array([4.0, 1.0, 0.25, 0.0])

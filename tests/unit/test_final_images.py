@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.analytic import AnalyticRenderer
 from unrender import optimizers
 from unrender.core import phases
 from unrender.estimators.path import PathGradient
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import final_images, least_squares
 from unrender.runs.callbacks import Callback
 from unrender.runs.image_sensitivity import Curvature

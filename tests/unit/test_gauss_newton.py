@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.estimators import derivative_images
 from unrender.estimators import gauss_newton as module
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import GradientNoise, Hessian, HessianNoise, ScoreCovariance, Smoothing
 from unrender.optimizers import AveragedNewton, averaged_newton
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import reader
 from unrender.runs.folder.state import not_finite, pack

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.analytic import AnalyticRenderer
 from unrender import optimizers, pixels
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
@@ -16,7 +17,6 @@ from unrender.images import RecursiveControlVariate
 from unrender.losses import Huber
 from unrender.methods import method
 from unrender.methods.smoothed import SmoothedMethod
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.components import resolve
 from unrender.runs.optimize import estimate, optimize

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.estimators.capabilities import BlockEstimate
 from unrender.images.base import PairRequest
 from unrender.methods import method
 from unrender.protocols import Callback
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.partial import HeldParameters
 from unrender.rendering.renderer import ParameterInfo
 from unrender.scene.batches import PixelBatch

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.estimators.gauss_newton import GaussNewtonState
 from unrender.estimators.hybrid import HybridState
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import least_squares
 from unrender.runs.least_squares import NumbersCheck, _checked, _Fit, check_numbers, pixel_weights
 from unrender.runs.numbers import Differences, Numbers

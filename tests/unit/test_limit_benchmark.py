@@ -7,7 +7,7 @@ import pytest
 
 import unrender as ur
 from benchmarks.limit import run as limit
-from unrender.rendering.numpy.linear import AnalyticRenderer
+from tests.analytic import AnalyticRenderer
 
 SHAPE, NOISE = (6, 6), 0.3
 MATRIX = np.random.default_rng(0).normal(0.0, 1.0, (SHAPE[0] * SHAPE[1] * 3, 3))

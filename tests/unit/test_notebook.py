@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.analytic import AnalyticRenderer
 from unrender import optimizers
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.display import formatting, notebook
 from unrender.display.notebook import NotebookBar
 from unrender.estimators.path import PathGradient
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 from unrender.scene.parameter import Parameter

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.optimizers import Adam, AveragedNewton, Partitioned
 from unrender.optimizers.base import Measuring, averaged_by
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import number_means, verify
 from unrender.runs.number_trace import NumberTrace
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.rendering.numpy.linear import AnalyticRenderer
+from tests.analytic import AnalyticRenderer
 from unrender.runs import field_directions, final_images, least_squares
 from unrender.runs.field_directions import _Adjoints
 from unrender.runs.least_squares import NumbersCheck, check_numbers

@@ -14,10 +14,10 @@ import pytest
 from scipy import stats
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from tiers import slow
 from unrender.core.errors import InputError
 from unrender.own_loop.stream import Rendered
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.numpy.one_pixel import ExponentialRenderer
 
 CV = ur.images.RecursiveControlVariate

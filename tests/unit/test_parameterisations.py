@@ -11,6 +11,7 @@ import pytest
 from drjit.auto import Float
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from tiers import slow
 from unrender.core import registry, trees
 from unrender.core.random import Key
@@ -25,7 +26,6 @@ from unrender.estimators.capabilities import (
 )
 from unrender.estimators.coordinates import by_coordinates
 from unrender.parameterisations import Identity, Log, Logit, Softplus
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.scene.fingerprint import fingerprint
 
 MAPS = {

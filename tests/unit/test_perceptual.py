@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender import losses
 from unrender.core import tables
 from unrender.losses import perceptual
-from unrender.rendering.numpy.linear import AnalyticRenderer
 
 torch: Any = pytest.importorskip("torch")
 SIZES = {0: (3, 64), 2: (64, 64), 5: (64, 128), 7: (128, 128), 10: (128, 256), 12: (256, 256), 14: (256, 256)}

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.camera_poses import POSES, Corrections, PosedCameras
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.photographs import scene_renderer, scene_values, sensors_with_rows, with_photographs
 from unrender.rendering.renderer import Camera, Renderer, SampleRequest
 from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer, falloff, powers

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core import periodic
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
@@ -25,7 +26,6 @@ from unrender.estimators.penalties import penalized, penalty
 from unrender.io import toml_lines
 from unrender.methods import method
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.scene.fingerprint import fingerprint
 from unrender.scene.prior import Prior
 from unrender.scene.references import likelihood_scale, standard_deviation

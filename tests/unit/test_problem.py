@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.analytic import AnalyticRenderer
 from unrender import losses
 from unrender.core.errors import InputError
 from unrender.preconditioners import LargeSteps
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.renderer import ParameterInfo
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem

@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.app.stages import stages_file
 from unrender.app.sweeps.record import SweepPlan, SweepRecord, read_sweep, write_sweep
 from unrender.core.errors import InputError
 from unrender.core.random import LARGEST_SEED, LEAST_SEED
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.callbacks import Callback
 from unrender.runs.folder import method_file, reader, schema
 from unrender.runs.metadata import RunAnnotations

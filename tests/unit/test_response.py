@@ -11,9 +11,9 @@ from PIL import Image
 from test_photographs_parameters import check_adjoint, requests
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.app.capture import pictures, unknowns
 from unrender.core.errors import InputError
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.photographs import OF_PHOTOGRAPHS, scene_values, with_photographs
 from unrender.rendering.renderer import SampleRequest
 from unrender.rendering.response import RESPONSE, RESPONSE_BOUND, RespondingRenderer, curve

@@ -10,13 +10,13 @@ import pytest
 
 import kernels
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core import trees
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capability, Hessian, HessianProduct, LossFunction, Smoothing
 from unrender.optimizers import CMAES, LBFGS, Adam, Newton, NewtonCG
 from unrender.optimizers.cma_es import CMAESState
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.schedules.functions import Constant, Exponential
 
 LIKE = {"a": np.zeros((2, 2)), "b": np.zeros(2)}

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import image_sensitivity as module
 from unrender.runs.image_sensitivity import insensitive, sensitivity
 from unrender.scene.parameter import Parameter

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.schedules.functions import Exponential
 from unrender.statistics import hessian_updates
 

@@ -9,13 +9,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from tests.analytic import AnalyticRenderer
 from unrender import losses
 from unrender.methods import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import starts
 from unrender.methods.rules.brightness import start_factors
 from unrender.methods.rules.constants import CONSTANTS
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
 from unrender.scene.parameter import Parameter

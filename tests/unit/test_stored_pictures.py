@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.io import stored_pictures
 from unrender.io.stored_pictures import PictureStore, StoredPicture
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.scene import view_checks
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.estimators.fresh_pictures import FreshPictures
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs.truth_check import further_from_truth
 
 SIDE, CELLS = 12, 8

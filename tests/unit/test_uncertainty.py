@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.rendering.numpy.linear import AnalyticRenderer
+from tests.analytic import AnalyticRenderer
 from unrender.runs import final_images, image_sensitivity
 from unrender.runs import map_uncertainty as module
 from unrender.runs.folder import reader as folders

@@ -12,11 +12,11 @@ from scipy.optimize import lsq_linear
 from test_hybrid import PosedRenderer
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.estimators import variable_projection
 from unrender.estimators.capabilities import BlockEstimate, DerivativeImages
 from unrender.methods import method
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.rendering.partial import EliminatedParameters
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
 from unrender.runs.folder.state import Packed, pack, unpack

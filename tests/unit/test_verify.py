@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from tiers import slow
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.images.base import leave_one_out
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.rendering.numpy.linear import AnalyticRenderer
 from unrender.runs import run, verification, verify
 from unrender.runs.folder import reader
 from unrender.runs.folder.schema import NOT_VERIFIED, RunRecord

@@ -11,7 +11,7 @@ import unrender as ur
 from benchmarks import weight_rules
 from benchmarks.rcv.fig12_start import run as start
 from benchmarks.weight_rules import RULES, Simulated, one_run
-from unrender.rendering.numpy.linear import AnalyticRenderer
+from tests.analytic import AnalyticRenderer
 
 STEPS = 9
 
