@@ -10,7 +10,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import listed
-from unrender.runs.image_sensitivity import seen_cells
+from unrender.runs.image_sensitivity import MAP_AXES, seen_cells
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import render, selected_views
@@ -25,6 +25,8 @@ _ERRORS = 2.0
 """Number of standard errors by which a change must be below its limit."""
 _UNSEEN = 0.05
 """Fraction of unseen cells of a texture or grid from which a line is returned."""
+_ROLES = ("value", "height")
+"""Roles of the tested parameters; equal normals or directions are no range."""
 _SEEDS, _RENDERINGS = (3, 4), 8
 """Seeds of the two independent halves, and number of renderings per view for two changes."""
 
@@ -53,7 +55,9 @@ def undetermined(
 ) -> list[str]:
     """Return a line for each parameter that hardly changes the images over its entire range.
 
-    Parameters of materials and media are tested in sequence while time remains. All elements of a parameter change together.
+    Parameters of materials and media are tested in sequence while time remains. All elements of a parameter change together. The range
+    of a map without bounds, such as a bump map, is that of its values. If its own details change the images, the line says that only
+    differences of its elements are determined.
 
     Args:
         problem: problem with views and scene.
@@ -66,20 +70,29 @@ def undetermined(
     until, longest = time.perf_counter() + seconds, 0.0
     for key, unknown in problem.unknowns.items():
         info, (low, high) = known[key], unknown.bounds
-        if low is None or high is None or info.rigid or info.viewpoint or info.welded or info.role != "value":
+        own = np.asarray(values[key], np.float32)
+        details = own.ndim >= MAP_AXES and bool(own.min() < own.max())
+        if low is None and high is None and details:
+            low, high = float(own.min()), float(own.max())
+        if low is None or high is None or info.rigid or info.viewpoint or info.welded or info.role not in _ROLES:
             continue
         started = time.perf_counter()
         if longest > 0.0 and started + longest > until:
             break
-        first, last = (
-            {**values, key: project(np.full(values[key].shape, end, np.float32), low, high)} for end in (low, high)
-        )
+        first, last = ({**values, key: project(np.full(own.shape, end, np.float32), low, high)} for end in (low, high))
         try:
             change = _change(problem, first, last, spp, per_pass)
+            hidden = change.is_below(_LEAST)
+            shown = details and hidden and not _change(problem, first, values, spp, per_pass).is_below(_LEAST)
         except InputError:  # the renderer rejects a value at the end of the range
             continue
         longest = max(longest, time.perf_counter() - started)
-        if change.is_below(_LEAST):
+        if shown:
+            lines.append(
+                f"{key}: a constant added to all of it changes the pictures by less than {_LEAST:.1%}; only differences of its elements "
+                "are determined"
+            )
+        elif hidden:
             lines.append(
                 f"{key}: over its entire range the pictures change by less than {_LEAST:.1%}; its value is the initial one, or noise"
             )
