@@ -34,6 +34,7 @@ from unrender.app.capture.formats import lights
 from unrender.app.evaluation.judge import judge
 from unrender.app.evaluation.turntable import turntable
 from unrender.app.exporting.scene_folder import export
+from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, images, volumes
 from unrender.runs.folder import reader
@@ -107,7 +108,8 @@ def _picture_files() -> Files:
     place = Path(tempfile.mkdtemp(prefix="fuzz"))
     import mitsuba as mi
 
-    mi.Bitmap(pixels.astype(np.float32)).write(str(place / "a.exr"))
+    with variant.two_threads():
+        mi.Bitmap(pixels.astype(np.float32)).write(str(place / "a.exr"))
     return found | {"a.exr": (place / "a.exr").read_bytes()}
 
 
