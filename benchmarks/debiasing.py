@@ -14,8 +14,6 @@ from typing import Any
 import unrender as ur
 from benchmarks.internals import Estimate, FullView, Key, PlainState, Tree, arrays, leave_one_out_groups, prepare, trees
 
-__all__ = ["DebiasedGradient", "bias_correction"]
-
 
 def bias_correction(derivative: Callable[[Any], Any], images: Any) -> Any:
     """∂L(mean of the images) − mean of ∂L of each, (H, W, 3): what Eq. 14 adds to the derivative at another such image.

@@ -18,8 +18,6 @@ from benchmarks.gpu.plan import SLICES, Slice
 from benchmarks.gpu.states import Folder, device, full, toy
 from unrender.backend import variant
 
-__all__ = ["lines", "main"]
-
 
 def main(arguments: Sequence[str]) -> int:
     """Do what the command line says; the exit status: 1 where a slice was not done, 2 where none can run."""

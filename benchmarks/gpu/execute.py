@@ -15,8 +15,6 @@ from benchmarks.gpu.plan import Command, Slice
 from benchmarks.gpu.states import Folder, State
 from benchmarks.runner.catalogue import ROOT
 
-__all__ = ["run_slice", "words"]
-
 _GRACE = 10.0
 """Seconds from the request to end to the end by force; a part of the minutes."""
 

@@ -13,8 +13,6 @@ from typing import Any
 
 import pytest
 
-__all__ = ["counts", "read"]
-
 _ENDS = 2
 """Beginnings without an end from which on a test counts as one that ends its process."""
 

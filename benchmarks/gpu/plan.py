@@ -8,8 +8,6 @@ from pathlib import Path
 
 from unrender.io import toml_lines
 
-__all__ = ["SLICES", "Command", "Slice"]
-
 _TOY_TESTS = {"unit": "losses", "contract": "tolerance", "render": "grids", "statistical": "grey_box_chain_rule"}
 
 

@@ -13,8 +13,6 @@ from typing import Any
 from benchmarks.gpu.plan import Command, Slice
 from benchmarks.runner.catalogue import PACKAGE, ROOT
 
-__all__ = ["Folder", "device", "full", "toy"]
-
 State = dict[str, Any]
 
 

@@ -11,8 +11,6 @@ from benchmarks.gpu.states import Folder, full
 from benchmarks.runner import records
 from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 
-__all__ = ["on_a_gpu", "section", "split_notes", "write_pages"]
-
 _BASELINES = Path(__file__).with_name("baselines.md")
 _FOLDER = ROOT / "docs" / "benchmarks"
 _INDEX = """# Benchmarks

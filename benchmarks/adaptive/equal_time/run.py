@@ -1,12 +1,11 @@
 """Pixel mini-batches at equal time (Adaptive Figs 1, 4, 5, 8 and 9): `sun-glossy`, `plain-and-textured`, `two-planets`, `mirror-trio`, and
 `three-textures`, `globe-and-mirror`, `sunlit-vase`.
 
-Uniform mini-batches, those in proportion to the loss derivative, and adaptive ones, two paths per pixel and as many
-pixels for all, Adam, the learning rate of each tuned on a seed of its own for the whole budget. Images and textures have
-fewer sampled pixels per texel than texels, as in the paper. On `plain-and-textured` also five levels.
-Error is each parameter's RMSE relative to where it began, averaged over parameters; ratios are to uniform mini-batches,
-at ten checkpoints, medians over seeds, at equal samples and at equal time. Since the machine's speed may change between
-runs, the time of a path is measured in turns, after the race (`--part cost`: that alone).
+Uniform mini-batches, those in proportion to the loss derivative, and adaptive ones, two paths per pixel and as many pixels for all, Adam,
+the learning rate of each tuned on a seed of its own for the whole budget. Images and textures have fewer sampled pixels per texel than
+texels, as in the paper. On `plain-and-textured` also five levels. Error is each parameter's RMSE relative to where it began, averaged over
+parameters; ratios are to uniform mini-batches, at ten checkpoints, medians over seeds, at equal samples and at equal time. Since the
+machine's speed may change between runs, the time of a path is measured in turns, after the race (`--part cost`: that alone).
 
 `--steps 5000` races by steps, with rates that fall along half a cosine; `time` is then that in which each method first
 reaches the least error that all reach, over that of uniform mini-batches; these races have entries of their own. Large

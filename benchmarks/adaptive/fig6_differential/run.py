@@ -1,12 +1,11 @@
 """Roughness gradients by differential BSDF sampling, with uniform and adaptive pixels (Adaptive Fig. 6).
 
-First the variance by the alpha of a rough conductor, ordinary and differential, at values of alpha around that of the
-reference: of the image's derivative alone, weighted by fixed numbers, and of the gradient of an L2 loss, in which the
-noise of the image counts too. Differential over ordinary at equal paths from the camera; times the ratio of processor
-times of image and adjoint, in turns, it is the ratio at equal processor time. Then descents from small mini-batches, as
-in the paper's figure: uniform and adaptive pixels, ordinary and differential derivatives; the error of alpha over the
-last quarter of the steps, relative to where it began, over seeds. `plate` and `ball` lie under a sky with a sun;
-`rough-box` is Mitsuba's Cornell box with a rough conductor in it.
+First the variance by the alpha of a rough conductor, ordinary and differential, at values of alpha around that of the reference: of the
+image's derivative alone, weighted by fixed numbers, and of the gradient of an L2 loss, in which the noise of the image counts too.
+Differential over ordinary at equal paths from the camera; times the ratio of processor times of image and adjoint, in turns, it is the
+ratio at equal processor time. Then descents from small mini-batches, as in the paper's figure: uniform and adaptive pixels, ordinary and
+differential derivatives; the error of alpha over the last quarter of the steps, relative to where it began, over seeds. `plate` and `ball`
+lie under a sky with a sun; `rough-box` is Mitsuba's Cornell box with a rough conductor in it.
 """
 
 from __future__ import annotations

@@ -1,15 +1,14 @@
 """Variance of adaptive pixel mini-batches over that of uniform ones, from the first step of a descent on.
 
-Adam descends with each sampler from the start of each problem. At some steps the parameters and the sampler's state are
-kept; then the variance of the gradient with the probabilities of that step, summed over all elements, is divided by that
-of as many uniform pixels, two paths each. Twice: plain, and relative to each element's mean square, which is what Adam's
-steps see and what the sampler minimises (of a single parameter the two are the same). And in two ways. "By gradients":
-many independent ones of each sampler; standard errors from eighths of them. "By paths": the second moment of each pixel,
-from many paths of whole views, the two factors from different ones, weighted by the probabilities; the same paths judge
-both samplers, so it resolves what a few bright paths decide. Beside the default: pooling, which is the default where no
-denoiser is installed, probabilities as they were before (a tenth uniform, maps of a few paths every 20 steps, raw), and
-those in proportion to the loss derivative (Eq. 5).
-Problems of the gallery, a Cornell box with a rough conductor, and scenes of others where assets are given.
+Adam descends with each sampler from the start of each problem. At some steps the parameters and the sampler's state are kept; then the
+variance of the gradient with the probabilities of that step, summed over all elements, is divided by that of as many uniform pixels, two
+paths each. Twice: plain, and relative to each element's mean square, which is what Adam's steps see and what the sampler minimises (of a
+single parameter the two are the same). And in two ways. "By gradients": many independent ones of each sampler; standard errors from eighths
+of them. "By paths": the second moment of each pixel, from many paths of whole views, the two factors from different ones, weighted by the
+probabilities; the same paths judge both samplers, so it resolves what a few bright paths decide. Beside the default: pooling, which is the
+default where no denoiser is installed, probabilities as they were before (a tenth uniform, maps of a few paths every 20 steps, raw), and
+those in proportion to the loss derivative (Eq. 5). Problems of the gallery, a Cornell box with a rough conductor, and scenes of others
+where assets are given.
 """
 
 from __future__ import annotations

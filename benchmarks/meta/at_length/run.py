@@ -1,14 +1,13 @@
 """Meta-estimation at length (Meta Figs 1, 6 and 9): thousands of steps with falling rates, on `spiral`, `chalice` and `ajar`.
 
-Every run has the processor time of as many steps of the paper's form (1 difference, 2 proportional samples) as `steps`
-says; how many steps of its own that is, a trial of a few steps tells. Learning rates fall along half a cosine over the
-steps of a run, for Adam and MetaAdam alike. They are chosen in two rounds: the best of two, and of more where it is at an
-end, on runs of a fifth of the time from a seed of their own; then, since longer runs want lower rates, whole runs with that
-and with the next lower ones, for as long as their ends get nearer, of which the best is kept. Other resolutions than 64²
-have entries of their own. β_F is 0.999, the loss the paper's mean relative squared error. Raced are Adam on plain gradients
-at 16 and 64 samples per pixel, the paper's form at (1, 2), (12, 4) and (4, 16) difference and proportional samples, that
-with MetaAdam's rule "walk", and the coupled form at 3 samples on plain images and on a control variate's. Error is each
-parameter's RMSE relative to where it began, averaged over parameters; seconds are the processor's, on one thread.
+Every run has the processor time of as many steps of the paper's form (1 difference, 2 proportional samples) as `steps` says; how many steps
+of its own that is, a trial of a few steps tells. Learning rates fall along half a cosine over the steps of a run, for Adam and MetaAdam
+alike. They are chosen in two rounds: the best of two, and of more where it is at an end, on runs of a fifth of the time from a seed of
+their own; then, since longer runs want lower rates, whole runs with that and with the next lower ones, for as long as their ends get
+nearer, of which the best is kept. Other resolutions than 64² have entries of their own. β_F is 0.999, the loss the paper's mean relative
+squared error. Raced are Adam on plain gradients at 16 and 64 samples per pixel, the paper's form at (1, 2), (12, 4) and (4, 16) difference
+and proportional samples, that with MetaAdam's rule "walk", and the coupled form at 3 samples on plain images and on a control variate's.
+Error is each parameter's RMSE relative to where it began, averaged over parameters; seconds are the processor's, on one thread.
 """
 
 from __future__ import annotations

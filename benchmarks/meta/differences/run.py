@@ -1,10 +1,9 @@
 """Finite differences of gradients (Meta Eq. 14 and section 7): how their variance falls with the step.
 
-Variance: at the start of each problem, the parameters of the previous state are moved by a step towards the truth whose
-length is varied; Var[ΔF] is taken over runs, summed over the elements, in path space and in primary sample space, with
-its log-log slope. Noise: the variance of plain gradients by samples per pixel, near the truth, summed over elements:
-where that of images and adjoints multiply, it falls with the square of the samples, and many in one step serve a descent
-better than as many over several.
+Variance: at the start of each problem, the parameters of the previous state are moved by a step towards the truth whose length is varied;
+Var[ΔF] is taken over runs, summed over the elements, in path space and in primary sample space, with its log-log slope. Noise: the variance
+of plain gradients by samples per pixel, near the truth, summed over elements: where that of images and adjoints multiply, it falls with the
+square of the samples, and many in one step serve a descent better than as many over several.
 """
 
 from __future__ import annotations

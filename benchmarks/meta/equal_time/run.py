@@ -1,11 +1,10 @@
 """Meta-estimation against Adam (Meta Figs 1, 6 and 9): `spiral`, `ajar`, and the hard case `chalice`.
 
-Adam gets plain gradients (leave-one-out sample groups) at several samples per pixel (the table `SPP`), and a control
-variate's at 2; meta-estimation is the paper's form (1 difference, 2 proportional samples) with MetaAdam and, as the
-paper warns, with Adam; and the coupled form at 3 and 8 samples, on plain images and on a control variate's. The
-learning rate of each is tuned for the whole budget on seeds of its own. On `spiral`, as in the paper's figure, every run
-has as many steps, and the question is when the others reach what Adam ends with; on `ajar` and `chalice` every run has
-as much time. Error is each parameter's RMSE relative to where it began, averaged over parameters.
+Adam gets plain gradients (leave-one-out sample groups) at several samples per pixel (the table `SPP`), and a control variate's at 2;
+meta-estimation is the paper's form (1 difference, 2 proportional samples) with MetaAdam and, as the paper warns, with Adam; and the coupled
+form at 3 and 8 samples, on plain images and on a control variate's. The learning rate of each is tuned for the whole budget on seeds of its
+own. On `spiral`, as in the paper's figure, every run has as many steps, and the question is when the others reach what Adam ends with; on
+`ajar` and `chalice` every run has as much time. Error is each parameter's RMSE relative to where it began, averaged over parameters.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
 """Ablations of meta-estimation (Meta Fig. 5): `ajar`, one part left out at a time, each tuned; and `indirect-room`, at length.
 
-Left out: the zero-centred moments (variances about the mean instead), the bound of alpha, the shared samples
-(statistics from independent ones, at twice the cost), the decoupling of the difference's variance from the step. Both
-forms. The race on `ajar` is one of equal seconds. At length, on a small `indirect-room` with the paper's loss, every form
-takes as many steps at one rate that is not tuned; a descent has diverged where it ends further from the truth than half
-of its start.
+Left out: the zero-centred moments (variances about the mean instead), the bound of alpha, the shared samples (statistics from independent
+ones, at twice the cost), the decoupling of the difference's variance from the step. Both forms. The race on `ajar` is one of equal seconds.
+At length, on a small `indirect-room` with the paper's loss, every form takes as many steps at one rate that is not tuned; a descent has
+diverged where it ends further from the truth than half of its start.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """Statistics updated before or after use (RCV Fig. 4): the bias of a weight that depends on the samples it weighs.
 
-On `indirect-room`, once with parameters that do not change and once on a fixed path from the initial values to the
-truth. Statistics are updated after use (`RecursiveControlVariate()`) or before (`UpdatedBeforeUse`). Their
-bias, relative to the mean of the image, is measured twice: as the mean over runs less a converged image at the same
-parameters, and, far more precisely, less the same recursion on the same samples with weights fixed beforehand (those
-of other runs), which is unbiased. Mean squares are freed of noise. "Equivalent spp" is the spp of one step times
-Var[plain] / Var[control variate].
+On `indirect-room`, once with parameters that do not change and once on a fixed path from the initial values to the truth. Statistics are
+updated after use (`RecursiveControlVariate()`) or before (`UpdatedBeforeUse`). Their bias, relative to the mean of the image, is measured
+twice: as the mean over runs less a converged image at the same parameters, and, far more precisely, less the same recursion on the same
+samples with weights fixed beforehand (those of other runs), which is unbiased. Mean squares are freed of noise. "Equivalent spp" is the spp
+of one step times Var[plain] / Var[control variate].
 
 At few samples a part of the bias does not come from the order: while a pixel has seen equal samples only (often 0), its
 variance is 0, so is its weight, and those samples are forgotten once another comes. `--spp 32` shows the order alone.

@@ -1,10 +1,9 @@
 """Shared samples in primary sample space and in path space (RCV Fig. 8).
 
-On `glossy-room` (its roughness maps change where paths go) and `indirect-room` (its albedo does not), view 0. One
-descent fixes the path of the parameters; a plain render, a control variate in primary space and one in path space
-then take it alike, on several seeds. Per step: the mean control weight and the variance over runs, relative to that
-of the plain render; every few steps also the mean square error against a converged image, likewise relative. The cost
-is the median time of one image of one view, and of one whole gradient step of all views.
+On `glossy-room` (its roughness maps change where paths go) and `indirect-room` (its albedo does not), view 0. One descent fixes the path of
+the parameters; a plain render, a control variate in primary space and one in path space then take it alike, on several seeds. Per step: the
+mean control weight and the variance over runs, relative to that of the plain render; every few steps also the mean square error against a
+converged image, likewise relative. The cost is the median time of one image of one view, and of one whole gradient step of all views.
 """
 
 from __future__ import annotations

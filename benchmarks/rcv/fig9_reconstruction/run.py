@@ -1,11 +1,10 @@
 """Reconstruction at equal time (RCV Fig. 9): the stock loop, plain gradients and recursive control variates, each tuned.
 
-Each method is tuned on a seed of its own over a grid of samples per pixel and learning rates for the whole budget; the
-best by final parameter error then runs on the seeds, all methods in turns. The error is each parameter's RMSE relative
-to where it began, averaged over parameters. `stock` is `mi.render`, `dr.backward`, `mi.ad.Adam`; `plain` is this
-library's gradient on leave-one-out sample groups; `rcv` has a recursive control variate besides. "denoised" is either of
-these with its images denoised before the loss sees them, by Open Image Denoise or OptiX; where neither is there, by total
-variation, and the record says by which.
+Each method is tuned on a seed of its own over a grid of samples per pixel and learning rates for the whole budget; the best by final
+parameter error then runs on the seeds, all methods in turns. The error is each parameter's RMSE relative to where it began, averaged over
+parameters. `stock` is `mi.render`, `dr.backward`, `mi.ad.Adam`; `plain` is this library's gradient on leave-one-out sample groups; `rcv`
+has a recursive control variate besides. "denoised" is either of these with its images denoised before the loss sees them, by Open Image
+Denoise or OptiX; where neither is there, by total variation, and the record says by which.
 
 Equal time is that of the clock; with `--processor` that of the processor, all cores together, which other work on the
 machine does not change much: entries of their own, on smaller films. `--steps` and `--spp IMAGE ADJOINT` race those

@@ -4,10 +4,9 @@
 spp), and a path to and fro between the descent's start and the truth, which never rests. Every rule of
 `benchmarks/weight_rules.py` weighs the same pairs of renders, shared in path space, at the same parameters.
 
-The error is the mean squared difference to a converged image at several steps, freed of that image's own noise, over
-the error of a plain render of the same step; 1 is no gain. Weights of 1 and n/(n+1) do not depend on samples, so theirs
-is variance alone; the others' has their bias in it. After the second and third render, too, where the rules by
-statistics know no variance yet.
+The error is the mean squared difference to a converged image at several steps, freed of that image's own noise, over the error of a plain
+render of the same step; 1 is no gain. Weights of 1 and n/(n+1) do not depend on samples, so theirs is variance alone; the others' has their
+bias in it. After the second and third render, too, where the rules by statistics know no variance yet.
 """
 
 from __future__ import annotations

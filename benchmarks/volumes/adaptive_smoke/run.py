@@ -1,9 +1,8 @@
 """Pixel mini-batches of smoke (Adaptive, its last figure): uniform, by the loss derivative, adaptive. `smoke`, L2.
 
-Two paths per pixel, as many pixels for all, Adam, its learning rates tuned per scheme on a seed of its own for the whole
-budget: the albedo's, extinction's being 10 times that. Errors as in `volumes.fig11_smoke`: root mean squares relative to
-the start, of extinction and of extinction times albedo, averaged. At equal time; ratios to uniform at ten checkpoints,
-by time and by samples.
+Two paths per pixel, as many pixels for all, Adam, its learning rates tuned per scheme on a seed of its own for the whole budget: the
+albedo's, extinction's being 10 times that. Errors as in `volumes.fig11_smoke`: root mean squares relative to the start, of extinction and
+of extinction times albedo, averaged. At equal time; ratios to uniform at ten checkpoints, by time and by samples.
 """
 
 from __future__ import annotations

@@ -3,11 +3,10 @@
 The gallery's `smoke`, under a bright sky; the same smoke with a lamp inside it, under a dim one; and the volume of
 Mitsuba's tutorials under the bright sky, which is left out where the assets are not there (`scenes.py`).
 
-Differential ratio tracking with 1 adjoint path per pixel throughout; the image with 1 to 32 paths per pixel without a
-control variate, 1 and 2 with one. Adam, its learning rates tuned per method on a seed of its own for the whole budget:
-the albedo's, extinction's being 10 times that. At equal steps, and of `smoke` some of them at equal time. Grids of other
-sizes than 16³ have entries of their own, and gradients smoothed by `Sobolev`, for all methods alike and at ten times the
-rates: of single voxels of 64³ an image tells too little.
+Differential ratio tracking with 1 adjoint path per pixel throughout; the image with 1 to 32 paths per pixel without a control variate, 1
+and 2 with one. Adam, its learning rates tuned per method on a seed of its own for the whole budget: the albedo's, extinction's being 10
+times that. At equal steps, and of `smoke` some of them at equal time. Grids of other sizes than 16³ have entries of their own, and
+gradients smoothed by `Sobolev`, for all methods alike and at ten times the rates: of single voxels of 64³ an image tells too little.
 
 Errors are root mean squares relative to where the descent began, of extinction and of the scattering coefficient
 (extinction times albedo), averaged: the albedo of empty voxels shows in no image. "needs" says how many samples a plain

@@ -1,10 +1,9 @@
 """Bias of a descent that begins at the truth (RCV Figs 5 and 6): where image noise moves the parameters.
 
-`three-bodies`, started at its truth, where every step is one away: L1 and L2, plain gradients at several samples per
-pixel and recursive control variates, one learning rate for all. For L1, whose derivative noise biases, plain gradients at
-2 spp whose bias is subtracted, too, as 512 more renders at each step tell it (Eq. 14): an ablation. Reported is how far each
-parameter is from the truth, relative to it, in the mean over the last third of the steps: signed, mean and standard error
-over seeds.
+`three-bodies`, started at its truth, where every step is one away: L1 and L2, plain gradients at several samples per pixel and recursive
+control variates, one learning rate for all. For L1, whose derivative noise biases, plain gradients at 2 spp whose bias is subtracted, too,
+as 512 more renders at each step tell it (Eq. 14): an ablation. Reported is how far each parameter is from the truth, relative to it, in the
+mean over the last third of the steps: signed, mean and standard error over seeds.
 """
 
 from __future__ import annotations
