@@ -15,11 +15,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "contract"))
-
-from analytic import problem  # pyright: ignore[reportMissingImports]
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import unrender as ur
+from tests.contract.analytic import problem
 from unrender.images import RecursiveControlVariate
 
 STEPS = 24

@@ -9,12 +9,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
-from analytic import problem
 from backends import TEXTURE
 from backends import problem as mitsuba_problem
 from test_estimators import ESTIMATORS
 
 import unrender as ur
+from tests.contract.analytic import problem
 from tiers import slow
 from unrender.core.errors import InputError
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from analytic import exact_gradient, problem
 
 import unrender as ur
+from tests.contract.analytic import exact_gradient, problem
 from unrender.core.random import Key
 from unrender.pixels.views import Views
 
