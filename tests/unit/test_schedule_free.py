@@ -13,7 +13,7 @@ from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.optimizers import Adam, ScheduleFree
-from unrender.optimizers.transforms import agreement_rate
+from unrender.optimizers.transforms import agreement_rate, fitted_sobolev
 from unrender.optimizers.transforms.agreement_rate import Agreement
 from unrender.optimizers.transforms.fitted_sobolev import StrengthFit
 from unrender.optimizers.transforms.scale import MeanSquare
@@ -216,8 +216,9 @@ def test_the_preconditioner_acts_on_gradient_and_direction():
     np.testing.assert_allclose(states[0].of(Iterates).fast["x"], -0.05 * np.sign(g), rtol=1e-6)
 
 
-def test_steps_are_as_long_as_the_share_of_signal_in_their_neighbourhood():
-    """The second step against its formula: a fifth of what two gradients tell, the rest is not known yet."""
+def test_steps_are_as_long_as_the_share_of_signal_in_their_neighbourhood(monkeypatch: pytest.MonkeyPatch):
+    """The second step against its formula, at full strength: a fifth of what two gradients tell, the rest is not known yet."""
+    monkeypatch.setattr(fitted_sobolev, "_LEAST_DESCENT", 0.0)
     smooth = Sobolev(3.0)
     optimizer = ScheduleFree(0.1, preconditioner=smooth, preconditioned=("x",), growth=0.0, decay=0.0)
     gradients = np.random.default_rng(0).normal(size=(2, 6, 5, 2)).astype(np.float32)

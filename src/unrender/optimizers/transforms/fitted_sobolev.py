@@ -33,13 +33,13 @@ STEPS = 10
 """Number of pairs of gradients in the first fit. Later pairs contain more noise than signal."""
 _FACTOR, _WEAKEST = 4.0, 1 / 16
 """Candidates are λ, λ/4, λ/16, ... down to the first that hardly smooths."""
-_LEAST_DESCENT = 0.4
-"""Smallest accepted descent relative to the best candidate's."""
+_LEAST_DESCENT = 0.55
+"""Smallest accepted descent relative to the best candidate's. Smaller values cost steps at the start, larger ones admit more noise."""
 _ROWS = 8
 """Number of independent gradients between two tests; a test uses those of the last two intervals."""
 _LEAST_FRESH_DESCENT, _ERRORS = 0.7, 2.8
 """Smallest accepted descent relative to the best candidate's, and the smallest improvement in standard errors."""
-_CONFIRMED, _REVERTED = 0.45, 0.6
+_CONFIRMED, _REVERTED = 0.45, 0.3
 """Confirmed fraction of the agreement of successive gradients that is needed to reduce smoothing, and the fraction below which the
 reduction is reverted."""
 _CLEAR = 0.15
@@ -58,7 +58,7 @@ class StrengthFit:
 
     Strong smoothing moves large regions quickly and averages noise, but hardly moves detail of single texels. Consider gradients g and g'
     of successive steps, and S = (I + λ L)^(-1/2). Steps of Adam's length descend by about S g · S g' / |S g|. The first fit selects the
-    strongest smoothing, up to the given λ, whose descent is at least 0.4 times the best.
+    strongest smoothing, up to the given λ, whose descent is at least 0.55 times the best.
 
     Gradients of an estimator that reuses samples also agree on the reused noise. If an estimate has the gradient f from new samples
     (`FreshGradient`), S g · S f excludes that noise. Smoothing is reduced to the strongest candidate with at least 0.7 times the best
@@ -71,7 +71,7 @@ class StrengthFit:
       detail waits for it. For photographs it decays as 1/step, for a checkerboard of single texels hardly at all.
     - It is at least a twentieth of its first value. Otherwise there is little to gain, and single texels would fit the reference's noise.
 
-    If new gradients later confirm less than 0.6 of the agreement of successive ones, by a standard error, the strength of the first fit
+    If new gradients later confirm less than 0.3 of the agreement of successive ones, by a standard error, the strength of the first fit
     is restored.
 
     Attributes:
