@@ -281,6 +281,8 @@ def test_a_file_has_expressions_and_its_run_resumes(tmp_path: Path) -> None:
     [
         ({"expression": "power"}, r"problem.toml:3: expressions.*: no parameter is called power"),
         ({"expression": "2.0"}, r"it reads no unknown"),
+        ({"expression": "strength[1]"}, r"strength\[1\] is not there: strength has 1 row, the first is strength\[0\]"),
+        ({"expression": "sinh(strength)"}, r"'sinh\(strength\)' is not allowed; there are numbers, .*, tanh"),
         ({"expression": "strength +"}, r"it is no expression"),
         ({"expression": "-strength"}, r"outside of the range"),
         ({"expression": "1 / (strength - 1)"}, r"it is not finite at the initial values"),

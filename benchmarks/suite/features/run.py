@@ -161,6 +161,7 @@ def run(
         mine = [[(at, error(values)) for at, values in one.found] for one in kept]
         found = compare(theirs, mine, seconds)
         found |= {"setting": [samples, tuned[samples][0]], "tried": sum(len(tried) for _, tried in tuned.values())}
+        found["settings"] = {"seconds": seconds, "seeds": seeds, "spp": list(spp), "rates": list(rates)}
         found["final"] = {"loop": [run[-1][1] for run in theirs], "auto": [run[-1][1] for run in mine]}
         print(name, found, flush=True)
         yield {"problems": {name: found}}
@@ -174,16 +175,17 @@ def table(record: Record) -> str:
     for name, entry in record["problems"].items():
         ends = [markdown.spread(entry["final"][side]) for side in ("loop", "auto")]
         speed = f"{entry['speed']:.2g}" if entry["speed"] else "below 1"
-        rows.append([name, "{} spp, rate {:g}".format(*entry["setting"]), *ends, speed])
-    head = "problem | the loop's setting | error of the loop | of `auto` | speed-up"
-    text = "{seeds} seeds, {seconds:g} s of the processor: median (least to greatest), relative to the start."
-    return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
+        tried = "{seconds:g} s, {seeds} seeds".format(**entry["settings"])
+        rows.append([name, tried, "{} spp, rate {:g}".format(*entry["setting"]), *ends, speed])
+    head = "problem | of the processor | the loop's setting | error of the loop | of `auto` | speed-up"
+    text = "Median (least to greatest), relative to the start."
+    return markdown.blocks(text, markdown.table(head, rows))
 
 
 def plot(record: Record) -> figures.Figure:
     """Error over time."""
-    tenths = ((np.arange(10) + 1) / 10 * record["settings"]["seconds"]).tolist()
-    panels = {
-        name: {side: [(tenths, entry[side])] for side in ("loop", "auto")} for name, entry in record["problems"].items()
-    }
+    panels = {}
+    for name, entry in record["problems"].items():
+        tenths = ((np.arange(10) + 1) / 10 * entry["settings"]["seconds"]).tolist()
+        panels[name] = {side: [(tenths, entry[side])] for side in ("loop", "auto")}
     return figures.curves(panels, "processor seconds", "error / at the start", log="y")

@@ -54,6 +54,16 @@ def parse(key: str, text: str) -> Function:
     return _compiled(key, tree, 0)
 
 
+def _row(key: str, name: str, value: Any, index: int) -> Any:
+    """Return a row of a value. Raises `KeyedError` if there is none of this index."""
+    rows = arrays.shape(value)[0]
+    if index >= rows:
+        raise KeyedError(
+            key, f"{name}[{index}] is not there: {name} has {rows} row{'s' * (rows > 1)}, the first is {name}[0]"
+        )
+    return value[index]
+
+
 def _compiled(key: str, node: ast.expr, depth: int) -> Function:
     """Return the function of one node of a syntax tree. Raises `KeyedError` for a node of another kind."""
     if depth > _DEEPEST:
@@ -81,11 +91,12 @@ def _compiled(key: str, node: ast.expr, depth: int) -> Function:
             apply, (a, b) = _OPERATORS[type(operator)], (inner(left), inner(right))
             return lambda values: apply(a(values), b(values))
         case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant(value=index)) if isinstance(index, int):
-            return lambda values: values[name][index]
+            return lambda values: _row(key, name, values[name], index)
         case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS:
             count, function = _FUNCTIONS[name]
             if len(args) != count:
                 raise KeyedError(key, f"{name} takes {count} arguments, got {len(args)}")
             parts = [inner(part) for part in args]
             return lambda values: function(*(part(values) for part in parts))
-    raise KeyedError(key, f"{ast.unparse(node)!r:.60} is not allowed; see unrender.rendering.expression_texts.parse")
+    allowed = f"numbers, lists, unknowns, + - * / **, name[0], {', '.join(_FUNCTIONS)}"
+    raise KeyedError(key, f"{ast.unparse(node)!r:.60} is not allowed; there are {allowed}")

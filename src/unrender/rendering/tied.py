@@ -107,6 +107,10 @@ class Tie:
             lows.append(-np.inf if low is None else low)
             highs.append(np.inf if high is None else high)
         low, high = max(lows), min(highs)
+        if low >= high:
+            raise KeyedError(
+                self.key, f"with these factors no value is within the ranges of {' and '.join(self.factors)}"
+            )
         return (float(low) if np.isfinite(low) else None), (float(high) if np.isfinite(high) else None)
 
 

@@ -38,9 +38,14 @@ def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[B
         start: initial values, which determine the side of a singular value.
 
     Raises:
-        InputError: the bounds are malformed, or the initial values are at a singular value or on both sides of it.
+        InputError: the bounds are malformed or outside of the physical range, or the initial values are at a singular value or on both
+            sides of it.
     """
     low, high = (info.lowest, info.highest) if bounds is None else _read(bounds)
+    if not (_below(low, info.highest) and _below(info.lowest, high)):
+        raise InputError(
+            f"no value is within {_interval((low, high))} and its range {_interval((info.lowest, info.highest))}"
+        )
     if info.singular is None or not (_below(low, info.singular) and _below(info.singular, high)):
         return (low, high), ""
     singular = info.singular

@@ -260,5 +260,5 @@ def _numbers(name: str, value: Any) -> np.ndarray:
     except (TypeError, ValueError):
         values = np.full(1, np.nan)
     if not np.isfinite(values).all():
-        raise InputError(f"prior: {name} must have finite numbers")
+        raise InputError(f"prior: {name} must have finite numbers, and rows of one length")
     return values

@@ -39,7 +39,7 @@ def of_views(
         opened: function from a scene to its renderer; called once for equal scenes.
 
     Raises:
-        FieldError: a sensor, key or value is invalid, or a scene has none of the unknowns.
+        FieldError: a sensor, key or value is invalid, a scene has none of the unknowns, or all views know one of them.
     """
     scenes: list[tuple[Any, Renderer]] = []
     worlds: dict[int, World] = {}
@@ -56,6 +56,11 @@ def of_views(
         if view.aov is not None:
             own = _with_aov(index, view.aov, own)
         worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters()))
+    if hidden := [
+        key for key in keys if len(worlds) == len(views) and all(key in world.values for world in worlds.values())
+    ]:
+        what = f"{hidden[0]} is known in all views, so none determines it; leave it out of one, or of the unknowns"
+        raise FieldError(("views", 0, "with"), what, "view 0: known")
     made, sensors = with_worlds(renderer, list(worlds.values()))
     located = dict(zip(worlds, sensors, strict=True))
     return made, tuple(
