@@ -228,10 +228,9 @@ def table(record: Record) -> str:
         for name, entry in record["problems"].items()
         if "adaptive" in entry
     }
-    parts += [
-        f"**adaptive**, by {settings['runs']} gradients of each sampler, plain / relative",
-        _by_steps(direct, _direct),
-    ]
+    if direct:
+        text = f"**adaptive**, by {settings['runs']} gradients of each sampler, plain / relative"
+        parts += [text, _by_steps(direct, _direct)]
     head = "sampler | problems | geometric mean at the end, plain | relative | worst of all steps, plain | relative"
     row = "{label} | {problems} | {mean[0]:.2f} | {mean[1]:.2f} | {worst[0][0]:.2f} ± {worst[0][1]:.1g}"
     row += " | {worst[1][0]:.2f} ± {worst[1][1]:.1g}"
