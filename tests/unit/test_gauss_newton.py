@@ -562,6 +562,28 @@ def test_few_noisy_pixels_do_not_outweigh_the_others() -> None:
     assert scatter[3.0] < 0.8 * scatter[None]
 
 
+def test_noisy_channels_do_not_outweigh_the_others_of_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One channel has ten times the noise of the others: weights of whole pixels cannot tell them apart."""
+    states = module._Point._states
+
+    def noisy(point: Any, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
+        images = states(point, points, view, key, spp)
+        noise = np.random.default_rng(key.uint32()).normal(size=images.shape[1:]) * np.array([1.0, 0.1, 0.1])
+        return images + noise if len(points) == 1 else images
+
+    monkeypatch.setattr(module._Point, "_states", noisy)
+    made, scatter = problem_of(np.abs(MATRIX)), {}
+    for by_channel in (False, True):
+        estimator = ur.GaussNewton(2, 2, noise_limit=0.3, by_channel=by_channel)
+        state, found = module.GaussNewtonState({"a": 0.02, "b": 0.03}), []
+        for seed in range(80):
+            estimate, state = estimator.estimate(made, TRUTH, state, Key(seed))
+            matrix = np.asarray(estimate.require("test", Hessian).matrix)
+            found.append(np.linalg.solve(matrix, np.concatenate([estimate.gradient[key] for key in TRUTH])))
+        scatter[by_channel] = float(np.median(np.abs(np.stack(found[8:]))))
+    assert scatter[True] < 0.7 * scatter[False]
+
+
 def test_gradient_noise_is_the_scatter_of_gradients() -> None:
     """Mean of the estimates over the variance of 300 gradients, within 4.5 standard errors of a variance. Half of it is seen."""
     made, estimator = problem(), ur.GaussNewton(2, 2)

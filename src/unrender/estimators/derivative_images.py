@@ -17,8 +17,8 @@ _RESIDUAL_ERRORS = 2.0
 """Standard errors of the sum of squared residuals from which on references have noise."""
 _VALUES = 1 << 22
 """Maximum number of image values that are converted to double precision at once."""
-_MEMORY = 0.3
-"""Weight of the latest image in the running mean of the variance."""
+_MEMORY, _CHANNEL_MEMORY = 0.3, 0.1
+"""Weight of the latest image in the running mean of the variance of a pixel, and of one of its channels, which has more noise itself."""
 _GROWTH = 1.0
 """Weights of derivative images in their mean grow as this power of their number."""
 
@@ -54,7 +54,7 @@ class LossWeights:
     other: np.ndarray
 
     def times(self, factor: np.ndarray) -> LossWeights:
-        """Return the weights times a factor per pixel, (H, W, 1)."""
+        """Return the weights times a factor per pixel (H, W, 1), or per channel (H, W, 3)."""
         return LossWeights(self.first * factor, self.second * factor, self.one * factor, self.other * factor)
 
 
@@ -144,18 +144,19 @@ class Products:
 
 
 def noise_weights(variance: np.ndarray, limit: float) -> np.ndarray:
-    """Return the weight 1 / (1 + σ² / (c m)) of each pixel, with c = `limit` and the median m of the variances σ² above 0.
+    """Return the weight 1 / (1 + σ² / (c m)) of each pixel or channel, with c = `limit` and the median m of the variances σ² above 0.
 
-    It is 1 where no pixel has noise.
+    It is 1 if no pixel has noise.
     """
     noisy = variance[variance > 0.0]
     return 1.0 / (1.0 + variance / (limit * float(np.median(noisy)))) if noisy.size else np.ones_like(variance)
 
 
-def running_mean(before: tuple[np.ndarray, ...], view: int, variance: np.ndarray) -> np.ndarray:
-    """Return the running mean of a view's variance (H, W, 1), from those of all views and the new one (H, W, 3)."""
-    new = variance.astype(np.float64).mean(axis=-1, keepdims=True)
-    return before[view] + _MEMORY * (new - before[view]) if before else new
+def running_mean(before: tuple[np.ndarray, ...], view: int, variance: np.ndarray, by_channel: bool) -> np.ndarray:
+    """Return the running mean of a view's variance, (H, W, 3) by channel or (H, W, 1), from those of all views and a new one (H, W, 3)."""
+    new = variance.astype(np.float64)
+    new = new if by_channel else new.mean(axis=-1, keepdims=True)
+    return before[view] + (_CHANNEL_MEMORY if by_channel else _MEMORY) * (new - before[view]) if before else new
 
 
 def mean_residuals(

@@ -65,7 +65,8 @@ class GaussNewtonState:
         widths: widths of the differences, {key: in units of the parameter}; {} before the first estimate.
         shift: target image shift of the differences in pixels.
         point: parameters of the last estimate, (n,); None before the first.
-        variances: running mean of the variance of each view's image, (H, W, 1); () without `noise_limit` and before the first estimate.
+        variances: running mean of the variance of each view's image, (H, W, 1), or (H, W, 3) by channel; () without `noise_limit` and
+            before the first estimate.
         derivatives: mean derivative images of each view; () without `remember` and before the first estimate.
         residuals: mean derivatives of the loss of each view, moved along to `point`; () without scores and before the first estimate.
         hessian: last Hessian, (n, n); None without scores and before the first estimate.
@@ -119,6 +120,7 @@ class GaussNewton:
             image, so it may never differ from the image as much as a shift of the full image would.
         noise_limit: a pixel of variance σ² in earlier images has the weight 1 / (1 + σ² / (c m)), with this c and the median m over pixels
             with noise, so a few noisy pixels, such as those of a visible lamp, do not outweigh the others; > 0. None for equal weights.
+        by_channel: whether each channel of a pixel has its own variance and weight.
         remember: whether derivative images are averaged over steps while steps are short relative to the widths. Their noise is then
             small relative to the derivatives also for elements that hardly change the image. Not for large pictures of many elements.
         scores: whether residuals are averaged over steps for `ScoreCovariance`, which standard errors need. Problems of more than
@@ -135,6 +137,7 @@ class GaussNewton:
     coarse: float | None = None
     largest: Mapping[str, float] = field(default_factory=dict)
     noise_limit: float | None = None
+    by_channel: bool = False
     remember: bool = False
     scores: bool = True
     derivative_images: bool = False
@@ -333,7 +336,9 @@ class _Point:
         weights, limit = self._weights(view, images), self.options.noise_limit
         if limit is None:
             return weights
-        total.variances.append(running_mean(state.variances, view, arrays.numpy(images.variance)))
+        total.variances.append(
+            running_mean(state.variances, view, arrays.numpy(images.variance), self.options.by_channel)
+        )
         return weights.times(noise_weights(state.variances[view], limit)) if state.variances else weights
 
     def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -167,7 +167,7 @@ def check_numbers(
 
 
 def pixel_weights(estimator: Estimator, state: Any) -> tuple[np.ndarray, ...]:
-    """Return the weights of each view's pixels in the next step, (H, W, 1), from the noise of earlier images; () for equal ones.
+    """Return the weights of each view's pixels in the next step, (H, W, 1) or (H, W, 3), from the noise of earlier images; () if equal.
 
     Only `GaussNewton` with a `noise_limit` has weights, alone or for the numbers of a `HybridGradient`.
     """

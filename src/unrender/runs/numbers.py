@@ -84,7 +84,7 @@ class Numbers:
         rigid: whether a number is of a pose, (n,).
         spp: samples per pixel of a picture.
         fields: {key: (k, *shape)}, directions of textures and grids.
-        weights: weights of each view's pixels in addition to the views' weights, (H, W, 1); () for equal ones.
+        weights: weights of each view's pixels in addition to the views' weights, (H, W, 1) or (H, W, 3); () for equal ones.
     """
 
     problem: Problem
@@ -224,9 +224,9 @@ class Numbers:
         return np.concatenate(flat)
 
     def roots(self, view: int) -> np.ndarray:
-        """Return the roots of the weights of a view's pixels, (P, 1)."""
+        """Return the roots of the weights of a view's pixels, (P, 3), or (P, 1) if its channels have equal weights."""
         roots = mask_roots(self.problem, view).reshape(-1, 1) * math.sqrt(self.problem.views[view].weight)
-        return roots * np.sqrt(self.weights[view]).reshape(-1, 1) if self.weights else roots
+        return roots * np.sqrt(self.weights[view]).reshape(len(roots), -1) if self.weights else roots
 
     def differences(self, directions: np.ndarray, key: Key) -> Differences:
         """Return the differences of `point` ± each column of directions (n + k, K), within the bounds."""
@@ -244,7 +244,7 @@ class Numbers:
         squares, total = 0.0, 0
         for view in self.views:
             image = np.asarray(self.problem.views[view].reference, np.float64)
-            roots = self.roots(view).reshape(*image.shape[:2], 1)
+            roots = self.roots(view).reshape(*image.shape[:2], -1)
             for x, root in ((image, roots), (image.swapaxes(0, 1), roots.swapaxes(0, 1))):
                 squares += 0.5 * float(np.square(np.diff(x, axis=0) * np.minimum(root[1:], root[:-1])).sum())
             total += image.size

@@ -142,6 +142,11 @@ class Constants:
     noise_limit: float = 3.0
     """Ratio of a pixel's variance to the median from which it has less weight in Gauss-Newton steps. Source: `stage-lights`: error 0.04 of
     the start's instead of 0.29, because the softbox's visible edge is noisier than all else."""
+    bsdf_noise_limit: float = 0.3
+    """The same ratio for the channels of pixels, if all unknowns are numbers of BSDFs and brightnesses. Source: `limit`, `numbers` at 16².
+
+    Poses of `stage-lights` end further away with it, since noisy bright pixels lead the first steps.
+    """
     averaged_values: int = MOST_AVERAGED
     """Elements times pixels up to which the derivative images of such steps are averaged over steps. Source: memory, 12 MiB."""
     pose_averaging: float = 3.0

@@ -85,6 +85,8 @@ def few_numbers(traits: Traits) -> Plan | None:
         return None
     estimator = _estimator(traits, keys, constants.pose_images)
     estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.averaged_values)
+    if _only_bsdfs_and_brightness(traits):
+        estimator = replace(estimator, noise_limit=constants.bsdf_noise_limit, by_channel=True)
     plateau = False
     if traits.poses:
         trial = replace(
@@ -186,8 +188,13 @@ def _of_bsdfs(traits: Traits) -> list[str]:
     """
     keys = [key for key, info in traits.infos.items() if info.shapes_bsdf]
     small = traits.elements > 1 and traits.elements * traits.problem.pixels <= traits.constants.bsdf_pixels
-    measured = traits.problem.loss.linear and all(x.shapes_bsdf or x.brightness for x in traits.infos.values())
+    measured = traits.problem.loss.linear and _only_bsdfs_and_brightness(traits)
     return keys if keys and ((small and measured) or traits.unreachable) else []
+
+
+def _only_bsdfs_and_brightness(traits: Traits) -> bool:
+    """Return whether all unknowns are parameters of BSDFs or of the brightness of lights."""
+    return all(info.shapes_bsdf or bool(info.brightness) for info in traits.infos.values())
 
 
 def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
