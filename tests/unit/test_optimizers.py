@@ -247,3 +247,12 @@ def test_meta_adam_is_the_same_on_the_device_and_compiles_nothing(gradients):
 def test_meta_adam_refuses(options, field):
     with pytest.raises(InputError, match=f"MetaAdam: {field}"):
         MetaAdam(**options)
+
+
+@pytest.mark.parametrize("begun", [-1, 4, 2**63 - 1])
+def test_a_chain_that_began_after_its_step_is_refused(begun: int) -> None:
+    """A damaged checkpoint may say so; moments of fewer than zero steps overflow."""
+    parameters = {"a": np.ones(2)}
+    state = dataclasses.replace(Adam(0.1).init(parameters), begun=begun)
+    with pytest.raises(InputError, match="begun"):
+        Adam(0.1).update(Estimate(0.0, parameters), state, parameters)

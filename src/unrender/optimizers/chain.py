@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 from unrender.core import arrays
+from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
@@ -81,6 +82,8 @@ class Recipe(ABC):
     def update(self, estimate: Estimate, state: ChainState, parameters: Tree) -> tuple[Tree, ChainState]:
         """Return the steps and the next state. Lazy on Dr.Jit unless a transform waits: evaluate both together."""
         factor = rates.factor(type(self).__name__, self.schedule, state.step)
+        if not 0 <= state.begun <= state.step:
+            raise InputError(f"state of {type(self).__name__}: begun at step {state.begun}, is at step {state.step}")
         made, gradient = state.step - state.begun, estimate.gradient
         update = StepUpdate(estimate, parameters, made, state.learning_rates, gradient, gradient, factor)
         states = []
