@@ -59,7 +59,7 @@ def test_a_machine_that_cannot_run_gets_three_and_the_command(monkeypatch: pytes
 def test_missing_extras_are_named(monkeypatch: pytest.MonkeyPatch):
     required = ["numpy", "no-such-thing>=2; extra == 'dev'", "pytest; extra == 'dev'"]
     monkeypatch.setattr(doctor.metadata, "requires", lambda name: required)
-    assert doctor._missing() == ["(optional, tests of this package) install: pip install 'no-such-thing>=2'"]
+    assert doctor._missing() == ["(optional, tests of this package) install: pip install 'unrender[dev]'"]
 
 
 def test_only_packages_that_can_be_installed_are_named(monkeypatch: pytest.MonkeyPatch):
@@ -71,8 +71,8 @@ def test_only_packages_that_can_be_installed_are_named(monkeypatch: pytest.Monke
     ]
     monkeypatch.setattr(doctor.metadata, "requires", lambda name: required)
     assert doctor._missing() == [
-        "(optional, the measure FLIP) install: pip install no-such-flip",
-        "(optional, other) install: pip install 'no-such-thing[fast]'",
+        "(optional, the measure FLIP) install: pip install 'unrender[flip]'",
+        "(optional, other) install: pip install 'unrender[other]'",
     ]
 
 

@@ -192,7 +192,9 @@ def test_mistakes_about_what_is_judged_are_one_line(unrender, run: Path, mitsuba
     (run.parent / "held-out.toml").write_text((run.parent / "held-out.toml").read_text().replace(KEY, "wall.other"))
     assert "wall.other" in refused("judge", "result")
     (run.parent / "held-out.toml").unlink()
-    assert "give --held-out FILE" in refused("judge", "result")
+    line = refused("judge", "result")
+    assert "no held-out.toml at " in line
+    assert "held-out.toml; give --held-out FILE" in line
     assert unrender("judge", "result", "--held-out", "problem.toml", "--variant", mitsuba_variant).status == 0
     assert "holds an earlier judgement" in refused("judge", "result", "--held-out", "problem.toml")
     (run / "parameters.npz").unlink()

@@ -106,7 +106,7 @@ def test_the_clock_goes_on(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     parts = ur.PathGradient(spp=2), ur.optimizers.Adam()
     first = ur.optimize(ur.gallery.problem("exponential"), *parts, seconds=0.05, run_directory=folder)
-    with pytest.raises(InputError, match=r"finished, after .* set a larger budget"):
+    with pytest.raises(InputError, match=r"finished, after .* to continue, give --steps \d+ or --seconds 0\.1\d*, "):
         ur.resume(folder, seconds=0.04)
     second = ur.resume(folder, seconds=0.1)
     assert second.stopped == "seconds"
@@ -151,7 +151,7 @@ def test_a_finished_run_wants_more(tmp_path: Path) -> None:
     parts = ur.PathGradient(spp=2), ur.optimizers.Adam()
     ur.optimize(ur.gallery.problem("exponential"), *parts, 4, run_directory=folder)
     for steps in (None, 4, 1):
-        with pytest.raises(InputError, match=r"finished, after 4 steps .*; to continue, set a larger budget"):
+        with pytest.raises(InputError, match=r"finished, after 4 steps .*; to continue, give --steps 8 or --seconds "):
             ur.resume(folder, steps=steps)
     whole = ur.optimize(ur.gallery.problem("exponential"), *parts, 9)
     assert ur.resume(folder, steps=9).parameters == whole.parameters

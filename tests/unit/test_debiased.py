@@ -80,6 +80,17 @@ def test_values_with_their_errors_in_words(value: float, error: float, text: str
     assert formatting.with_error(value, error) == text
 
 
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.0018, 0.0019, "0.0018 ± 0.0019"), (-0.0005, 0.0019, "−0.0005 ± 0.0019"), (0.0, 0.02, "0.000 ± 0.020"), (0.3, 0.0, "0.3"),
+        (-2e-8, 3e-8, "−2·10⁻⁸ ± 3·10⁻⁸"), (math.inf, 1.0, "∞"),
+    ],
+)  # fmt: skip
+def test_values_within_their_standard_error_are_no_limit(value: float, error: float, text: str) -> None:
+    assert formatting.with_standard_error(value, error) == text
+
+
 def test_phases_in_words() -> None:
     assert formatting.phases({"loading": 2.123, "page": 0.01, "steps": 83.0}) == "loading 2.1 s, steps 1 min 23 s"
 

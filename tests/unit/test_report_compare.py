@@ -110,6 +110,14 @@ def test_runs_are_grouped_by_method_and_settings_but_not_by_seed_or_budget(tmp_p
     ]
 
 
+@pytest.mark.parametrize(("rate", "untuned"), [(0.01, True), (0.02, False)])
+def test_a_reference_with_its_default_rate_is_named_untuned(tmp_path: Path, rate: float, untuned: bool):
+    stock = write_run(tmp_path / "a", "stock", settings={"options": {"learning_rate": rate}})
+    notices = compared(tmp_path, [stock, write_run(tmp_path / "b", "plain")])["notices"]
+    assert any("default learning rate, not tuned" in line for line in notices) == untuned
+    assert compared(tmp_path, [stock])["notices"] == []
+
+
 def test_what_weakens_a_comparison_is_said(tmp_path):
     runs = [
         write_run(tmp_path / "a", "plain", 0),

@@ -72,21 +72,25 @@ def values(array: np.ndarray, standard_error: Sequence[float | None] | None = No
 
 
 def with_error(value: float, error: float) -> str:
-    """Format a measured value >= 0 with its standard error: 0.0312 ± 0.0004.
+    """Format the value and error of `debiased.rmse`: 0.0312 ± 0.0004.
 
-    A value within two standard errors of 0 becomes a limit, the root of the sum of their squares: below 0.012. Without a finite error
-    above 0, the value stands alone.
+    A value within two errors of 0 becomes a limit, the root of the sum of their squares: below 0.012. It is a limit only for
+    `debiased.rmse`, whose error is then the root of two standard errors of the mean square. Others need `with_standard_error`.
     """
-    if not (math.isfinite(value) and math.isfinite(error)):
-        return number(value)
-    if error <= 0:
-        return number(value)
-    if value <= 2 * error:
+    if 0 < error < math.inf and value <= 2 * error:
         return f"below {number(math.hypot(value, error))}"
+    return with_standard_error(value, error)
+
+
+def with_standard_error(value: float, error: float) -> str:
+    """Format a measured value, which may be negative, with its standard error: 0.0018 ± 0.0019. Without a finite error above 0, the value
+    stands alone."""
+    if not (math.isfinite(value) and math.isfinite(error)) or error <= 0:
+        return number(value)
     places = min(max(1 - math.floor(math.log10(error)), 0), 12)  # two digits of the error
-    if value >= 1e5 or error < 1e-6:
+    if abs(value) >= 1e5 or error < 1e-6:
         return f"{number(value)} ± {number(error)}"
-    return f"{value:.{places}f} ± {error:.{places}f}"
+    return f"{value:.{places}f} ± {error:.{places}f}".replace("-", "−")
 
 
 def phases(seconds: Mapping[str, float]) -> str:

@@ -15,6 +15,7 @@ from unrender.display.plots import Line, chart
 from unrender.rendering import parameter_errors
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.callbacks import Callback
+from unrender.runs.phase_times import COMPILING
 
 if TYPE_CHECKING:
     from unrender.runs.result import Result
@@ -82,9 +83,8 @@ class NotebookProgress(Callback):
     def on_end(self, run: Run, result: Result) -> None:
         del run
         self._summary = f"{result.steps} steps in {formatting.duration(result.seconds)}"
-        self._summary += (
-            f" and {formatting.duration(result.warmup_seconds)} to compile" if result.warmup_seconds >= 0.5 else ""
-        )
+        compiling = result.phases.get(COMPILING, 0.0)
+        self._summary += f", without {formatting.duration(compiling)} of compiling" if compiling >= 0.5 else ""
 
 
 _VIEWS, _MAPS = 2, 3

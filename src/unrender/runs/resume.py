@@ -80,8 +80,10 @@ def load_run(directory: str | Path, steps: int | None = None, seconds: float | N
     done = (steps is None or steps <= record.steps) and (seconds is None or seconds <= record.seconds)
     if record.status in ENDED and done:
         so_far = f"finished, after {record.steps} steps and {record.seconds:.3g} s"
+        more = 2 * max(record.seconds, method.seconds or 0.0)
         raise InputError(
-            f"run folder {folder}: {so_far}; to continue, set a larger budget, in steps or seconds from its start"
+            f"run folder {folder}: {so_far}; to continue, give --steps {2 * max(record.steps, 1)} or --seconds {more:.2g}, counted from "
+            "its start (steps= or seconds= in Python)"
         )
     return StoredRun(folder, record, method.model_copy(update={"steps": budget[0], "seconds": budget[1]}))
 

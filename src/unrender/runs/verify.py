@@ -348,7 +348,7 @@ def _lines(first: Picture, last: Picture, best: str, best_loss: float, memory: M
 
 def _loss(picture: Picture) -> str:
     value, error = picture.loss
-    return formatting.with_error(value, error) if math.isfinite(value) else "not finite"
+    return formatting.with_standard_error(value, error) if math.isfinite(value) else "not finite"
 
 
 def _number(value: float) -> float | None:

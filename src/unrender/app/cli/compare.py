@@ -159,6 +159,8 @@ def _report(console: Console, directories: Sequence[Path], folder: Path) -> None
         comparison, notices = report.load_comparison(directories)
         page = report.write_comparison(comparison, notices, folder)
     show(console, comparison)
+    for notice in notices:
+        console.say(f"note: {notice}")
     console.print("Times are those of the steps, without compilation and final pictures.")
     console.say(f"page: {page}")
 

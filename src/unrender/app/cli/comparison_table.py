@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.markup import escape
 
-from unrender.app.report.equal_time import Comparison, Spread
+from unrender.app.report.equal_time import LOSS_WINDOW, Comparison, Spread
 from unrender.core.text import visible
 from unrender.display import formatting
 from unrender.display.terminal import Console, columns
@@ -15,7 +15,8 @@ def show(console: Console, comparison: Comparison) -> None:
     """Print the median and range over each method's runs, for every metric and for the final pictures."""
     parameters = [metric for metric in comparison.metrics if metric.name != "loss"]
     for metric in parameters or comparison.metrics:
-        console.print(f"[bold]{plain(metric.title)}[/]", soft_wrap=True)
+        window = f" (median over the last {LOSS_WINDOW:.0%} of the time)" if metric.name == "loss" else ""
+        console.print(f"[bold]{plain(metric.title)}[/]{window}", soft_wrap=True)
         first = metric.methods[comparison.groups[0].label]
         times = [f"at {formatting.duration(moment.seconds)}" for moment in first.moments]
         table = columns("method", "runs", *times, f"after {formatting.count(comparison.samples)} paths")

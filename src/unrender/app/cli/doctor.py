@@ -193,7 +193,7 @@ def _first_line(program: str, *arguments: str) -> str | None:
 def _missing() -> list[str]:
     """Return one line per optional feature with missing packages that support this Python, with the installation command.
 
-    The command names the packages themselves, since this package may not be on an index that provides its extras.
+    pip reads the extras of the installed package, so the command needs no index that has this package.
     """
     from packaging.requirements import InvalidRequirement, Requirement
 
@@ -201,7 +201,7 @@ def _missing() -> list[str]:
         required = metadata.requires("unrender") or []
     except metadata.PackageNotFoundError:
         return []
-    absent: dict[str, list[str]] = {}
+    absent: set[str] = set()
     for text in required:
         try:
             requirement = Requirement(text)
@@ -211,13 +211,8 @@ def _missing() -> list[str]:
         if extra is None or _version(requirement.name) is not None:
             continue
         if requirement.marker is not None and requirement.marker.evaluate({"extra": extra[1]}):
-            requirement.marker = None
-            absent.setdefault(extra[1], []).append(str(requirement))
+            absent.add(extra[1])
     return [
-        f"(optional, {_FEATURES.get(extra, extra)}) install: pip install {' '.join(map(_quoted, names))}"
-        for extra, names in sorted(absent.items())
+        f"(optional, {_FEATURES.get(extra, extra)}) install: pip install 'unrender[{extra}]'"
+        for extra in sorted(absent)
     ]
-
-
-def _quoted(requirement: str) -> str:
-    return f"'{requirement}'" if re.search(r"[<>=!~\[]", requirement) else requirement

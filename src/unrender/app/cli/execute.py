@@ -138,7 +138,7 @@ def verified(result: Result) -> str:
     """Return the verification by fresh pictures as text: status, losses, and the selected parameters."""
     verification = result.verification
     first, last = (
-        formatting.with_error(*verification[name]) if None not in verification[name] else "not finite"
+        formatting.with_standard_error(*verification[name]) if None not in verification[name] else "not finite"
         for name in ("start", "end")
     )
     selected = "" if verification["best"] == "end" else f"; selected: the parameters of {verification['best']}"
@@ -157,7 +157,7 @@ def introduce(console: Console, problem: Problem, variant: str) -> None:
 def summarise(console: Console, problem: Problem, result: Result, progress: Progress) -> None:
     """Print a summary of the result."""
     table = columns()
-    table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s (and {result.warmup_seconds:.1f} s to compile)")
+    table.add_row("steps", f"{result.steps} in {result.seconds:.1f} s, without compiling")
     if result.skipped:
         table.add_row("skipped", f"{result.skipped} steps whose gradient was not finite")
     if result.resumed:

@@ -130,7 +130,8 @@ def _error(trial: TrialRecord) -> str:
         return "–"
     if trial.standard_error is None:
         return formatting.number(trial.error)
-    return formatting.with_error(trial.error, trial.standard_error)
+    of_one_run = formatting.with_error if len(trial.runs) == 1 else formatting.with_standard_error
+    return of_one_run(trial.error, trial.standard_error)
 
 
 def _settings(trial: TrialRecord) -> str:

@@ -31,9 +31,9 @@ def find(run: Path, problem: Problem) -> Path:
     origin = problem.origin.get("file", problem.origin.get("scene")) if staged is None else staged[0].problem
     candidate = None if origin is None else Path(origin).parent / HELD_OUT
     if candidate is None or not candidate.is_file():
-        where = "" if candidate is None else f", and there is none at {candidate}"
+        where = "" if candidate is None else f" at {candidate}"
         raise InputError(
-            f"{run}: give --held-out FILE, a problem file with other views{where} (unrender import --hold-out N makes one)"
+            f"{run}: no {HELD_OUT}{where}; give --held-out FILE, a problem file with other views (unrender import --hold-out N makes one)"
         )
     return candidate
 

@@ -96,6 +96,8 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
         seeds = [run.record.seed for run in of.runs]
         if len(set(seeds)) < len(seeds):
             notices.append(f"{of.label}: some runs share a seed, so the spread over the runs is too small.")
+    if first.record.method == "stock" and len({run.record.method for run in runs}) > 1 and _default_rate(first):
+        notices.append("stock ran with its default learning rate, not tuned: ratios and times are relative to that.")
     for run in runs:
         who = f"{run.record.method}, seed {run.record.seed}"
         notices += [f"{who}: {line}" for line in run.record.warnings]
@@ -103,6 +105,18 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
         ends |= {run.record.status} & DOUBTFUL
         notices += [f"{who}: {end} after {run.record.seconds:.3g} s." for end in sorted(ends)]
     return list(dict.fromkeys(notices))
+
+
+def _default_rate(run: RunFolder) -> bool:
+    """Return whether a run of a registered method had the method's default learning rate."""
+    from unrender.methods import method  # imports all methods
+
+    rate, options = "learning_rate", run.record.settings.get("options", {})
+    return (
+        isinstance(options, dict)
+        and rate in options
+        and options[rate] == method(run.record.method).options_of({})[rate]
+    )
 
 
 def _relative_difference(a: np.ndarray, b: np.ndarray) -> float:

@@ -15,6 +15,7 @@ from unrender.rendering import parameter_errors
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 from unrender.runs.folder.schema import DOUBTFUL, RunRecord
 from unrender.runs.image_sensitivity import seen_cells
+from unrender.runs.phase_times import COMPILING
 from unrender.statistics import debiased
 
 
@@ -159,7 +160,8 @@ def tiles(run: RunFolder) -> list[Tile]:
     loss = curves.smoothed_loss(run, 0.05 * float(run.history.seconds[-1])) if len(run.history) else None
     if loss is not None:
         all_tiles.append(_tile("Loss", float(loss.values[0]), float(loss.values[-1]), "of the step's samples"))
-    note = f"and {formatting.duration(run.record.warmup_seconds)} of warm-up" if run.record.warmup_seconds else ""
+    compiling = run.record.phases.get(COMPILING)
+    note = f"of the steps, without {formatting.duration(float(f'{compiling:.2g}'))} of compiling" if compiling else ""
     all_tiles.append(Tile("Time", formatting.duration(run.record.seconds), note))
     skipped = f"{run.record.skipped} skipped, not finite" if run.record.skipped else ""
     all_tiles.append(Tile("Steps", f"{run.record.steps:,}".replace(",", "\u202f"), skipped))
