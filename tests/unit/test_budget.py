@@ -83,9 +83,22 @@ def test_a_budget_may_cover_more_than_the_steps(
     assert result.steps == steps
 
 
+def test_advice_on_few_steps_suits_the_run() -> None:
+    assert budget.few_steps(4.0, 3, spp=16, large=True).endswith(
+        "; use more seconds, fewer samples (--set spp=4), a smaller picture (resolution), or fewer pixels a step (--set pixels=4096)"
+    )
+    assert budget.few_steps(4.0, 3, spp=4).endswith(
+        "; use more seconds, fewer samples (--set spp=2), or a smaller picture (resolution)"
+    )
+    assert budget.few_steps(4.0, 3, spp=2).endswith("; use more seconds or a smaller picture (resolution)")
+    assert not budget.few_steps(4.0, 20, spp=16)
+
+
 def test_a_budget_of_few_steps_is_told_after_the_first() -> None:
     found = ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), seconds=0.4)
-    assert any("allows about" in line and "--set spp=1" in line for line in found.warnings)
+    (line,) = (line for line in found.warnings if "allows about" in line)
+    assert "fewer samples (--set spp=" in line
+    assert "pixels=4096" not in line  # the view has 16 pixels
     assert not ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), steps=5).warnings
 
 

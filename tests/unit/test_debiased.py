@@ -91,6 +91,14 @@ def test_values_within_their_standard_error_are_no_limit(value: float, error: fl
     assert formatting.with_standard_error(value, error) == text
 
 
+def test_few_values_are_listed_up_to_twelve_numbers() -> None:
+    known = {f"colour{i}": np.array([0.25, 0.5, 1.0]) for i in range(5)} | {"map": np.zeros((4, 4))}
+    texts = formatting.few_values(known, {"colour0": [0.01, None, 0.02]})
+    assert list(texts) == ["colour0", "colour1", "colour2", "colour3"]
+    assert texts["colour0"] == "0.25 ± 0.01, 0.5 (not determined), 1 ± 0.02"
+    assert texts["colour1"] == "0.25, 0.5, 1"
+
+
 def test_phases_in_words() -> None:
     assert formatting.phases({"loading": 2.123, "page": 0.01, "steps": 83.0}) == "loading 2.1 s, steps 1 min 23 s"
 

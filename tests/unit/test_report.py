@@ -221,6 +221,22 @@ def test_numbers_have_their_standard_errors(tmp_path):
     assert "one standard error, from the noise" in text
 
 
+def test_facts_are_labelled_text_and_few_values_are_at_the_top(tmp_path):
+    run = write_run(
+        tmp_path / "run",
+        truth={"a": np.array([-0.2, 0.5])},
+        parameters={"a": np.array([-0.3, 0.4])},
+        choices=["path gradients of a"],
+        settings={"spp": 4, "estimator": "PathGradient(image=Plain())"},
+        verification={"status": "finished", "start": [0.0218, 0.00158], "end": [0.0018, 0.0019], "best": "end"},
+    )
+    text = Page(report.page(run)).words
+    assert text.index("Recovered values a −0.3, 0.4") < text.index("How it was made")
+    assert "verified.loss at the start 0.0218 ± 0.0016 verified.loss at the end 0.0018 ± 0.0019" in text
+    assert "[0.0218" not in text
+    assert "PathGradient(" not in text
+
+
 def test_a_texture_refined_on_the_way_is_shown_without_an_error(tmp_path):
     truth = {KEY: np.full((8, 8, 3), 0.5)}
     run = write_run(tmp_path / "run", truth=truth, initial={KEY: np.zeros((2, 2, 3))})

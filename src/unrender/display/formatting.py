@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 LISTED = 4
 """Maximum number of elements of an array that are listed one by one."""
+_MOST_LISTED = 12
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNKNOWN = "–"
 
@@ -69,6 +70,18 @@ def values(array: np.ndarray, standard_error: Sequence[float | None] | None = No
             for text, error in zip(texts, standard_error, strict=True)
         ]
     return ", ".join(texts)
+
+
+def few_values(
+    parameters: Mapping[str, np.ndarray], standard_error: Mapping[str, Sequence[float | None]]
+) -> dict[str, str]:
+    """Return {key: values with their standard errors where known} of parameters of at most 4 elements, up to 12 numbers in all."""
+    few, listed = {}, 0
+    for key, array in parameters.items():
+        if 0 < array.size <= LISTED and listed + array.size <= _MOST_LISTED:
+            listed += array.size
+            few[key] = values(array, standard_error.get(key))
+    return few
 
 
 def with_error(value: float, error: float) -> str:

@@ -22,6 +22,8 @@ _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning is given, and number of steps that are timed for it."""
 _FEW = "allows about"
 """Words of that warning."""
+_LEAST_SPP, _FEW_PIXELS = 2, 4096
+"""Least samples per pixel, and pixels per step, that it advises."""
 _END_SHARE, _END_SECONDS = 0.1, 1.0
 """Time reserved for verification and final images: a fraction of the budget, plus seconds."""
 _LOOK_SECONDS, MOST_SLOWDOWN = 0.5, 3.0
@@ -108,18 +110,32 @@ def _warn_of_few_steps(run: Run) -> None:
     if run.seconds is None or run.clock <= 0.0 or any(_FEW in line for line in run.warnings):
         return
     expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
-    if line := few_steps(run.seconds, max(expected, run.step), run.steps):
+    spp, smaller = getattr(run.estimator, "spp", None), run.problem.pixels > _FEW_PIXELS
+    if line := few_steps(
+        run.seconds, max(expected, run.step), run.steps, spp if isinstance(spp, int) else None, smaller
+    ):
         run.warnings.append(line)
 
 
-def few_steps(seconds: float, steps: int, most: int | None = None) -> str:
-    """Return a line with advice if a budget allows fewer than 20 steps and fewer than `most`; else ""."""
+def few_steps(seconds: float, steps: int, most: int | None = None, spp: int | None = None, large: bool = False) -> str:
+    """Return a line with advice if a budget allows fewer than 20 steps and fewer than `most`; else "".
+
+    Args:
+        seconds, steps, most: the budget, the steps that it allows, and the steps that were requested.
+        spp: samples per pixel of a step, of which it advises a quarter, at least 2, since gradients without bias need two groups of
+            samples; None if unknown.
+        large: whether the views have more pixels than the number that it advises per step.
+    """
     if steps >= min(_FEW_STEPS, most or _FEW_STEPS):
         return ""
-    return (
-        f"the budget of {seconds:g} s {_FEW} {steps} step{'' if steps == 1 else 's'}; use more seconds, fewer samples "
-        "(--set spp=1), a smaller picture (resolution), or fewer pixels a step of a large one (--set pixels=4096)"
-    )
+    ways = ["use more seconds"]
+    if spp is not None and spp > _LEAST_SPP:
+        ways.append(f"fewer samples (--set spp={max(spp // 4, _LEAST_SPP)})")
+    ways.append("a smaller picture (resolution)")
+    if large:
+        ways.append(f"fewer pixels a step (--set pixels={_FEW_PIXELS})")
+    advice = ", ".join(ways[:-1]) + (", or " if len(ways) > 2 else " or ") + ways[-1]
+    return f"the budget of {seconds:g} s {_FEW} {steps} step{'' if steps == 1 else 's'}; {advice}"
 
 
 def check_budget(steps: int | None, seconds: float | None) -> None:

@@ -170,6 +170,11 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
         table.add_row("image error", f"{first} before, {last} after (root mean square{where}{removed})")
     if result.verification:
         table.add_row("verified", verified(result))
+    few = formatting.few_values(
+        result.parameters, {key: np.ravel(error).tolist() for key, error in result.standard_error.items()}
+    )
+    for key, text in few.items():
+        table.add_row(f"= {escape(key)}", f"{text} (recovered)")
     start = problem.parameter_error(result.initial)
     last = next((record["parameter_error"] for record in reversed(result.history) if "parameter_error" in record), {})
     for key, error in (last | problem.parameter_error(result.parameters)).items():
@@ -177,8 +182,10 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     for key, error in result.standard_error.items():
         if key in result.data_share:
             table.add_row(f"± {escape(key)}", _map_line(error, result.data_share[key]))
-            continue
-        table.add_row(f"± {escape(key)}", f"{', '.join(map(formatting.deviation, np.ravel(error)))} (standard error)")
+        elif key not in few:
+            table.add_row(
+                f"± {escape(key)}", f"{', '.join(map(formatting.deviation, np.ravel(error)))} (standard error)"
+            )
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
     console.print(table)

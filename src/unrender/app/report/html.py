@@ -49,17 +49,38 @@ def flatten(fields: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
     return {name: text for name, text in flat.items() if text}
 
 
+_COMPONENTS = ("estimator", "optimizer")
+_VERIFIED = {"start": "loss at the start", "end": "loss at the end", "best_loss": "loss of the selected parameters"}
+
+
+def _verification(record: RunRecord) -> dict[str, Any]:
+    """Return the verification by new pictures with labels. Pairs of a loss and its standard error become text."""
+    named: dict[str, Any] = {"status": record.verified}
+    for name, value in record.verification.items():
+        label = _VERIFIED.get(name, "selected parameters" if name == "best" else name)
+        match value:
+            case [int() | float() as loss, int() | float() as error] if name in _VERIFIED:
+                named[label] = formatting.with_standard_error(loss, error)
+            case _:
+                named[label] = value
+    return named
+
+
 def facts(record: RunRecord) -> dict[str, str]:
-    """Return the facts about a run, {name: value}: problem, settings, seed, hardware, versions."""
+    """Return the facts about a run, {name: value}: problem, settings, seed, hardware, versions.
+
+    The reasons of a method's choices replace the Python objects of its estimator and optimizer, which `run.json` stores.
+    """
+    hidden = _COMPONENTS if record.choices else ()
     return flatten(
         {
             "problem": {"name": record.name, **record.problem.description},
             "method": record.method,
             "choices": "; ".join(record.choices),
             "adapted": "; ".join(record.adapted),
-            "settings": record.settings,
+            "settings": {name: value for name, value in record.settings.items() if name not in hidden},
             "seed": record.seed,
-            "verified": {"status": record.verified, **record.verification},
+            "verified": _verification(record),
             "time": formatting.phases(record.phases),
             "variant": record.variant,
             "hardware": record.hardware,

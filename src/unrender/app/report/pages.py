@@ -15,7 +15,7 @@ import numpy as np
 from unrender.app.report import curves, html, image_metrics, panels, shapes, tables
 from unrender.app.report import groups as grouping
 from unrender.app.report.equal_time import Comparison, compare_groups
-from unrender.display import plots
+from unrender.display import formatting, plots
 from unrender.display.plots import Chart, Line
 from unrender.io.files import write
 from unrender.runs.folder.reader import RunFolder, read
@@ -49,6 +49,7 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
         command=run.record.command,
         facts=html.facts(run.record),
         tiles=tables.tiles(run),
+        values=formatting.few_values(run.parameters, run.record.standard_error),
         views=[panels.view_of_run(view, of) for view, of in shown.items()],
         more_views=len(run.views) - len(shown),
         view_rows=tables.view_rows(run),
