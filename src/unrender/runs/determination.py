@@ -49,15 +49,20 @@ class Change:
         """Return whether the change is significantly less than `share` of the root mean square of the images, or of √`scale`."""
         return self.square + _ERRORS * self.error < share**2 * (self.scale if scale is None else scale)
 
+    def is_above(self, share: float) -> bool:
+        """Return whether the change is significantly more than `share` of the root mean square of the images."""
+        return self.square - _ERRORS * self.error > share**2 * self.scale
+
 
 def undetermined(
     problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf, per_pass: int | None = None
 ) -> list[str]:
     """Return a line for each parameter that hardly changes the images over its entire range.
 
-    Parameters of materials and media are tested in sequence while time remains. All elements of a parameter change together. The range
-    of a map without bounds, such as a bump map, is that of its values. If its own details change the images, the line says that only
-    differences of its elements are determined.
+    Parameters of materials and media are tested in sequence while time remains. All elements of a parameter change together. If a map
+    such as a bump map hardly changes the images then, its details are tested: a checkerboard of its bounds, or its own values if it has
+    none. If they change the images, the line says that only differences of its elements are determined. A map without bounds gets no
+    other line.
 
     Args:
         problem: problem with views and scene.
@@ -71,28 +76,31 @@ def undetermined(
     for key, unknown in problem.unknowns.items():
         info, (low, high) = known[key], unknown.bounds
         own = np.asarray(values[key], np.float32)
-        details = own.ndim >= MAP_AXES and bool(own.min() < own.max())
-        if low is None and high is None and details:
+        is_map, bounded = own.ndim >= MAP_AXES, low is not None or high is not None
+        if is_map and not bounded:
             low, high = float(own.min()), float(own.max())
         if low is None or high is None or info.rigid or info.viewpoint or info.welded or info.role not in _ROLES:
             continue
         started = time.perf_counter()
         if longest > 0.0 and started + longest > until:
             break
-        first, last = ({**values, key: project(np.full(own.shape, end, np.float32), low, high)} for end in (low, high))
+        ends = [project(np.full(own.shape, end, np.float32), low, high) for end in (low, high)]
+        details = np.where(np.indices(own.shape).sum(axis=0) % 2, *ends) if bounded else own
+        first, last, detailed = ({**values, key: array} for array in (*ends, details))
         try:
             change = _change(problem, first, last, spp, per_pass)
             hidden = change.is_below(_LEAST)
-            shown = details and hidden and not _change(problem, first, values, spp, per_pass).is_below(_LEAST)
+            if hidden and is_map:
+                change = _change(problem, first, detailed, spp, per_pass)
         except InputError:  # the renderer rejects a value at the end of the range
             continue
         longest = max(longest, time.perf_counter() - started)
-        if shown:
+        if hidden and change.is_above(_LEAST):
             lines.append(
                 f"{key}: a constant added to all of it changes the pictures by less than {_LEAST:.1%}; only differences of its elements "
                 "are determined"
             )
-        elif hidden:
+        elif hidden and bounded and change.is_below(_LEAST):
             lines.append(
                 f"{key}: over its entire range the pictures change by less than {_LEAST:.1%}; its value is the initial one, or noise"
             )
