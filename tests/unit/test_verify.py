@@ -111,11 +111,32 @@ def test_pictures_whose_light_few_paths_bring_are_told(probability: float, told:
     generator, spp = np.random.default_rng(0), 16
     brightness = generator.uniform(0.5, 2.0, (400, 1))
     hits = generator.binomial(spp, probability, (4, 400, 1)) / (spp * probability)
-    line = verification.rare_light([hits * brightness * np.ones(3)], spp)
+    line = verification.rare_light([hits * brightness * np.ones(3)], np.ones(400), spp)
     assert bool(line) == told
     if told:
         assert int(line.split(" brings")[0].split()[-1]) == pytest.approx(1.0 / probability, rel=0.35)
-    assert verification.rare_light([np.zeros((4, 9, 3))], spp) == ""
+    assert verification.rare_light([np.zeros((4, 9, 3))], np.ones(9), spp) == ""
+
+
+def test_pixels_outside_the_mask_tell_nothing_of_rare_light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of a picture has light that one path in 200 brings; a mask leaves that half out."""
+    generator, spp = np.random.default_rng(0), 16
+    hits = generator.binomial(spp, np.repeat([0.5, 0.005], 200)[:, None], (4, 400, 1)) / (
+        spp * np.repeat([0.5, 0.005], 200)[:, None]
+    )
+    images = [part * np.ones(3) for part in np.split(hits, 2, axis=1)]
+    mask = np.repeat([1.0, 0.0], 200)
+    assert verification.rare_light(images, np.ones(400), spp)
+    assert verification.rare_light(images, mask, spp) == ""
+
+    noted: list[np.ndarray] = []
+    monkeypatch.setattr(verify, "rare_light", lambda images, weights, spp: noted.append(weights) or "")
+    masked = made()
+    view = ur.View(masked.views[0].reference, 0, mask=np.arange(SIDE * SIDE).reshape(SIDE, SIDE) % 2)
+    ur.optimize(
+        ur.Problem(masked.renderer, masked.parameters, [view]), ur.PathGradient(spp=1), ur.optimizers.SGD(1e-3), steps=2
+    )
+    assert [list(weights) for weights in noted] == [list(np.arange(SIDE * SIDE) % 2)]
 
 
 def test_parts_of_the_launches_have_the_same_mean() -> None:
@@ -704,11 +725,14 @@ def test_a_difference_that_changes_its_sign_within_tiles_is_told(sampled: bool) 
     assert "the final picture differs from the references by 0.0" in found
 
 
-@pytest.mark.parametrize("side", [24, 48])
-def test_noise_of_references_with_a_reconstruction_filter_is_no_difference(side: int) -> None:
+@pytest.mark.parametrize(
+    ("side", "size", "count"), [(24, 0.05, 40), (48, 0.05, 40), (128, 0.2, 6), (256, 0.1, 3), (256, 0.2, 3)]
+)
+def test_noise_of_references_with_a_reconstruction_filter_is_no_difference(side: int, size: float, count: int) -> None:
+    """The score of a correlation grows with the root of the number of pixels, so that one of 0.018 shows in large pictures."""
     generator, problem = np.random.default_rng(0), made()
-    for _ in range(40):
-        noise = 0.05 * seen_through_a_filter(generator, side)
+    for _ in range(count):
+        noise = size * seen_through_a_filter(generator, side)
         adjacent = float(np.mean(noise[1:] * noise[:-1]) / np.mean(noise**2))
         assert 0.2 < adjacent < 0.5
         residuals = noise + generator.normal(0.0, 0.01, (4, side * side, 3))
@@ -722,3 +746,14 @@ def test_a_status_that_is_none_of_ours_is_not_verified(status: object) -> None:
         {"status": "finished", "name": "a", "method": "b", "verification": {"status": status}}
     )
     assert record.verified == NOT_VERIFIED
+
+
+def test_a_difference_along_edges_is_told_beside_filtered_noise_of_references() -> None:
+    """Edges that differ by 8 % of the picture, in references of 256² pixels with a noise of 20 %."""
+    generator, problem, side = np.random.default_rng(0), made(), 256
+    edges = np.where(np.arange(side * side) // 6 % 2 < 1, 0.08, -0.08)[:, None]
+    residuals = edges + 0.2 * seen_through_a_filter(generator, side) + generator.normal(0.0, 0.01, (4, side * side, 3))
+    assert paired_losses.systematic(residuals.mean(axis=0), layout=(3, 1)).score < paired_losses.SIGNIFICANT
+    assert "differs" in verification.misfit_of_numbers(
+        problem, residuals, np.ones((side * side, 3)), np.ones(side * side)
+    )

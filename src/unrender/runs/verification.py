@@ -167,16 +167,17 @@ def misfit_of_views(
     return misfit_of_numbers(problem, residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), known)
 
 
-def rare_light(images: Sequence[np.ndarray], spp: float) -> str:
+def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) -> str:
     """Return a warning if only one path of many brings light to the pictures, as in caustics; "" otherwise.
 
     A pixel of mean m whose light comes from a fraction p of its paths has a variance of at least m² (1 − p) / p per path.
 
     Args:
         images: independent images (K, N, 3) of each frame, K >= 2.
+        weights: weight of each pixel of all frames, (N,). Pixels of weight 0 do not count.
         spp: samples per pixel of one of these.
     """
-    joined = np.concatenate(images, axis=1).sum(axis=2)
+    joined = np.concatenate(images, axis=1)[:, weights > 0].sum(axis=2)
     joined = joined[:, np.isfinite(joined).all(axis=0)]
     joined /= max(float(np.abs(joined).max(initial=0.0)), 1e-300)  # squares of the largest numbers overflow
     count = len(joined)

@@ -157,7 +157,8 @@ class Verify(Callback):
             ends = places[best][1] if places else result.parameters
             lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds)
         lines += _lines(first, last, best, best_picture.loss[0], memory if disagrees else None, worse)
-        lines += filter(None, [rare_light(last.images, pictures.paths / (pictures.pixels * len(last.images[0])))])
+        spp = pictures.paths / (pictures.pixels * len(last.images[0]))
+        lines += filter(None, [rare_light(last.images, pictures.weights, spp)])
         verification: dict[str, Any] = {
             "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
             "start": _numbers(*first.loss),
