@@ -154,7 +154,10 @@ def test_values_are_tied_unless_they_are_encoded_differently(role: Role) -> None
         ([{"keys": [LEFT, RIGHT]}, {"key": RIGHT}], "is an unknown of its own"),
         ([{"key": "a", "keys": [LEFT, RIGHT]}, {"key": "b", "keys": [RIGHT]}], "is tied to a already"),
         ([{"keys": {LEFT: 0.0}}], "expected a factor other than 0"),
-        ([{"keys": {LAMPS[0]: -1.0, LAMPS[1]: 1.0}}], "no value is within the ranges of key.intensity.value and fill"),
+        (
+            [{"keys": {LAMPS[0]: -1.0, LAMPS[1]: 1.0}}],
+            "no range of values is within the ranges of key.intensity.value and fill",
+        ),
         ([{"keys": []}], "expected at least one key"),
         ([{"keys": [LEFT, LEFT]}], "a key is given twice"),
         ([{"keys": LEFT}], "expected a list of keys"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mitsuba as mi
@@ -11,6 +12,9 @@ import pytest
 
 import unrender as ur
 from tiers import quick
+from unrender.app.distributed.transfer import packed, unpacked
+from unrender.app.stages import stages_file
+from unrender.app.stages.stage_problem import StagedProblem
 from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.random import Key
@@ -252,6 +256,27 @@ def test_a_world_that_cannot_be_is_refused_in_one_line(tmp_path: Path, more: str
     with pytest.raises(InputError, match=message) as caught:
         ur.Problem.from_file(files(tmp_path, more + "\n"))
     assert "\n" not in str(caught.value)
+
+
+def test_a_part_of_the_views_may_know_an_unknown() -> None:
+    """Views of one worker, and the first view of a stage's scene: another view determines the lamp."""
+    cloudpickle = pytest.importorskip("ray").cloudpickle
+    made = problem([ur.View(picture()), ur.View(picture(right=0.0), known={LAMP: DARK})], (WALL, LAMP), max_depth=3)
+    ray = SimpleNamespace(cloudpickle=cloudpickle)
+    for view in (0, 1):
+        assert len(unpacked(packed(made, [view], ray), ray).views) == 1
+    with pytest.raises(InputError, match=f"{LAMP} is known in all views"):
+        made.replaced(views=made.original_views[1:])
+
+
+def test_a_stage_has_a_scene_though_the_first_view_knows_what_is_fixed(tmp_path: Path) -> None:
+    lamp, more = "lamp.intensity.value", 'with = { "lamp.intensity.value" = [0.5, 0.5, 0.5] }\n'
+    file = files(tmp_path, f'{more}[[views]]\nreference = "one.npy"\n[[parameters]]\nkey = "{lamp}"\n')
+    stage = stages_file.Stage("colour", ("wall.bsdf.reflectance.value",))
+    first = stages_file.Stage("light", (lamp,))
+    whole = StagedProblem.read(stages_file.Stages(file, (first, stage), steps=1))
+    made = whole.of_stage(stage, {lamp: np.full(3, 3.0, np.float32)}, tmp_path / "made")
+    assert made.renderer.values([lamp])[lamp].numpy() == pytest.approx(3.0)
 
 
 def test_a_scene_without_the_unknowns_is_refused() -> None:

@@ -127,9 +127,7 @@ def test_first_map_of_a_rough_box_is_as_good_as_that_of_the_loss_derivative() ->
 
     ours, loss = logarithms(ur.pixels.Adaptive(1000)), logarithms(ur.pixels.LossProportional(1000))
     error = np.sqrt((ours.var(ddof=1) + loss.var(ddof=1)) / len(ours))
-    print(np.exp([ours.mean(), loss.mean()]), error)
     assert ours.mean() < loss.mean() + 3 * error
     assert np.exp(ours.max()) < 1.0, "no better than uniform pixels"
     raw = logarithms(ur.pixels.Adaptive(1000, uniform=0.1, learn_from_draws=False, by_cost=False, denoiser="none"))
-    print(np.exp(raw.mean()))
     assert raw.mean() > loss.mean() + 3 * error, "a planted worse map went unseen"

@@ -370,6 +370,13 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
         CONSTANTS.number_spp[1], CONSTANTS.difference_spp[1], noise_limit=CONSTANTS.noise_limit, remember=True
     )
     assert plan.estimator == expected
+    lit = {key: dataclasses.replace(info, nonlinear=True, brightness="light") for key, info in known.items()}
+    formed.update(lit)
+    assert method("auto").plan(made).estimator == expected, "lights alone are weighted as BSDFs"
+    formed["place"] = dataclasses.replace(lit["place"], shapes_bsdf=True)
+    by_channel = dataclasses.replace(expected, noise_limit=CONSTANTS.bsdf_noise_limit, by_channel=True)
+    assert method("auto").plan(made).estimator == by_channel
+    formed.update(dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)})
     assert isinstance(plan.optimizer, optimizers.AveragedNewton)
     assert "4 numbers" in plan.reasons[0]
     assert "with place" in plan.reasons[0]

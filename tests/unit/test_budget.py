@@ -102,12 +102,20 @@ def test_a_budget_of_few_steps_is_told_after_the_first() -> None:
     assert not ur.optimize(problem(), slow(0.05), ur.optimizers.Adam(0.01), steps=5).warnings
 
 
-def test_a_budget_of_few_steps_is_told_at_the_end_if_the_first_were_quick() -> None:
+def test_a_budget_of_few_steps_is_told_at_the_end_if_the_first_were_quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+
     class Busy(Callback):
         def on_step(self, run: Any, record: Any) -> None:
-            object.__setattr__(estimator, "pause", 0.1 if run.step > 3 else 0.0)
+            object.__setattr__(estimator, "pause", 0.1 if run.step > 3 else 0.001)
 
-    estimator = slow(0.0)
+    def passed(seconds: float) -> None:
+        now[0] += seconds
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time, "sleep", passed)
+    monkeypatch.setattr(budget, "slowdown", lambda: 1.0)
+    estimator = slow(0.001)
     found = ur.optimize(problem(), estimator, ur.optimizers.Adam(0.01), seconds=0.6, callbacks=[Busy()])
     assert found.steps < 20
     (line,) = (line for line in found.warnings if "allows about" in line)

@@ -261,7 +261,14 @@ BAD_PARAMETERS: list[tuple[Parameter, str]] = [
     (Parameter("wall.value", 1j), "initial: expected a number, a colour"),  # pyright: ignore
     (Parameter("wall.value", bounds=(1.0, 0.0)), "bounds: low must be less than high, got 1 and 0"),
     (Parameter("wall.value", bounds=(1.0, 1.0)), "bounds: low must be less than high"),
-    (Parameter("wall.value", bounds=(-5.0, -1.0)), r"bounds: no value is within \[-5, -1\] and its range \[0, "),
+    (
+        Parameter("wall.value", bounds=(-5.0, -1.0)),
+        r"bounds: no range of values is within \[-5, -1\] and its range \[0, ",
+    ),
+    (
+        Parameter("wall.value", bounds=(-5.0, 0.0)),
+        r"bounds: no range of values is within \[-5, 0\] and its range \[0, ",
+    ),
     (Parameter("wall.value", bounds=(np.inf, None)), "bounds: low must be less than high"),
     (Parameter("wall.value", bounds=(0.0, float("nan"))), "bounds: expected two numbers or None, got nan"),
     (Parameter("wall.value", bounds=(0.0,)), "bounds: expected"),  # pyright: ignore

@@ -109,7 +109,7 @@ class Tie:
         low, high = max(lows), min(highs)
         if low >= high:
             raise KeyedError(
-                self.key, f"with these factors no value is within the ranges of {' and '.join(self.factors)}"
+                self.key, f"with these factors no range of values is within the ranges of {' and '.join(self.factors)}"
             )
         return (float(low) if np.isfinite(low) else None), (float(high) if np.isfinite(high) else None)
 

@@ -42,9 +42,9 @@ def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[B
             sides of it.
     """
     low, high = (info.lowest, info.highest) if bounds is None else _read(bounds)
-    if not (_below(low, info.highest) and _below(info.lowest, high)):
+    if any(a is not None and b is not None and a >= b for a, b in ((low, info.highest), (info.lowest, high))):
         raise InputError(
-            f"no value is within {_interval((low, high))} and its range {_interval((info.lowest, info.highest))}"
+            f"no range of values is within {_interval((low, high))} and its range {_interval((info.lowest, info.highest))}"
         )
     if info.singular is None or not (_below(low, info.singular) and _below(info.singular, high)):
         return (low, high), ""

@@ -48,7 +48,7 @@ from unrender.scene.validation import (
 from unrender.scene.view import View
 from unrender.scene.view_checks import check_views, known_angles
 from unrender.scene.view_losses import ViewLosses
-from unrender.scene.view_worlds import known_keys, of_views
+from unrender.scene.view_worlds import check_determined, known_keys, of_views
 
 __all__ = ["Bounds", "Problem", "open_scene"]
 
@@ -78,6 +78,7 @@ class Problem(ViewLosses):
         name: name for display; None takes the name of the scene file.
         surfaces: {key: `scene.surfaces.Surface`} of vertex positions whose true surface is known, but not the true position of each
             vertex.
+        partial: whether other views, which this object does not have, may determine an unknown that all of its views know.
 
     Attributes:
         renderer: renderer of the scene.
@@ -126,6 +127,7 @@ class Problem(ViewLosses):
         name: str | None = None,
         surfaces: Mapping[str, Surface] | None = None,
         expressions: Mapping[str, str | Callable[..., Any]] | None = None,
+        partial: bool = False,
     ):
         check_max_depth(max_depth)
         checked_loss = check_loss(L2() if loss is None else loss)
@@ -133,6 +135,8 @@ class Problem(ViewLosses):
         original_views: tuple[View, ...] = check_sequence(views, View, "views")
         path = Path(scene) if isinstance(scene, (str, Path)) else None
         renderer, located = _opened(scene, max_depth, checked_parameters, original_views, expressions or {})
+        if not partial:
+            check_determined(original_views, scene_keys(checked_parameters))
         unknowns = _unknowns(checked_parameters, renderer, truth or {}, surfaces or {})
         checked_views, view_notices = check_views(located, renderer, checked_loss)
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))
@@ -160,11 +164,11 @@ class Problem(ViewLosses):
         )
 
     @classmethod
-    def from_file(cls, path: str | Path) -> Problem:
-        """Return the problem of a TOML file. Raises `InputError` that names the line."""
+    def from_file(cls, path: str | Path, *, partial: bool = False) -> Problem:
+        """Return the problem of a TOML file; `partial` as for `Problem`. Raises `InputError` that names the line."""
         from unrender.scene.toml_file import read
 
-        return read(path)
+        return read(path, partial)
 
     def replaced(
         self,

@@ -122,8 +122,8 @@ TABLES: dict[str, type[Table]] = {"": _Problem, "parameters": _Parameter, "views
 """Models of a problem file's tables, by name; "" is the file itself."""
 
 
-def read(path: str | Path) -> Problem:
-    """Return the problem of a TOML file.
+def read(path: str | Path, partial: bool = False) -> Problem:
+    """Return the problem of a TOML file; `partial` as for `Problem`.
 
     Raises:
         InputError: "problem.toml:12: parameters[0].bounds: ...": file, line, field and the expected value.
@@ -132,7 +132,7 @@ def read(path: str | Path) -> Problem:
     model, text = _read_model(file)
     try:
         with confinement.within(file.parent):
-            problem = _build(model, file)
+            problem = _build(model, file, partial)
         return problem.with_parts(origin={**problem.origin, "file": str(file.resolve())})
     except FieldError as error:
         place = error.place
@@ -155,7 +155,7 @@ def _read_model(file: Path) -> tuple[_Problem, str]:
     return toml_models.read(file, _Problem, {"parameters": _Parameter, "views": _View})
 
 
-def _build(model: _Problem, file: Path) -> Problem:
+def _build(model: _Problem, file: Path, partial: bool) -> Problem:
     folder = file.parent
     try:
         loss = tables.component(model.loss, "loss", folder=folder)
@@ -172,6 +172,7 @@ def _build(model: _Problem, file: Path) -> Problem:
         truth={p.key: _value(truth, folder) for p, truth in truths if truth is not None},
         name=model.name or file.stem,
         expressions=model.expressions,
+        partial=partial,
     )
 
 

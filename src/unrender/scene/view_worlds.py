@@ -39,7 +39,7 @@ def of_views(
         opened: function from a scene to its renderer; called once for equal scenes.
 
     Raises:
-        FieldError: a sensor, key or value is invalid, a scene has none of the unknowns, or all views know one of them.
+        FieldError: a sensor, key or value is invalid, or a scene has none of the unknowns.
     """
     scenes: list[tuple[Any, Renderer]] = []
     worlds: dict[int, World] = {}
@@ -56,17 +56,20 @@ def of_views(
         if view.aov is not None:
             own = _with_aov(index, view.aov, own)
         worlds[index] = World(own, view.sensor, _values(index, view.known or {}, own.parameters()))
-    if hidden := [
-        key for key in keys if len(worlds) == len(views) and all(key in world.values for world in worlds.values())
-    ]:
-        what = f"{hidden[0]} is known in all views, so none determines it; leave it out of one, or of the unknowns"
-        raise FieldError(("views", 0, "with"), what, "view 0: known")
     made, sensors = with_worlds(renderer, list(worlds.values()))
     located = dict(zip(worlds, sensors, strict=True))
     return made, tuple(
         replace(view, sensor=located[index], known=None, scene=None, aov=None) if index in located else view
         for index, view in enumerate(views)
     )
+
+
+def check_determined(views: Sequence[View], keys: Sequence[str]) -> None:
+    """Raise `FieldError` if all views know one of these keys. The views must be all views of a problem."""
+    for key in keys:
+        if all(key in (view.known or {}) for view in views):
+            what = f"{key} is known in all views, so none determines it; leave it out of one, or of the unknowns"
+            raise FieldError(("views", 0, "with"), what, "view 0: known")
 
 
 def _equal(one: Any, other: Any) -> bool:

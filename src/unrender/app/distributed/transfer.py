@@ -92,6 +92,7 @@ def unpacked(blob: bytes, ray: Any) -> Problem:
         parts.max_depth,
         name=parts.name,
         expressions=parts.expressions,
+        partial=True,
     )
 
 

@@ -164,7 +164,7 @@ def _problem(
     problem: Problem, held_out: Path, parameters: Mapping[str, np.ndarray], run: RunFolder
 ) -> tuple[Problem, dict[str, np.ndarray], list[str]]:
     """Return the problem with the held-out views, the values of its parameters, and the notices."""
-    other = Problem.from_file(held_out)
+    other = Problem.from_file(held_out, partial=True)
     known = scene_renderer(other.renderer).parameters()
     shared = [key for key in parameters if key in known]
     if not shared:
@@ -173,7 +173,14 @@ def _problem(
     notices = [f"{', '.join(left_out)}: not in the scene of {held_out.name}, left out"] if left_out else []
     bounds = {parameter.key: parameter.bounds for parameter in problem.parameters if parameter.keys is None}
     plain = [Parameter(key, bounds=bounds.get(key)) for key in shared]
-    target = Problem(other.origin["scene"], plain, other.original_views, max_depth=problem.max_depth, name=other.name)
+    target = Problem(
+        other.origin["scene"],
+        plain,
+        other.original_views,
+        max_depth=problem.max_depth,
+        name=other.name,
+        partial=True,
+    )
     if not isinstance(target.renderer, MitsubaRenderer):
         raise InputError(f"{held_out}: it is not rendered by Mitsuba")
     target = reopen.with_meshes(target, run)

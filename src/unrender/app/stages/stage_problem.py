@@ -80,7 +80,7 @@ class StagedProblem:
         if fixed:
             if not (folder / scene_folder.SCENE).is_file():
                 unknowns = [Parameter(key, keys=self.parameters[key].keys) for key in fixed]
-                problem = Problem(scene, unknowns, self.views[:1], self.loss, self.max_depth)
+                problem = Problem(scene, unknowns, self.views[:1], self.loss, self.max_depth, partial=True)
                 self._check_names(stage, scene_folder.export((problem, fixed), folder))
             scene = folder / scene_folder.SCENE
         return Problem(

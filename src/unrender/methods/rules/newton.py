@@ -193,8 +193,9 @@ def _of_bsdfs(traits: Traits) -> list[str]:
 
 
 def _only_bsdfs_and_brightness(traits: Traits) -> bool:
-    """Return whether all unknowns are parameters of BSDFs or of the brightness of lights."""
-    return all(info.shapes_bsdf or bool(info.brightness) for info in traits.infos.values())
+    """Return whether some unknowns are parameters of BSDFs, and all others of the brightness of lights."""
+    infos = traits.infos.values()
+    return any(info.shapes_bsdf for info in infos) and all(info.shapes_bsdf or bool(info.brightness) for info in infos)
 
 
 def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
