@@ -370,6 +370,22 @@ def test_broken_exif_is_passed_over(tmp_path: Path) -> None:
         assert pictures.upright(tmp_path / "a.jpg", None) == (8, 6, 1)
 
 
+def test_only_errors_of_pillow_are_errors_of_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def raising(picture: Image.Image) -> int:
+        raise TypeError("a fault of the program")
+
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (64, 64)).save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) - 60])
+    with pytest.raises(InputError, match=r"a\.jpg: cannot be read as a picture"):
+        pictures.read(path)
+    path.write_bytes(whole)
+    monkeypatch.setattr(pictures.images, "orientation", raising)
+    with pytest.raises(TypeError, match="a fault of the program"):
+        pictures.upright(path, None)
+
+
 def test_a_photograph_of_a_thousand_scans_is_refused(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     Image.new("RGB", (8, 6)).save(buffer, "JPEG", progressive=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,7 +67,8 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
     if header.kind in _PILLOW_KINDS:
         with _opened(path, header) as picture:
             if picture.format == "PNG":
-                picture.load()  # EXIF may follow the pixels
+                with _errors_of_pillow(path):
+                    picture.load()  # EXIF may follow the pixels
             return picture.width, picture.height, images.orientation(picture)
     if header.kind == "TIFF":
         width, height, _ = header.sizes[0]
@@ -179,17 +180,22 @@ def _is_16_bit(header: image_size.Header) -> bool:
 
 @contextmanager
 def _opened(path: Path, header: image_size.Header) -> Iterator[Image.Image]:
-    """Open a file by Pillow, by the plugin of the kind that its header has and by no other. Errors of Pillow become `InputError`."""
+    """Open a file by Pillow, by the plugin of the kind that its header has and by no other. Pillow's errors become `InputError`."""
+    with warnings.catch_warnings(), ExitStack() as stack:
+        warnings.simplefilter("ignore")  # Pillow's size limit equals ours, and malformed EXIF is handled
+        with _errors_of_pillow(path):
+            file = stack.enter_context(bounded_files.open_regular(path))
+            picture = stack.enter_context(Image.open(file, formats=_PILLOW_KINDS[header.kind]))
+        if (picture.width, picture.height) != header.sizes[0][:2]:
+            raise InputError(f"{path}: cannot be read as a picture: its header declares two sizes")
+        yield picture
+
+
+@contextmanager
+def _errors_of_pillow(path: Path) -> Iterator[None]:
+    """Raise `InputError` for exceptions of the calls of Pillow inside."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Pillow's size limit equals ours, and malformed EXIF is handled
-            with (
-                bounded_files.open_regular(path) as file,
-                Image.open(file, formats=_PILLOW_KINDS[header.kind]) as picture,
-            ):
-                if (picture.width, picture.height) != header.sizes[0][:2]:
-                    raise InputError(f"{path}: cannot be read as a picture: its header declares two sizes")
-                yield picture
+        yield
     except (InputError, MemoryError):
         raise
     except Exception as error:  # Pillow raises many types of exceptions
@@ -202,7 +208,8 @@ def _decode_pillow(path: Path, header: image_size.Header) -> np.ndarray:
         if picture.mode not in _PILLOW_MODES:
             raise InputError(f"{path}: {picture.mode} pixels, expected 8 bits a channel; save it as .png, .tif or .exr")
         transparent = picture.mode in ("RGBA", "LA", "PA") or "transparency" in picture.info
-        return np.array(picture.convert("RGBA" if transparent else "RGB"))
+        with _errors_of_pillow(path):
+            return np.array(picture.convert("RGBA" if transparent else "RGB"))
 
 
 def _decode_opencv(path: Path, header: image_size.Header) -> np.ndarray:
