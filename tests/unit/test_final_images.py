@@ -146,6 +146,7 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
     """A wrong number is told however late it is."""
     made, allowed = problem(), []
     monkeypatch.setattr(final_images, "slowdown", lambda: 1.0)
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
     none = Curvature()
     monkeypatch.setattr(final_images, "curvature", lambda *_, seconds, **__: allowed.append(seconds) or none)
     monkeypatch.setattr(
@@ -163,6 +164,7 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
 def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that ends without its test of numbers says so; one that was tested does not."""
     made = problem()
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
     values = {"wall": np.full(3, 0.4, np.float32)}
     result = replace(Result(values, values, [{}], 30.0, 0.0, "steps"), standard_error={"wall": np.full(3, 1e-3)})
     line = "whether wall converged: no time was left to test it; use a longer run or fewer pixels"
@@ -172,6 +174,21 @@ def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypa
     late = final_images.render_final_images(made, result, left=lambda: 0.0, tested=tested)
     assert line in late.undetermined
     assert not late.standard_error  # what a run claims is checked first
+
+
+def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a wrong minimum, the references do not leave a number open by what least squares say."""
+    made, values, errors = problem(), {"wall": np.full(3, 0.4, np.float32)}, {"wall": np.full(3, 1e-3)}
+    check = least_squares.NumbersCheck({"wall": "the references leave it open"}, {"wall": "it moves"})
+    monkeypatch.setattr(final_images, "check_numbers", lambda *_: check)
+    result = replace(Result(values, values, [{}], 30.0, 0.0, "steps"), standard_error=errors)
+    found = final_images.render_final_images(made, result)
+    assert not found.standard_error
+    assert not found.undetermined
+    assert "it moves" in found.warnings
+    assert "hence no standard errors" in " ".join(found.warnings)
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
+    assert "the references leave it open" in final_images.render_final_images(made, result).undetermined
 
 
 def test_run_json_says_where_the_time_went(tmp_path: Path) -> None:

@@ -127,15 +127,18 @@ def render_final_images(
             known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
         sensitivities, deviations = known.sensitivity(), dict(result.standard_error)
         lines, warnings = [], ()
-        if not tested and result.steps:
+        differs = misfit_of_views(problem, chosen, ends, result.warnings) if result.steps else ""
+        if not tested and result.steps and not differs:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
             lines, deviations = late.missing(), _without(deviations, late.unchecked)
         if everything:
-            lines, warnings, deviations = _undetermined(problem, result, sensitivities, 0.25 * tests, weights)
+            lines, warnings, deviations = _undetermined(
+                problem, result, sensitivities, 0.25 * tests, weights, fits=not differs
+            )
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
-    if result.steps and (differs := misfit_of_views(problem, chosen, ends, result.warnings)):
+    if differs:
         deviations = {}
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
         if differs not in result.warnings:
@@ -193,10 +196,11 @@ def _undetermined(
     sensitivities: Mapping[str, np.ndarray],
     most: float,
     weights: Sequence[np.ndarray],
+    fits: bool,
 ) -> tuple[list[str], tuple[str, ...], dict[str, np.ndarray]]:
     """Return lines about what the images do not determine and about numbers that have not settled, and standard errors; none without steps.
 
-    Each test takes at most about `most` seconds.
+    Each test takes at most about `most` seconds. A final picture that does not fit the references (`fits`) has no standard errors.
     """
     if not result.steps:
         return [], (), {}
@@ -209,9 +213,9 @@ def _undetermined(
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities, weights)
     text, deviations = "\n".join(lines), _without(result.standard_error, numbers.unchecked)
-    lines += [line for key, line in numbers.undetermined.items() if key not in text] + numbers.missing(
-        numbers.undetermined
-    )
+    if fits:
+        lines += [line for key, line in numbers.undetermined.items() if key not in text]
+        lines += numbers.missing(numbers.undetermined)
     deviations |= numbers.standard_errors(result.parameters, deviations)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)

@@ -151,8 +151,8 @@ def misfit_of_numbers(
         else "noise does not explain:"
     )
     return (
-        f"{difference.describe()}, which {noise} the run needs more steps, another start or bounds (auto compares starts "
-        "within them), or something that is not among the unknowns is wrong"
+        f"{difference.describe()}, which {noise} the run needs more steps, another start or narrower bounds, or something that is not "
+        "among the unknowns is wrong; hence no standard errors"
     )
 
 
