@@ -180,20 +180,6 @@ def test_smoothing_returns_when_fresh_samples_show_no_detail_any_more():
     assert after.gain < 0.1
 
 
-def test_smoothing_stays_weak_while_half_of_the_agreement_is_signal():
-    """Reused noise as large as the detail: half of the agreement of successive gradients is detail, which smoothing would slow down."""
-    *_, fit = watched(1.0, 0.3)
-    assert fit.share < 0.1
-    smooth = Sobolev()
-    previous = smooth.scaled(fit.share).apply(BOARD + remembered(0))
-    for step in range(1, 9):
-        gradient = BOARD + remembered(step)
-        fit = fit.after(smooth, previous, gradient, BOARD + normal(50 + step))
-        previous = smooth.scaled(fit.share).apply(gradient)
-    assert fit.unjudged == 0
-    assert fit.share < 0.1
-
-
 def test_a_checkerboard_is_recovered():
     """A bowl whose minimum alternates from texel to texel, by 60 steps; by full strength most of it is still missing."""
 

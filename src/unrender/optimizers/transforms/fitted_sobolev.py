@@ -39,7 +39,7 @@ _ROWS = 8
 """Number of independent gradients between two tests; a test uses those of the last two intervals."""
 _LEAST_FRESH_DESCENT, _ERRORS = 0.7, 2.8
 """Smallest accepted descent relative to the best candidate's, and the smallest improvement in standard errors."""
-_CONFIRMED, _REVERTED = 0.45, 0.3
+_CONFIRMED, _REVERTED = 0.45, 0.6
 """Confirmed fraction of the agreement of successive gradients that is needed to reduce smoothing, and the fraction below which the
 reduction is reverted."""
 _CLEAR = 0.15
@@ -71,7 +71,7 @@ class StrengthFit:
       detail waits for it. For photographs it decays as 1/step, for a checkerboard of single texels hardly at all.
     - It is at least a twentieth of its first value. Otherwise there is little to gain, and single texels would fit the reference's noise.
 
-    If new gradients later confirm less than 0.3 of the agreement of successive ones, by a standard error, the strength of the first fit
+    If new gradients later confirm less than 0.6 of the agreement of successive ones, by a standard error, the strength of the first fit
     is restored.
 
     Attributes:
