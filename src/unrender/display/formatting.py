@@ -96,8 +96,10 @@ def with_error(value: float, error: float) -> str:
 
 
 def with_standard_error(value: float, error: float) -> str:
-    """Format a measured value, which may be negative, with its standard error: 0.0018 ± 0.0019. Without a finite error above 0, the value
-    stands alone."""
+    """Format a measured value, which may be negative, with its standard error: 0.0018 ± 0.0019.
+
+    Without a finite error above 0, the value stands alone.
+    """
     if not (math.isfinite(value) and math.isfinite(error)) or error <= 0:
         return number(value)
     places = min(max(1 - math.floor(math.log10(error)), 0), 12)  # two digits of the error

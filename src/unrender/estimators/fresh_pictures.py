@@ -153,7 +153,7 @@ class FreshPictures:
 
     @property
     def in_pairs(self) -> bool:
-        """Whether the pixels are pairs of nearby ones at distant places, instead of rows of views."""
+        """Whether the pixels are pairs at random places, a distance of two apart. Otherwise they are the rows of views."""
         return self.sampled and self.frames[0].view is None
 
     @property

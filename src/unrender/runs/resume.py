@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,9 +81,9 @@ def load_run(directory: str | Path, steps: int | None = None, seconds: float | N
     done = (steps is None or steps <= record.steps) and (seconds is None or seconds <= record.seconds)
     if record.status in ENDED and done:
         so_far = f"finished, after {record.steps} steps and {record.seconds:.3g} s"
-        more = 2 * max(record.seconds, method.seconds or 0.0)
+        more = max(math.ceil(2 * max(record.seconds, method.seconds or 0.0)), 1)
         raise InputError(
-            f"run folder {folder}: {so_far}; to continue, give --steps {2 * max(record.steps, 1)} or --seconds {more:.2g}, counted from "
+            f"run folder {folder}: {so_far}; to continue, give --steps {2 * max(record.steps, 1)} or --seconds {more}, counted from "
             "its start (steps= or seconds= in Python)"
         )
     return StoredRun(folder, record, method.model_copy(update={"steps": budget[0], "seconds": budget[1]}))

@@ -86,7 +86,7 @@ def misfit(
         least: smallest difference relative to the references.
         fresh: differences of K >= 2 images with independent noise, (K, N, 3). With these, few pixels are also judged one by one.
         by_pixel: whether many pixels are, too.
-        sampled: whether the pixels are pairs of nearby ones at distant places, instead of rows.
+        sampled: whether the pixels are pairs at random places, see `FreshPictures.in_pairs`; rows of pixels otherwise.
     """
     one, other = residuals.mean(axis=0), others.mean(axis=0)
     if not (np.isfinite(one).all() and np.isfinite(other).all()):
