@@ -92,6 +92,39 @@ def test_the_noise_of_the_check_is_no_distance_and_no_number_is_known_better_tha
     np.testing.assert_allclose(own, [np.sqrt(18.0), 3.5, np.inf])
 
 
+def test_errors_of_a_run_that_has_converged_are_no_larger_with_a_check() -> None:
+    """The run and the check estimate one error, each with a scatter, and the step is noise."""
+    random, count = np.random.default_rng(1), 1 << 14
+    own, check = (1.0 + 0.25 * random.normal(size=count) for _ in range(2))
+    found = NumbersCheck(
+        errors={"a": check}, steps={"a": 0.5 * random.normal(size=count)}, noise={"a": np.full(count, 0.5)}
+    )
+    values = {"a": np.zeros(count)}
+
+    def size(complete: bool) -> float:
+        return float(np.sqrt(np.mean(np.square(found.standard_errors(values, {"a": own}, complete)["a"]))))
+
+    mean = float(np.sqrt(np.mean(np.square(own))))
+    assert size(complete=True) == pytest.approx(mean, rel=0.02)
+    assert size(complete=False) > 1.15 * mean
+    far = dataclasses.replace(found, steps={"a": np.full(count, 3.0)})  # an error that the run does not know
+    assert (far.standard_errors(values, {"a": own}, complete=True)["a"] > 2.5).all()
+
+
+def test_noise_of_the_slopes_is_noise_of_the_step() -> None:
+    """Times a residual that is noise of the reference, it moves the solution of the check."""
+    made, random = problem(MATRIX), np.random.default_rng(2)
+    numbers = Numbers.of(made, TRUTH, made.initial_values())
+    assert numbers is not None
+    slopes, scores = MATRIX.T.reshape(4, -1, 3), []
+    for _ in range(64):
+        noisy = [slopes + 0.2 * random.normal(size=slopes.shape) for _ in range(2)]
+        residuals = np.stack([random.normal(0.0, 0.05, slopes.shape[1:])] * 2)
+        fits = [_Fit.of(numbers, Differences(np.eye(4), *of), residuals) for of in (noisy, [slopes, slopes])]
+        scores.append((fits[0].step - fits[1].step) / fits[0].own)
+    assert float(np.std(scores)) == pytest.approx(1.0, abs=0.2)
+
+
 @pytest.mark.parametrize("planted", [False, True])
 def test_a_solution_with_weights_is_no_distance_from_the_fit(planted: bool):
     """Half of the pixels have ten times the noise, and little weight in the run's steps. The planted fault is a fit with equal weights,

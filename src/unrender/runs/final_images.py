@@ -97,6 +97,7 @@ def render_final_images(
     left: Callable[[], float] = lambda: math.inf,
     tested: bool = True,
     weights: Sequence[np.ndarray] = (),
+    complete: bool = False,
 ) -> FinalImages:
     """Render the reference, initial and final image of each view, and collect control weights, pixel probabilities and sensitivities.
 
@@ -112,6 +113,7 @@ def render_final_images(
             take about half a second.
         tested: whether to estimate sensitivities and to test what the images determine.
         weights: weights of each view's pixels in the run's steps, see `least_squares.pixel_weights`.
+        complete: whether the standard errors of the result contain the references' noise.
     """
     with phases.phase("final pictures") as advance:
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
@@ -133,7 +135,7 @@ def render_final_images(
             lines, deviations = late.missing(), _without(deviations, late.unchecked)
         if everything:
             lines, warnings, deviations = _undetermined(
-                problem, result, sensitivities, 0.25 * tests, weights, fits=not differs
+                problem, result, sensitivities, 0.25 * tests, weights, fits=not differs, complete=complete
             )
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
@@ -197,10 +199,12 @@ def _undetermined(
     most: float,
     weights: Sequence[np.ndarray],
     fits: bool,
+    complete: bool,
 ) -> tuple[list[str], tuple[str, ...], dict[str, np.ndarray]]:
     """Return lines about what the images do not determine and about numbers that have not settled, and standard errors; none without steps.
 
     Each test takes at most about `most` seconds. A final picture that does not fit the references (`fits`) has no standard errors.
+    `complete`: see `render_final_images`.
     """
     if not result.steps:
         return [], (), {}
@@ -216,7 +220,7 @@ def _undetermined(
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in text]
         lines += numbers.missing(numbers.undetermined)
-    deviations |= numbers.standard_errors(result.parameters, deviations)
+    deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
     return lines, unfinished, deviations

@@ -28,25 +28,19 @@ from unrender.statistics import scores
 
 _STREAM, _FIELDS = 4, 1 << 16
 """Stream of all random numbers, and index of those of textures and grids."""
-_PASSES, _CHANGES = 3, (64.0, 8.0, 4.0)
-"""Passes that find widths, and the factors by which these change at most."""
-_FIRST_WIDTH = 0.02
-"""First widths of differences, relative to their limits."""
-_SHIFT = 0.3
-"""Shift of the picture, in pixels, that a difference is as large as."""
+_PASSES, _REPEATS, _CHANGES = 3, 8, (64.0, 8.0, 4.0)
+"""Passes that find widths, most repeats of the pictures that are judged, and the factors by which widths change at most."""
+_FIRST_WIDTH, _SHIFT = 0.02, 0.3
+"""First widths of differences, relative to their limits; shift of the picture, in pixels, that a difference is as large as."""
 _WEAKEST = 1e-4
 """Smallest eigenvalue, relative to the largest, that the length of a direction follows."""
-_REPEATS = 8
-"""Most repeats of the pictures that are judged."""
 _FLAT, _COMPARABLE = 0.1, 0.3
 """Change of the pictures relative to that of a shift by `_SHIFT` below which the longest difference leaves a number undetermined;
 noise of the references relative to that of this check from which a change that the check does not see is undetermined."""
 _CHANNELS = 3.0
 """Channels that share their noise."""
-_ERRORS = 3.0
-"""Standard errors by which the change along a direction must exceed its noise."""
-_ROUNDING = 1e-10
-"""Square of a change, relative to the largest, that rounding may leave."""
+_ERRORS, _ROUNDING = 3.0, 1e-10
+"""Standard errors by which the change along a direction must exceed its noise; square of one, relative to the largest, left by rounding."""
 _DOUBTFUL = 0.1
 """Standard error, as a share of a number's size, from which on the references leave it open."""
 _FURTHER, _STEP_ERRORS = 0.05, 4.0
@@ -57,6 +51,8 @@ _TOGETHER = 0.9
 """Correlation from which on two numbers count as determined together."""
 _ROUNDS, _WEAK = 3, 0.3
 """Most rounds that measure weak directions again; length relative to the wanted one below which a direction is weak."""
+_CLEAR = 3.0
+"""Length of a step over its noise from which it counts as a distance, if the run states its own error."""
 _FAR, _BETTER, _NOISY = 6.0, 1.0, 0.05
 """Standard errors that a number moved from which on the picture must be better than with its start; by how many standard errors; share of
 the noisiest pixels that may hide it."""
@@ -101,23 +97,29 @@ class NumbersCheck:
         return [f"{listed(keys)} {have} recovered together with {others}"]
 
     def standard_errors(
-        self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] = MappingProxyType({})
+        self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] | None = None, complete: bool = False
     ) -> dict[str, np.ndarray]:
         """Return the standard errors of the numbers at the end of a run, of the shapes of `values`, float32.
 
         The squares of the error by the references' noise and of the distance from the least-squares solution are added. An estimate of the
-        distance, without its noise σ, is step² − σ². A number is not known better than σ, unless the run states its own error.
+        distance, without its noise σ, is step² − σ². A number is not known better than σ, unless the run states its own error. If that is
+        complete, it replaces the check's, which is of another solution, and only steps beyond 3 σ are distances.
 
         Args:
             values: {key: array} at the end of the run.
-            known: {key: standard errors} from the run's own noise; errors are no smaller.
+            known: {key: standard errors} that the run states.
+            complete: whether these contain the references' noise; otherwise errors are no smaller than them.
         """
-        errors = {}
+        errors, known = {}, known or {}
         for key, error in self.errors.items():
-            square, noise = np.square(error), np.square(self.noise[key])
-            square = square if key in known else np.maximum(square, noise)
-            stated = np.sqrt(square + np.maximum(np.square(self.steps[key]) - noise, 0.0)).reshape(values[key].shape)
-            errors[key] = np.maximum(stated, known.get(key, 0.0)).astype(np.float32)
+            square, noise, step = (np.square(x) for x in (error, self.noise[key], self.steps[key]))
+            own = np.square(known.get(key, 0.0)).reshape(-1)
+            if complete and key in known:
+                square = np.where(np.isfinite(square), own, np.inf) + np.maximum(step - _CLEAR**2 * noise, 0.0)
+            else:
+                square = square if key in known else np.maximum(square, noise)
+                square = np.maximum(square + np.maximum(step - noise, 0.0), own)
+            errors[key] = np.sqrt(square).reshape(values[key].shape).astype(np.float32)
         return errors
 
 
@@ -159,10 +161,7 @@ def check_numbers(
     until = time.perf_counter() + seconds
     try:
         return _check(numbers, sensitivities, until)
-    except (
-        InputError,
-        np.linalg.LinAlgError,
-    ):  # a value that the renderer rejects, or matrices without eigenvalues in double precision
+    except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues
         return NumbersCheck()
 
 
@@ -277,7 +276,7 @@ class _Fit:
     Attributes:
         covariance: covariance from the references' noise, as the residual after the step shows it, (n + k, n + k).
         error: standard errors of the numbers, (n,); infinite along directions whose changes the noise of this check hides.
-        own: the same from the noise of this check, (n,).
+        own: the same from the noise of this check, its slopes included, (n,).
         step: step of the numbers, (n,).
         unseen: largest changes of the numbers along each hidden direction, (n, number of hidden directions).
         better: standard errors by which the picture is better than with the start's numbers.
@@ -308,10 +307,10 @@ class _Fit:
         tangents, n = numbers.tangents(), numbers.count
         changes = tangents @ differences.directions
 
-        def covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-            """Return the covariance of numbers and factors for residuals (P, 3) with independent rendering noise."""
+        def covariance(one: np.ndarray, other: np.ndarray, by: np.ndarray = slopes) -> np.ndarray:
+            """Return the covariance of numbers and factors for residuals (P, 3) with independent rendering noise, times slopes."""
             middle = np.zeros_like(matrix)
-            for parts in zip(*map(numbers.by_view, (slopes, one[None], other[None])), strict=True):
+            for parts in zip(*map(numbers.by_view, (by, one[None], other[None])), strict=True):
                 middle += scores.covariance(*((parts[0] * of).sum(axis=3) for of in parts[1:]))
             middle = scores.positive_part(middle)
             middle[hidden, :] = middle[:, hidden] = 0.0
@@ -324,7 +323,9 @@ class _Fit:
         after = residuals + np.tensordot(along, slopes, axes=1)  # a run that ended early leaves more
         total = covariance(*scores.without_own_pixel(after, slopes, slopes, inverse))
         total *= 1.0 if residual.size > len(total) else math.inf
-        error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (total, covariance(noise, noise)))
+        left = 0.5 * (after[0] + after[1])  # the noise of the slopes moves the solution, too
+        noises = covariance(noise, noise) + covariance(left, left, 0.5 * (differences.one - differences.other))
+        error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (total, noises))
         step = numbers.inside((numbers.point + changes @ along)[None])[0] - numbers.point
         flat = squares + _ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size
         # The noise of this check says nothing about references that have much less of it.

@@ -21,6 +21,7 @@ from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import files
+from unrender.optimizers.base import Measuring
 from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
 from unrender.runs.final_images import render_final_images, warm_up
@@ -179,8 +180,10 @@ class RunWriter(Callback):
                 # Save the long computation and its outcome before the final images take more time.
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
-            weights = pixel_weights(run.estimator, run.state.estimator)
-            images = render_final_images(run.problem, result, self.final_spp, run.time_left, self._tested, weights)
+            weights, complete = pixel_weights(run.estimator, run.state.estimator), isinstance(run.optimizer, Measuring)
+            images = render_final_images(
+                run.problem, result, self.final_spp, run.time_left, self._tested, weights, complete
+            )
             result = replace(
                 result,
                 pictures=images.pictures,
