@@ -192,6 +192,28 @@ def test_noise_is_averaged_where_a_constant_rate_leaves_it():
     assert late < 0.35 * constant
 
 
+def test_the_average_does_not_follow_an_iterate_whose_rate_falls_at_once():
+    """A bowl under noise of which 95 % is reused at each step: its agreement does not last, so the rate falls to a tenth at step 289.
+
+    Where z keeps its displacement, the error rises from 0.99 at step 288 to 1.58 at step 360.
+    """
+    rng, memory = np.random.default_rng(0), np.zeros(2000)
+
+    def bowl(step: int, x: np.ndarray) -> np.ndarray:
+        reused = min(0.95, step / (step + 1.0))
+        memory[:] = reused * memory + (1.0 - reused) * 6.0 * rng.normal(size=x.shape)
+        return x - 0.3 + memory
+
+    seen, states = descend(ScheduleFree(0.1), np.zeros(2000), bowl, 360)
+    errors = [float(np.sqrt(np.mean((x - 0.3) ** 2))) for x in seen]
+    rates = [math.exp(state.of(Agreement).log_rate["x"]) for state in states]
+    fallen = next(step for step in range(1, 360) if rates[step] < 0.5 * rates[step - 1])
+    assert 250 < fallen < 320
+    assert errors[fallen] > 0.9
+    assert max(errors[fallen:]) < 1.02 * errors[fallen]
+    assert errors[360] < 0.7 * errors[fallen]
+
+
 def test_parameters_at_a_bound_leave_it_as_soon_as_the_gradient_turns():
     """50 steps into the bound are no debt: 5 back lead as far from it as 5 from a start there."""
 

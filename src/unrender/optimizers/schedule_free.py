@@ -48,7 +48,7 @@ class ScheduleFree(Recipe):
     learning rate averages the noise instead.
 
     Where the smoothing becomes weaker, the learning rate restarts at 0.3 η_0 or less, because neighbours no longer average the noise.
-    Where it becomes stronger again, z restarts at x.
+    Where it becomes stronger again, or the rate falls by more than a quarter at once, z restarts at x.
 
     Args:
         learning_rate: η_0, in units of the parameter, > 0, for the parameters without their own; or {key: rate, "*": rate of the others}.

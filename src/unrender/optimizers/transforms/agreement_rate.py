@@ -34,6 +34,8 @@ _LASTING_ERRORS = 2.0
 """Standard errors 1/√n of the lasting fraction that are added to it before growth is taken back."""
 _MOST_GROWTH = 3.0
 """Largest rate relative to the first one, and relative to the growth of the parameters."""
+_FALL = 0.75
+"""Ratio of successive rates below which the averaged iterate restarts."""
 _REFINED = 0.3
 """Largest rate, relative to the first one, at a step that reduces smoothing."""
 
@@ -72,7 +74,8 @@ class AgreementRate(StepTransform):
     Agreement that does not last comes from steps back and forth around the minimum, and what it added to the rate is taken back: the factor
     of the rate is f η + (1 − f) η', where f is the lasting fraction plus two standard errors, 2/√n, and η' follows the same rule with
     min(ρ, 0) in place of ρ since the last change of smoothing. Directions that no pixel determines would otherwise follow a random walk
-    with long steps.
+    with long steps. Where the rate thereby falls by more than a quarter at once, the averaged iterate restarts: with shorter steps it would
+    keep the displacement that noise has given it with the longer ones, and the average would move there.
 
     The rate is at most 3 times the first, times the growth of the parameter. At a step that reduces smoothing it is at most 0.3 times the
     first. Needs a `FittedSobolev` before it, which stores the last gradient.
@@ -105,6 +108,7 @@ class AgreementRate(StepTransform):
         previous = update.require_previous("AgreementRate")
         if update.made > 0:
             correlation, log_rate, log_most, log_least = {}, {}, {}, {}
+            fallen = set[str]()
             for key, (cosine, size) in _measured(update.gradient, previous, update.parameters).items():
                 rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
                 fit, shape = update.smoothing.get(key, SMOOTHING_UNCHANGED), arrays.shape(update.gradient[key])
@@ -116,6 +120,9 @@ class AgreementRate(StepTransform):
                 least = state.log_least[key] + self._change(min(rho, 0.0), shape, update.made)
                 least = log_least[key] = min(least, most) if fit.gain == 1.0 else most
                 log_rate[key] = _between(least, most, fit.lasting, math.prod(shape))
+                if fit.gain == 1.0 and log_rate[key] < state.log_rate[key] + math.log(_FALL):
+                    fallen.add(key)
+            update = replace(update, restarted=update.restarted | fallen)
             state = replace(state, correlation=correlation, log_rate=log_rate, log_most=log_most, log_least=log_least)
         factors = {key: update.factors.get(key, 1.0) * math.exp(state.log_rate[key]) for key in update.gradient}
         return replace(update, factors=factors), state

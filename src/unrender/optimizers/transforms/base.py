@@ -58,6 +58,7 @@ class StepUpdate:
         divisor: Sum of weights, if `direction` is a mean that starts at zero.
         previous: Preconditioned gradient of the last step; zeros at the first step, None if no transform stores it.
         smoothing: {key: preconditioning of its gradient}.
+        restarted: Keys of parameters whose iterate restarts at its average before the step.
         steps: {key: step}, set by a transform with its own iterates.
     """
 
@@ -72,6 +73,7 @@ class StepUpdate:
     divisor: float = 1.0
     previous: Tree | None = None
     smoothing: Mapping[str, SmoothingChange] = field(default_factory=dict)
+    restarted: frozenset[str] = frozenset()
     steps: Tree = field(default_factory=dict)
 
     def rate(self, key: str) -> float:

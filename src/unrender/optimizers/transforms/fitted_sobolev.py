@@ -276,7 +276,7 @@ class FittedSobolevState(TransformState):
 @register
 @dataclass(frozen=True)
 class FittedSobolev(StepTransform):
-    """Precondition gradients, and store them for later transforms.
+    """Precondition gradients, and store them for later transforms. Averaged iterates restart where the smoothing becomes stronger.
 
     The strength of a `Sobolev` is an upper limit; it is fitted to successive gradients, see `StrengthFit`. Any other preconditioner is
     applied unchanged. Gradients of other parameters are unchanged. The gradient keeps its unit.
@@ -338,10 +338,10 @@ class FittedSobolev(StepTransform):
         for key, change in smoothing.items():
             if key in raw and change.preconditioner is not None:
                 gradient[key] = change.preconditioner.apply(raw[key])
+        stronger = frozenset(key for key, change in smoothing.items() if change.gain < 1.0)
+        update = replace(update, previous=state.gradient, smoothing=smoothing, restarted=update.restarted | stronger)
         following = replace(state, gradient=gradient, strengths=strengths)
-        return replace(
-            update, gradient=gradient, direction=gradient, previous=state.gradient, smoothing=smoothing
-        ), following
+        return replace(update, gradient=gradient, direction=gradient), following
 
     def choices(self, state: FittedSobolevState, made: int) -> tuple[str, ...]:
         """Return the fitted strengths relative to the given ones."""

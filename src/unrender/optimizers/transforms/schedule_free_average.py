@@ -9,7 +9,7 @@ from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.optimizers.transforms.base import SMOOTHING_UNCHANGED, VALUES, StepTransform, StepUpdate, TransformState
+from unrender.optimizers.transforms.base import VALUES, StepTransform, StepUpdate, TransformState
 
 _WARMUP = 2
 """Number of steps over which the learning rate increases."""
@@ -38,7 +38,7 @@ class ScheduleFreeAverage(StepTransform):
         z ← z − η_t direction,   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
 
     x is the mean of z with weights that grow as t^r. The learning rate is halved at the first step. Iterates z and x are projected onto
-    the bounds together with the parameters. If the smoothing becomes stronger, z restarts at x.
+    the bounds together with the parameters. z restarts at x for the parameters in `StepUpdate.restarted`.
 
     Args:
         beta: β, in [0, 1).
@@ -69,8 +69,7 @@ class ScheduleFreeAverage(StepTransform):
         for key, direction in update.direction.items():
             y, tolerance = update.parameters[key], update.learning_rates[key] * _PROJECTED
             before, mean = self._within_bounds(state.fast[key], state.average[key], y, tolerance)
-            if update.smoothing.get(key, SMOOTHING_UNCHANGED).gain < 1.0:
-                before = mean
+            before = mean if key in update.restarted else before
             fast[key] = before + arrays.scalar(-warm.rate(key), direction) * direction
             average[key] = mean + arrays.scalar(weight, direction) * (fast[key] - mean)
             steps[key] = self._between(fast[key], average[key]) - y
