@@ -122,6 +122,11 @@ def error_panels(entries: Mapping[str, Any], seconds: str = "seconds") -> dict[s
     }
 
 
+def run_curves(methods: Mapping[str, Any]) -> dict[str, Curves]:
+    """Return the curves of each method's runs, whose "curve" is (x values, y values)."""
+    return {name: [run["curve"] for run in found["runs"]] for name, found in methods.items() if "runs" in found}
+
+
 def over_steps(*runs: Values) -> Curves:
     """Return curves of values at steps 0, 1, ..."""
     return [(range(len(run)), run) for run in runs]

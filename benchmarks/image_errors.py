@@ -1,20 +1,28 @@
-"""Errors of images of a problem without a truth."""
+"""Errors of rendered pictures, free of the renderings' noise."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
 from benchmarks.internals import Key, SampleRequest, Tree, arrays, prepare
+from unrender.statistics import debiased
+
+Pair = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Two independent renderings, and the reference, (H, W, C) each."""
+
+
+def picture_error(pairs: Iterable[Pair]) -> float:
+    """Return the root mean square error over pictures of equal size (`debiased.rmse`)."""
+    one, two, reference = (np.concatenate(each) for each in zip(*pairs, strict=True))
+    return debiased.rmse(one, two, reference)[0]
 
 
 class ImageErrors:
     """How far renders of groups of views are from their references, relative to the start.
-
-    They are free of rendering noise: products of two independent renders' differences.
 
     Args:
         made: `nerf-volume` with all views.
@@ -34,13 +42,11 @@ class ImageErrors:
 
     def errors(self, parameters: Tree) -> dict[str, float]:
         """Root mean square over each group's views."""
-        found, parameters = {}, {key: self.array(value) for key, value in parameters.items()}
-        for name, group in self.groups.items():
-            squares = []
-            for number in group:
-                request = SampleRequest(self.views[number].sensor, self.spp, Key(424_242, number).uint32(), 2)
-                images = arrays.numpy(self.session.image(parameters, request).images).astype(np.float64)
-                a, b = images - np.asarray(self.views[number].reference, np.float64)
-                squares.append(float(np.mean(a * b)))
-            found[name] = max(float(np.mean(squares)), 0.0) ** 0.5
-        return found
+        parameters = {key: self.array(value) for key, value in parameters.items()}
+
+        def pair(number: int) -> Pair:
+            request = SampleRequest(self.views[number].sensor, self.spp, Key(424_242, number).uint32(), 2)
+            one, two = arrays.numpy(self.session.image(parameters, request).images)
+            return one, two, np.asarray(self.views[number].reference)
+
+        return {name: picture_error(map(pair, group)) for name, group in self.groups.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -136,6 +137,25 @@ def search(rates: tuple[float, ...], error: Callable[[float], float]) -> tuple[f
             break
         attempt(best / factor if best == min(tried) else best * factor)
     return min(tried, key=tried.__getitem__), [{"rate": rate, "error": e} for rate, e in sorted(tried.items())]
+
+
+Setting = dict[str, Any]
+"""Samples per pixel "spp", a learning "rate", and more."""
+
+
+def grid(**values: Sequence[Any]) -> list[Setting]:
+    """All settings of a grid, {name: values}."""
+    return [dict(zip(values, each, strict=True)) for each in itertools.product(*values.values())]
+
+
+def tune(name: str, settings: Sequence[Setting], error: Callable[[Setting], float]) -> tuple[Setting, list[Setting]]:
+    """The setting of least error, and all that were tried, with their errors."""
+    tried = []
+    for setting in settings:
+        found = error(setting)
+        tried.append({**setting, "error": found if math.isfinite(found) else 1e9})
+        print(f"  {name} {setting}: {found:.4f}", flush=True)
+    return settings[min(range(len(tried)), key=lambda n: tried[n]["error"])], tried
 
 
 def race(

@@ -95,6 +95,34 @@ def priors(problem: ur.Problem, values: Mapping[str, Any]) -> Any:
     return total
 
 
+class _Descent:
+    """Adam on a problem's parameters from its start; `step` takes one step with the given views and returns the loss."""
+
+    def __init__(self, problem: ur.Problem, stock: StockViews, rates: Mapping[str, float]):
+        self.problem, self.stock, self.rates = problem, stock, rates
+        self.optimizer = mi.ad.Adam(lr=1.0)
+        for key, value in problem.initial().items():
+            self.optimizer[key] = value
+        self.set_rates(1.0)
+        stock.write(self.optimizer)
+
+    def set_rates(self, factor: float) -> None:
+        self.optimizer.set_learning_rate({key: max(rate * factor, 1e-9) for key, rate in self.rates.items()})
+
+    def step(self, seed: int, number: int, views: Iterable[int], spp: int) -> float:
+        loss = self.stock.backward(seed, number, views, spp, priors(self.problem, self.optimizer))
+        self.optimizer.step()
+        for key in self.rates:
+            self.optimizer[key] = project(self.optimizer[key], *self.problem.unknowns[key].bounds)
+        self.stock.write(self.optimizer)
+        found = float(np.array(dr.detach(loss)).reshape(-1)[0])
+        dr.sync_thread()
+        return found
+
+    def values(self) -> dict[str, Any]:
+        return {key: mi.TensorXf(dr.detach(self.optimizer[key])) for key in self.rates}
+
+
 def stock_loop(
     problem: ur.Problem,
     spp: int,
@@ -120,43 +148,22 @@ def stock_loop(
         integrator: see `StockViews`.
         views: random views a step, with one rate for all parameters; None for all views, and the problem's own rates where it has some.
     """
-    stock = StockViews(problem, integrator)
-    start, count, rng = problem.initial(), len(problem.views), np.random.default_rng(seed)
+    stock, count, rng = StockViews(problem, integrator), len(problem.views), np.random.default_rng(seed)
     own = {} if views else problem.learning_rates
-    history: list[dict[str, Any]] = []
-    for warm in (True, False):
-        rates = {key: own.get(key, learning_rate) for key in start}
-        optimizer = mi.ad.Adam(lr=learning_rate)
-        for key, value in start.items():
-            optimizer[key] = value
-        optimizer.set_learning_rate(rates)
-        stock.write(optimizer)
-        clock, step = 0.0, 0
-        while clock < seconds and step < ((count if views else 2) if warm else steps):
-            began = timer()
-            drawn = [step] if warm else rng.choice(count, min(views or count, count), replace=False).tolist()
-            chosen = drawn if views else range(count)
-            loss = stock.backward(seed, step, chosen, spp, priors(problem, optimizer))
-            if fall:
-                factor = fall(min(max(clock / seconds, step / steps), 1.0))
-                optimizer.set_learning_rate({key: max(rate * factor, 1e-9) for key, rate in rates.items()})
-            optimizer.step()
-            for key in start:
-                low, high = problem.unknowns[key].bounds
-                optimizer[key] = project(optimizer[key], low, high)
-            stock.write(optimizer)
-            value = float(np.array(dr.detach(loss)).reshape(-1)[0])
-            dr.sync_thread()
-            clock += timer() - began
-            step += 1
-            if not warm and (step % every == 0 or clock >= seconds or step >= steps):
-                now = {key: mi.TensorXf(dr.detach(optimizer[key])) for key in start}
-                history.append(
-                    {
-                        "step": step - 1,
-                        "seconds": clock,
-                        "loss": value,
-                        "parameter_error": (error or problem.parameter_error)(now),
-                    }
-                )
+    rates = {key: own.get(key, learning_rate) for key in problem.initial()}
+    warm = _Descent(problem, stock, rates)
+    for step in range(count if views else 2):
+        warm.step(seed, step, [step] if views else range(count), spp)
+    descent, clock, step, history = _Descent(problem, stock, rates), 0.0, 0, []
+    while clock < seconds and step < steps:
+        began = timer()
+        if fall:
+            descent.set_rates(fall(min(max(clock / seconds, step / steps), 1.0)))
+        chosen = rng.choice(count, min(views, count), replace=False).tolist() if views else range(count)
+        loss = descent.step(seed, step, chosen, spp)
+        clock += timer() - began
+        step += 1
+        if step % every == 0 or clock >= seconds or step >= steps:
+            entry = {"step": step - 1, "seconds": clock, "loss": loss}
+            history.append(entry | {"parameter_error": (error or problem.parameter_error)(descent.values())})
     return history

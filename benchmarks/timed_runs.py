@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
+from benchmarks.image_errors import Pair, picture_error
 from benchmarks.peers.drivers.recorder import BudgetSpentError, Recorder
 from benchmarks.runner.timing import work_time
 
@@ -74,10 +75,8 @@ def measured(problem: ur.Problem, found: Sequence[tuple[float, Mapping[str, np.n
 
 
 def _picture_error(problem: ur.Problem, values: Mapping[str, np.ndarray]) -> float:
-    """Of two halves of the samples, so that their noise does not count."""
-    found = 0.0
-    for index, view in enumerate(problem.views):
+    def pair(index: int) -> Pair:
         one, two = (ur.render(problem, values, index, spp=_PICTURE_SPP, seed=seed) for seed in (1, 2))
-        reference = np.asarray(view.reference)
-        found += float(np.mean((one - reference) * (two - reference)))
-    return float(np.sqrt(max(found / len(problem.views), 0.0)))
+        return one, two, np.asarray(problem.views[index].reference)
+
+    return picture_error(map(pair, range(len(problem.views))))

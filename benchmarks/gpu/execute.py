@@ -30,18 +30,8 @@ def words(part: Slice, command: Command, folder: Folder) -> list[str]:
         case "doctor":
             return [sys.executable, "-m", "unrender", "doctor", *arguments]
         case "tests":
-            own = [
-                "-q",
-                "-n",
-                "auto",
-                "--dist",
-                "loadfile",
-                "-p",
-                "benchmarks.gpu.outcomes",
-                "--outcomes",
-                str(where / "tests.jsonl"),
-            ]
-            return [sys.executable, "-m", "pytest", *own, *arguments]
+            own = ["-q", "-n", "auto", "--dist", "loadfile", "-p", "benchmarks.gpu.outcomes", "--outcomes"]
+            return [sys.executable, "-m", "pytest", *own, str(where / "tests.jsonl"), *arguments]
         case name:
             beside = _relative(where / name)
             return [sys.executable, "-m", "benchmarks", name, *arguments, "--out", beside]

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-import itertools
-import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -21,7 +19,7 @@ from benchmarks import figures, markdown
 from benchmarks.internals import dr, mi, scene_description
 from benchmarks.own_loop import loops
 from benchmarks.own_loop.loops import Clock, Task
-from benchmarks.races import TUNING_SEED, median_and_range
+from benchmarks.races import TUNING_SEED, Setting, grid, median_and_range, tune
 from benchmarks.runner.records import Record
 
 QUICK = {
@@ -59,18 +57,6 @@ def contenders() -> dict[str, Callable[..., None]]:
     }
 
 
-def tune(loop: Callable[..., None], task: Task, loss: str, seconds: float, spp: Any, rates: Any) -> dict[str, Any]:
-    """The samples per pixel and the learning rate of least error at the end."""
-    tried = []
-    for samples, rate in itertools.product(spp, rates):
-        clock = Clock(seconds, task.error)
-        loop(task, samples, rate, loss, TUNING_SEED, clock)
-        error = clock.history[-1][1]
-        tried.append({"spp": samples, "rate": rate, "error": error if math.isfinite(error) else math.inf})
-        print(f"  {loss} {samples} spp, rate {rate:g}: {tried[-1]['error']:.4f} in {clock.steps}", flush=True)
-    return min(tried, key=lambda found: found["error"])
-
-
 def run(
     loss: tuple[str, ...] = ("l2", "l1"),
     seconds: float = 6.0,
@@ -98,8 +84,13 @@ def run(
     for kind in loss:
         tuned = {}
         for name in ("drjit", "drjit, changed"):
-            print(name, flush=True)
-            tuned[name] = tune(every[name], task, kind, tuning_seconds, spp, rates)
+
+            def end(setting: Setting, loop: Callable[..., None] = every[name], kind: str = kind) -> float:
+                clock = Clock(tuning_seconds, task.error)
+                loop(task, setting["spp"], setting["rate"], kind, TUNING_SEED, clock)
+                return clock.history[-1][1]
+
+            tuned[name], _ = tune(f"{kind} {name}", grid(spp=spp, rate=rates), end)
         entries: dict[str, Any] = {name: {**tuned[name.replace("torch", "drjit")], "runs": []} for name in every}
         for seed in range(seeds):
             for name, loop in every.items():

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import figures, markdown
+from benchmarks.image_errors import picture_error
 from benchmarks.internals import mi
 from benchmarks.peers import scenes
 from benchmarks.races import TUNING_SEED, first_at, search
@@ -94,14 +95,13 @@ class Judge:
         for key, value in values.items():
             self._parameters[key] = mi.TensorXf(np.ascontiguousarray(value.reshape(self._truth[key].shape)))
         self._parameters.update()
-        square = 0.0
-        for n, picture in enumerate(self._pictures):  # two halves of the samples, so that their noise does not count
-            one, two = (
-                np.array(mi.render(self._scene, sensor=n, integrator=self._path, spp=_PICTURE_SPP, seed=seed))
-                for seed in (1, 2)
+
+        def rendered(view: int, seed: int) -> np.ndarray:
+            return np.array(
+                mi.render(self._scene, sensor=view, integrator=self._path, spp=_PICTURE_SPP, seed=seed), np.float32
             )
-            square += float(np.mean((one - picture) * (two - picture)))
-        return float(np.sqrt(max(square, 0.0)))
+
+        return picture_error((rendered(n, 1), rendered(n, 2), picture) for n, picture in enumerate(self._pictures))
 
     def run(self, found: Points, steps: int) -> dict[str, Any]:
         """The record of a run."""

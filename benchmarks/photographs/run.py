@@ -81,14 +81,12 @@ class Judge:
         return self.psnr(lambda view: np.asarray(ur.render(self.problem, values, view=view, spp=self.spp)))
 
 
-def stock(
-    problem: ur.Problem, spp: int, rate: float, falling: bool, seconds: float, views: int, seed: int
-) -> tuple[dict, int]:
-    """The usual loop over random views; its values, and how many steps it took. A step with each view, to warm up, does not count.
+def stock(problem: ur.Problem, spp: int, rate: float, falling: bool, seconds: float, seed: int) -> tuple[dict, int]:
+    """The usual loop over two random views a step; its values and its number of steps, without the warm-up of a step with each view.
 
     With `falling`, the rate falls exponentially, to a twentieth at the end.
     """
-    options: dict[str, Any] = {"fall": (lambda done: LAST_RATE**done) if falling else None, "views": views}
+    options: dict[str, Any] = {"fall": (lambda done: LAST_RATE**done) if falling else None, "views": 2}
     options["error"] = lambda values: {key: np.array(value) for key, value in values.items()}
     options["timer"] = time.process_time
     (end,) = stock_loop(problem, spp, rate, seconds, seed=seed, every=sys.maxsize, **options)
@@ -122,7 +120,6 @@ def run(
     spp: tuple[int, ...] = (4,),
     rates: tuple[float, ...] = (0.003, 0.01),
     falling: tuple[float, ...] = (),
-    stock_views: int = 2,
     seeds: int = 1,
     final_spp: int = 64,
 ) -> Iterator[dict[str, Any]]:
@@ -135,7 +132,6 @@ def run(
         spp: of the stock loop, tried with each of the rates
         rates: of the stock loop, that stay
         falling: likewise, that fall to a twentieth
-        stock_views: views a step of the stock loop
         final_spp: of the pictures that are measured
     """
     dr.set_thread_count(1)
@@ -166,7 +162,7 @@ def run(
             projection = Projection(judge.folder, problem, texture)
             found = {"psnr": [judge.psnr(lambda view, by=projection, of=judge: by.picture(of.problem, view))]}
         elif who in ("stock", "stock-normals"):
-            found = tuned(problem, judge, settings, seconds, stock_views, seeds)
+            found = tuned(problem, judge, settings, seconds, seeds)
         else:
             for seed in range(seeds):
                 if who in ("stages", "stages-flat"):
@@ -194,13 +190,13 @@ def run(
 
 
 def tuned(
-    problem: ur.Problem, judge: Judge, settings: list[tuple[int, float, bool]], seconds: float, views: int, seeds: int
+    problem: ur.Problem, judge: Judge, settings: list[tuple[int, float, bool]], seconds: float, seeds: int
 ) -> dict[str, Any]:
     """The stock loop with each of the settings, samples, rate and whether that falls; then further seeds of the best."""
     tried: list[dict[str, Any]] = []
     pictures = []
     for samples, rate, falling in settings:
-        values, steps = stock(problem, samples, rate, falling, seconds, views, 0)
+        values, steps = stock(problem, samples, rate, falling, seconds, 0)
         tried.append({"spp": samples, "rate": rate, "falling": falling, "steps": steps, "psnr": judge.of(values)})
         pictures.append(judge.picture)
         print("stock", samples, rate, "falling" if falling else "", steps, np.mean(tried[-1]["psnr"]), flush=True)
@@ -209,7 +205,7 @@ def tuned(
     found: dict[str, Any] = {"psnr": [best["psnr"]], "steps": [best["steps"]], "tried": tried}
     found["settings"] = {key: best[key] for key in ("spp", "rate", "falling")}
     for seed in range(1, seeds):
-        values, steps = stock(problem, best["spp"], best["rate"], best["falling"], seconds, views, seed)
+        values, steps = stock(problem, best["spp"], best["rate"], best["falling"], seconds, seed)
         found["psnr"].append(judge.of(values))
         found["steps"].append(steps)
     return found

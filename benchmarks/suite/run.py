@@ -13,7 +13,6 @@ higher_order.table2, since the loop has no gradients of them.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -26,7 +25,7 @@ import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.fixed_point import applies, fixed_point
 from benchmarks.internals import dr, insensitive
-from benchmarks.races import TUNING_SEED, Recorder
+from benchmarks.races import TUNING_SEED, Recorder, Setting, grid, tune
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
 from benchmarks.stock_loop import stock_loop
@@ -98,25 +97,10 @@ def loop(
     setting: dict[str, Any],
 ) -> Points:
     """A run of the stock loop."""
-    fall = ur.schedules.Cosine(1) if setting["falling"] else None
-    history = stock_loop(
-        problem, setting["spp"], setting["rate"], seconds, seed=seed, every=every, fall=fall, error=error
-    )
+    fall: Any = ur.schedules.Cosine(1) if setting["falling"] else None
+    options = {"seed": seed, "every": every, "fall": fall, "error": error}
+    history = stock_loop(problem, setting["spp"], setting["rate"], seconds, **options)
     return [(h["seconds"], h["parameter_error"]) for h in history]
-
-
-def tune(
-    problem: ur.Problem, error: Any, seconds: float, every: int, spp: Any, rates: Any
-) -> tuple[dict[str, Any], list[Any]]:
-    """The loop's setting of least error at the end, and all that were tried."""
-    tried = []
-    for samples, rate, falling in itertools.product(spp, rates, (False, True)):
-        setting = {"spp": samples, "rate": rate, "falling": falling}
-        end = loop(problem, error, seconds, TUNING_SEED, every, setting)[-1][1]
-        tried.append({**setting, "error": end if math.isfinite(end) else 1e9})
-        print(f"  {problem.name}: loop {setting_text(setting)}: {end:.4f}", flush=True)
-    best = min(tried, key=lambda found: found["error"])
-    return {key: best[key] for key in ("spp", "rate", "falling")}, tried
 
 
 def tune_ours(
@@ -184,9 +168,6 @@ def run(
     seeds: int = 3,
     spp: tuple[int, ...] = (4, 16, 64),
     rates: tuple[float, ...] = (0.005, 0.02, 0.05),
-    resolution: int = 64,
-    texture: int = 64,
-    reference_spp: int = 4096,
     gallery_reference_spp: int | None = None,
     gallery_resolution: int | None = None,
     every: int = 2,
@@ -205,9 +186,6 @@ def run(
         seeds: runs of each side
         spp: of the loop, to try
         rates: of the loop, to try
-        resolution: of pictures of the scenes of others
-        texture: side of their textures
-        reference_spp: of their references
         gallery_reference_spp: of the gallery's references, none for its own
         gallery_resolution: film size of the gallery's problems, none for its own
         every: steps of the loop between errors
@@ -227,10 +205,14 @@ def run(
         raise ur.InputError(f"--no-retune: the record has no setting of the loop for {', '.join(lacking)}")
     found: dict[str, Any] = {"problems": {}}
     for name in names:
-        opened = scenes.problem(name, assets, resolution, texture, reference_spp, **options)
+        opened = scenes.problem(name, assets, **options)
         error = error_of(opened)
         if retune:
-            setting, tried = tune(opened, error, seconds, every, spp, rates)
+
+            def end(setting: Setting, opened: ur.Problem = opened, error: Any = error) -> float:
+                return loop(opened, error, seconds, TUNING_SEED, every, setting)[-1][1]
+
+            setting, tried = tune(f"{name}: loop", grid(spp=spp, rate=rates, falling=(False, True)), end)
         else:
             setting, tried = known[name]["setting"], known[name]["tried"]
         theirs, mine, details = [], [], {}

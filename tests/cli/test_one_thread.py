@@ -12,13 +12,12 @@ import numpy as np
 import mitsuba as mi
 import unrender as ur
 from unrender.backend import variant
-from unrender.app.exporting.ready_made import as_bitmap, write_bitmap
 from unrender.io import images
 
 folder = sys.argv[1]
 variant.use_threads(1)
 sky = np.random.default_rng(1).uniform(0.1, 1.0, (256, 512, 3))
-write_bitmap(as_bitmap(sky), folder + "/sky.exr")
+images.write(sky, folder + "/sky.exr")
 assert np.allclose(images.read(folder + "/sky.exr").values, sky, atol=1e-2)
 scene = {
     "type": "scene",

@@ -63,7 +63,7 @@ def _problem_files() -> Files:
     place = Path(tempfile.mkdtemp(prefix="fuzz"))
     write_scene(place, scene(body='<shape type="obj" id="mesh"><string name="filename" value="mesh.obj"/></shape>'))
     text = f"""name = "a"\nscene = "scene.xml"\nmax_depth = 3\nloss = {{ type = "Huber", delta = 0.1 }}\n[[parameters]]\nkey = "{KEY}"
-initial = [0.5, 0.4, 0.3]\nbounds = [0.0, 1.0]\nlearning_rate = 0.01\nparameterisation = "logit"\ntruth = 0.2
+initial = [0.5, 0.4, 0.3]\nbounds = [0.0, 1.0]\nlearning_rate = 0.01\nparameterisation = "log"\ntruth = 0.2
 [[views]]\nreference = "photo.npy"\nweight = 1.0\nmask = "mask.npy"\nsensor = 0\n"""
     (place / "problem.toml").write_text(text)
     (place / "mesh.obj").write_bytes(_obj())

@@ -764,7 +764,7 @@ def test_a_parameterised_run_comes_to_its_resolution_and_repeats_when_resumed(
     estimator: Any, optimizer: Any, states: str, tmp_path: Path
 ) -> None:
     def fresh() -> ur.Problem:
-        return problem({"steps": (3, 6), "states": states}, parameterisation="logit")
+        return problem({"steps": (3, 6), "states": states}, parameterisation="log")
 
     whole = ur.optimize(fresh(), estimator, optimizer, steps=12)
     assert whole.parameters[KEY].shape == TRUTH.shape

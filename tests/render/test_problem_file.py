@@ -204,21 +204,21 @@ MISTAKES = [
     ),
     (
         "[[views]]",
-        "bounds = [-inf, 1]\nparameterisation = 'logit'\n[[views]]",
+        "bounds = [-inf, 1]\nparameterisation = 'log'\n[[views]]",
         6,
-        "parameters[0].parameterisation: logit needs a lower and an upper bound, got bounds open to 1; give bounds, such as [0, 1]",
+        "parameters[0].parameterisation: log needs a lower bound, got bounds open to 1; give bounds, such as [0, inf]",
     ),
     (
         "[[views]]",
         "parameterisation = 3\n[[views]]",
         5,
-        'parameters[0].parameterisation: expected "identity", "log", "logit", "softplus" or',
+        'parameters[0].parameterisation: expected "identity" or "log", got 3',
     ),
     (
         "[[views]]",
-        "parameterisation = 'softplus(x)'\n[[views]]",
+        "parameterisation = 'log(x)'\n[[views]]",
         5,
-        "parameters[0].parameterisation: expected a number, got 'x'",
+        "parameters[0].parameterisation: expected log(), got 'log(x)'",
     ),
     ("[[views]]", "preconditioner = 'LargeSteps'\ninitial = 'no.png'\n[[views]]", 6, "parameters[0].initial: "),
     (

@@ -9,7 +9,7 @@ machine's speed may change between runs, the time of a path is measured in turns
 
 `--steps 5000` races by steps, with rates that fall along half a cosine; `time` is then that in which each method first
 reaches the least error that all reach, over that of uniform mini-batches; these races have entries of their own. Large
-pictures: `--resolution 1024`; many views: `--views 16`. `--levels` races one level against five at equal steps in
+pictures: `--resolution 1024`. `--levels` races one level against five at equal steps in
 `plain-and-textured`: the paper's form, as Fig. 5 has it, and the default.
 """
 
@@ -142,7 +142,6 @@ def run(
     resolution: int | None = None,
     count: int | None = None,
     steps: int | None = None,
-    views: int | None = None,
     texture_resolution: int | None = None,
     only: tuple[str, ...] = (),
     part: tuple[str, ...] = ("race", "cost"),
@@ -156,14 +155,13 @@ def run(
         resolution: film size, for GPUs
         count: pixels a step
         steps: of every run, in place of its seconds, with falling rates
-        views: how many, where the problem takes them
         texture_resolution: texels a side, for GPUs
         only: methods to run and to time; the others' figures stay
         part: measured; the other's figures stay
         rounds: of turns of the cost
         levels: race one level against five, by steps; the rest of the record stays
     """
-    given = {"resolution": resolution, "views": views, "texture_resolution": texture_resolution}
+    given = {"resolution": resolution, "texture_resolution": texture_resolution}
     given = {key: value for key, value in given.items() if value}
     if levels:
         races = race_levels(count or 512, steps or 400, seeds, only, {**FINE, **given})

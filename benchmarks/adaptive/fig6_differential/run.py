@@ -27,6 +27,8 @@ from unrender.gallery import parts
 
 ALPHAS = (0.02, 0.05, 0.15, 0.5)
 KINDS = ("ordinary", "differential")
+SPP = 4
+"""Of the gradients whose variance is measured, leave-one-out."""
 WARM = 4
 SCHEMES = ("uniform", "adaptive")
 DESCENTS = {"plate": (0.2, 0.05), "rough-box": (0.3, 0.1)}
@@ -138,13 +140,7 @@ def descents(
                 "budget": [steps, count],
                 "along": np.round(np.mean(runs, axis=0), 4).tolist(),
             }
-            print(
-                problem.name,
-                scheme,
-                kind,
-                {k: v for k, v in found[f"{scheme}, {kind}"].items() if k != "along"},
-                flush=True,
-            )
+            print(problem.name, scheme, kind, last, flush=True)
     return found
 
 
@@ -152,7 +148,6 @@ def run(
     scene: tuple[str, ...] = ("plate", "ball", "mirror-trio", "rough-box"),
     alphas: tuple[float, ...] = ALPHAS,
     runs: int = 96,
-    spp: int = 4,
     resolution: int = 32,
     count: int = 128,
     rate: float = 0.003,
@@ -169,7 +164,6 @@ def run(
         scene: which
         alphas: where the variance is measured
         runs: gradients of each variance
-        spp: of these gradients, leave-one-out
         resolution: of the films
         count: pixels a step of the descents, two paths each
         rate: of Adam
@@ -187,7 +181,7 @@ def run(
             at = {problem.parameters[0].key: problem.renderer.array(np.full((), alpha, np.float32))}
             point: dict[str, Any] = {"alpha": alpha}
             for measured, of in (("derivative", image_derivative), ("loss", loss_gradient)):
-                point[measured] = compared({kind: of(problem, at, kind, spp) for kind in KINDS}, runs)
+                point[measured] = compared({kind: of(problem, at, kind, SPP) for kind in KINDS}, runs)
             found["variance"][name].append(point)
             print(name, point, flush=True)
         if name in DESCENTS and "descents" in part:
@@ -201,7 +195,7 @@ def table(record: Record) -> str:
     s, variance = record["settings"], record["variance"]
     alphas = [f"{point['alpha']:g}" for point in next(iter(variance.values()))]
     parts = [
-        "{resolution}² pixels, {spp} paths each, {runs} gradients; differential over ordinary, by alpha.".format(**s)
+        f"{s['resolution']}² pixels, {SPP} paths each, {s['runs']} gradients; differential over ordinary, by alpha."
     ]
     kinds = {"derivative": "variance of the image's derivative", "loss": "variance of the loss's gradient"}
     for of, label in kinds.items():

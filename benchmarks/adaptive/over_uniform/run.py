@@ -14,7 +14,6 @@ where assets are given.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,28 +68,19 @@ def rough_box(reference_spp: int = 2048, resolution: int = 64) -> ur.Problem:
     return blank.replaced(views=[ur.View(np.mean(images, axis=0))])
 
 
-@dataclass(frozen=True)
-class Kept:
-    """An estimator that keeps the parameters and its state before some steps."""
+class Kept(ur.protocols.Callback):
+    """Parameters and the sampler's state before each of `STEPS`."""
 
-    inner: ur.PathGradient
-    at: tuple[int, ...]
-    before: dict[int, tuple[Tree, Any]] = field(default_factory=dict)
+    def __init__(self) -> None:
+        self.before: dict[int, tuple[Tree, Any]] = {}
 
-    @property
-    def provides(self) -> Any:
-        """See `Estimator.provides`."""
-        return self.inner.provides
+    def on_start(self, run: Any) -> None:
+        if run.step in STEPS:
+            self.before[run.step] = dict(run.parameters), run.state.estimator.pixels
 
-    def init(self, problem: ur.Problem, parameters: Tree) -> Any:
-        """See `Estimator.init`."""
-        return self.inner.init(problem, parameters)
-
-    def estimate(self, problem: ur.Problem, parameters: Tree, state: Any, key: Key) -> Any:
-        """See `Estimator.estimate`."""
-        if state.step in self.at:
-            self.before[state.step] = parameters, state
-        return self.inner.estimate(problem, parameters, state, key)
+    def on_step(self, run: Any, record: Any) -> None:
+        del record
+        self.on_start(run)
 
 
 def rows(problem: ur.Problem, sampler: PixelSampler, at: Tree, state: Any, runs: int, seed: int) -> np.ndarray:
@@ -147,13 +137,13 @@ def point(
     return found
 
 
-def descent(problem: ur.Problem, label: str, settings: dict[str, int], seed: int) -> list[dict[str, Any]]:
+def descent(problem: ur.Problem, label: str, settings: dict[str, int]) -> list[dict[str, Any]]:
     """Ratios at each of `STEPS`."""
     sampler = SAMPLERS[label](settings["count"])
-    kept = Kept(ur.PathGradient(pixels=sampler, spp=2), STEPS)
-    ur.optimize(problem, kept, ur.optimizers.Adam(0.01), steps=STEPS[-1] + 1, seed=seed)
+    kept, estimator = Kept(), ur.PathGradient(pixels=sampler, spp=2)
+    ur.optimize(problem, estimator, ur.optimizers.Adam(0.01), steps=STEPS[-1], callbacks=[kept])
     return [
-        point(problem, sampler, at, state.pixels, settings, step, label == "adaptive")
+        point(problem, sampler, at, state, settings, step, label == "adaptive")
         for step, (at, state) in sorted(kept.before.items())
     ]
 
@@ -174,12 +164,10 @@ def summarize(record: dict[str, Any]) -> dict[str, Any]:
 def run(
     problem: tuple[str, ...] = tuple(GALLERY),
     assets: Path | None = None,
-    foreign: tuple[str, ...] = FOREIGN,
     sampler: tuple[str, ...] = tuple(SAMPLERS),
     count: int = 1000,
     runs: int = 128,
     paths: int = 1 << 17,
-    seed: int = 0,
     gallery_reference_spp: int | None = None,
 ) -> Iterator[dict[str, Any]]:
     """A part per problem.
@@ -187,17 +175,15 @@ def run(
     Args:
         problem: of the gallery, and "rough-box"
         assets: folder of the scenes of others
-        foreign: of others, where assets are given
         sampler: that descend
         count: pixels a step, two paths each
         runs: gradients of each variance
         paths: of each measurement by paths, about
-        seed: of the descents
         gallery_reference_spp: of the gallery's references, none for its own
     """
     options = {} if gallery_reference_spp is None else {"reference_spp": gallery_reference_spp}
-    for name in (*problem, *(foreign if assets is not None else ())):
-        if name in FOREIGN and assets is not None:
+    for name in (*problem, *(FOREIGN if assets is not None else ())):
+        if assets is not None and name in FOREIGN:
             opened = foreign_problem(name, assets, 64, 64, 1024)
         elif name == "rough-box":
             opened = rough_box(**options)
@@ -205,7 +191,7 @@ def run(
             opened = ur.gallery.problem(name, **GALLERY[name], **options)
         found: dict[str, Any] = {}
         for label in sampler:
-            found[label] = descent(opened, label, {"count": count, "runs": runs, "paths": paths}, seed)
+            found[label] = descent(opened, label, {"count": count, "runs": runs, "paths": paths})
             shown = [
                 f"{at['step']}: {at['ratio'][0]:.2f} {at['ratio'][1]:.2f} ± {at['error'][1]:.2f}" for at in found[label]
             ]

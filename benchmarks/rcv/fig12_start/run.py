@@ -17,6 +17,8 @@ from benchmarks.runner.records import Record
 from unrender.statistics import welford
 
 RENDERS = False
+ALPHAS = (0.9, 0.99, 0.999)
+"""Decays."""
 QUICK = {"values": 20, "sequences": 200}
 
 
@@ -53,16 +55,15 @@ def forgotten_after(alpha: float, name: str) -> int:
     return count
 
 
-def run(alphas: tuple[float, ...] = (0.9, 0.99, 0.999), values: int = 200, sequences: int = 4000) -> dict[str, Any]:
+def run(values: int = 200, sequences: int = 4000) -> dict[str, Any]:
     """Every decay, on the same sequences.
 
     Args:
-        alphas: decays
         values: of a sequence
     """
     x = np.random.default_rng(0).normal(size=(sequences, values))
     decays: dict[str, Any] = {}
-    for alpha in alphas:
+    for alpha in ALPHAS:
         entry: dict[str, Any] = {}
         for name, found in means(x, alpha).items():
             weights = [WEIGHTS[name](alpha, n) for n in range(1, values + 1)]

@@ -44,6 +44,8 @@ class UpdatedBeforeUse(ur.images.RecursiveControlVariate):
 
 
 ORDERS = {"before": UpdatedBeforeUse(), "after": ur.images.RecursiveControlVariate()}
+HALF_LIFE = 8.0
+"""Steps in which the moving path halves the distance that is left."""
 PILOT_SEEDS = (1_000_001, 1_000_002)
 QUICK = {"resolution": 8, "spp": 2, "steps": 6, "runs": 3, "reference_spp": 128}
 
@@ -109,23 +111,14 @@ def measure(
 
 
 def run(
-    resolution: int = 32,
-    spp: int = 4,
-    steps: int = 32,
-    runs: int = 32,
-    half_life: float = 8.0,
-    reference_spp: int = 8192,
+    resolution: int = 32, spp: int = 4, steps: int = 32, runs: int = 32, reference_spp: int = 8192
 ) -> dict[str, Any]:
-    """Bias and variance of every method on both paths.
-
-    Args:
-        half_life: steps in which the moving path halves the distance that is left
-    """
+    """Bias and variance of every method on both paths."""
     problem = ur.gallery.problem(
         "indirect-room", resolution=resolution, texture_resolution=resolution, reference_spp=16
     )
     chosen = sorted({*(2**k for k in range(1, 12) if 2**k < steps - 1), steps - 1})
-    paths = {"still": [problem.initial()] * steps, "drift": geometric(problem, steps, half_life)}
+    paths = {"still": [problem.initial()] * steps, "drift": geometric(problem, steps, HALF_LIFE)}
     found = {name: measure(problem, path, spp, runs, chosen, reference_spp) for name, path in paths.items()}
     return {"paths": found}
 

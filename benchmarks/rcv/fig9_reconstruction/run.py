@@ -24,7 +24,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import ImageEstimator, available_denoiser
-from benchmarks.races import TUNING_SEED, Entrant, median_and_range, race, scaled, total_error
+from benchmarks.races import TUNING_SEED, Entrant, Setting, median_and_range, race, scaled, total_error, tune
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import stock_loop
@@ -89,20 +89,6 @@ def descend(
     return [(h["seconds"], total_error(h["parameter_error"], start)) for h in history if "parameter_error" in h]
 
 
-def tune(
-    problem: ur.Problem, method: str, grid: list[tuple[int, float]], seconds: float, processor: bool
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """The best of the grid and all that were tried; where there is nothing to choose, no error and nothing tried."""
-    if len(grid) == 1:
-        return {"spp": grid[0][0], "rate": grid[0][1], "error": None}, []
-    tried: list[dict[str, Any]] = []
-    for spp, rate in grid:
-        error = descend(problem, method, spp, rate, seconds, TUNING_SEED, processor)[-1][1]
-        tried.append({"spp": spp, "rate": rate, "error": error})
-        print(f"{problem.name} {method} spp {spp} rate {rate}: {error:.3f}", flush=True)
-    return min(tried, key=lambda t: t["error"]), tried
-
-
 def compare(
     name: str, loss: str, seconds: float, seeds: int, options: dict[str, Any], chosen: Grid | None, processor: bool
 ) -> dict[str, Any]:
@@ -115,8 +101,13 @@ def compare(
     for method in (*METHODS, *(DENOISED if processor else ())):
         # The stock loop takes plain's spp: its estimate is the same but for the sample groups.
         spp = (methods["plain"]["spp"],) if method == "stock" else counts.get(method, ())
-        grid = GRID[method] if processor else list(itertools.product(spp, RATES))
-        best, tried = tune(problem, method, chosen.get(method, grid) if chosen else grid, seconds, processor)
+        usual = GRID[method] if processor else list(itertools.product(spp, RATES))
+        settings = [{"spp": n, "rate": rate} for n, rate in (chosen or {}).get(method, usual)]
+
+        def end(setting: Setting, method: str = method) -> float:
+            return descend(problem, method, **setting, seconds=seconds, seed=TUNING_SEED, processor=processor)[-1][1]
+
+        best, tried = (settings[0], []) if len(settings) == 1 else tune(f"{name} {method}", settings, end)
         methods[method] = {**best, "tried": tried, "runs": []}
     for seed in range(seeds):
         for method, entry in methods.items():

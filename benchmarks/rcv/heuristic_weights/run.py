@@ -27,11 +27,11 @@ RATE = 0.02
 QUICK = {"resolution": 8, "spp": 2, "steps": 9, "runs": 3, "reference_spp": 64}
 
 
-def to_and_fro(problem: ur.Problem, steps: int, period: int) -> list[Tree]:
-    """From the initial values to the truth and back, as a cosine of so many steps."""
+def to_and_fro(problem: ur.Problem, steps: int) -> list[Tree]:
+    """From the initial values to the truth and back, as a cosine of 64 steps."""
     start, end, path = problem.initial(), truth(problem), []
     for step in range(steps):
-        share = 0.5 - 0.5 * np.cos(2 * np.pi * step / period)
+        share = 0.5 - 0.5 * np.cos(2 * np.pi * step / 64)
         path.append({key: x + (end[key] - x) * arrays.scalar(float(share), x) for key, x in start.items()})
     arrays.evaluate(path)
     return path
@@ -67,17 +67,13 @@ def measure(problem: ur.Problem, path: Sequence[Tree], spp: int, runs: int, refe
 
 
 def run(
-    resolution: int = 24, spp: int = 4, steps: int = 129, runs: int = 16, period: int = 64, reference_spp: int = 4096
+    resolution: int = 24, spp: int = 4, steps: int = 129, runs: int = 16, reference_spp: int = 4096
 ) -> dict[str, Any]:
-    """Both paths.
-
-    Args:
-        period: of the path to and fro, in steps
-    """
+    """Both paths."""
     problem = ur.gallery.problem("three-bodies", resolution=resolution, reference_spp=1024)
     paths = {
         "descent": descent(problem, ur.PathGradient(spp=16), RATE, steps),
-        "to and fro": to_and_fro(problem, steps, period),
+        "to and fro": to_and_fro(problem, steps),
     }
     return {"paths": {name: measure(problem, path, spp, runs, reference_spp) for name, path in paths.items()}}
 

@@ -200,8 +200,5 @@ def table(record: Record) -> str:
 
 def plot(record: Record) -> figures.Figure:
     """Error of the surface over seconds."""
-    panels = {
-        name: {method: [run["curve"] for run in of["runs"]] for method, of in found.items() if "runs" in of}
-        for name, found in record["problems"].items()
-    }
+    panels = {name: figures.run_curves(found) for name, found in record["problems"].items()}
     return figures.curves(panels, "processor seconds", "surface error / at the start")

@@ -76,7 +76,6 @@ def run(
     views: int = 6,
     pixels: int = 2048,
     spp: int = 4,
-    strength: float = 4.0,
     rates: tuple[float, ...] = (0.03, 0.1),
     repetitions: int = 40,
     only: tuple[str, ...] = (),
@@ -89,7 +88,6 @@ def run(
         problems: of the gallery
         views: how many, of problems that let it be chosen
         pixels: of a mini-batch
-        strength: of the large steps
         rates: tried on a seed of its own
         repetitions: gradients that a variance is of
         only: ways of choosing pixels; left out, all
@@ -99,7 +97,7 @@ def run(
         options = {} if name == "shadow-art" else {"views": views}
         problem = ur.gallery.problem(name, resolution=resolution, subdivisions=subdivisions, **options)
         (key,) = problem.faces
-        problem = with_preconditioner(problem, ur.preconditioners.LargeSteps(strength), key)
+        problem = with_preconditioner(problem, ur.preconditioners.LargeSteps(4.0), key)
         what = "surface" if problem.has_truth else "pictures"
         label = name if (pixels, spp) == _USUAL else f"{name}, {pixels} pixels, {spp} spp"
         found[label] = {"judged by": what, "views": len(problem.views), "seconds": seconds, "methods": {}}
@@ -141,7 +139,7 @@ def table(record: Record) -> str:
 def plot(record: Record) -> figures.Figure | None:
     """Error of the surface over seconds, of the problems where it is known; None if there are none."""
     panels = {
-        name: {method: [run["curve"] for run in entry["runs"]] for method, entry in found["methods"].items()}
+        name: figures.run_curves(found["methods"])
         for name, found in record["problems"].items()
         if found["judged by"] == "surface"
     }

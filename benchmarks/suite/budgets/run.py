@@ -42,9 +42,6 @@ def run(
     seconds: tuple[float, ...] = (30.0,),
     seeds: int = 2,
     settings: int = 2,
-    resolution: int = 64,
-    texture: int = 64,
-    reference_spp: int = 4096,
     gallery_reference_spp: int | None = None,
     every: int = 4,
 ) -> Iterator[dict[str, Any]]:
@@ -57,16 +54,13 @@ def run(
         seconds: budgets
         seeds: runs of each side
         settings: of the loop, that were best in the suite's record
-        resolution: of pictures of the scenes of others
-        texture: side of their textures
-        reference_spp: of their references
         gallery_reference_spp: of the gallery's references, none for its own
         every: steps of the loop between errors
     """
     options = {} if gallery_reference_spp is None else {"reference_spp": gallery_reference_spp}
     for name in (*problem, *foreign):
         chosen = best_settings(name, settings)
-        opened = scenes.problem(name, assets, resolution, texture, reference_spp, **options)
+        opened = scenes.problem(name, assets, **options)
         error = error_of(opened)
         for budget in seconds:
             theirs = [[loop(opened, error, budget, seed, every, given) for seed in range(seeds)] for given in chosen]

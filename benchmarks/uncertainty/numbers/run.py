@@ -20,7 +20,7 @@ from benchmarks.uncertainty.run import LEVELS, quantiles
 
 MERGE = ("problems",)
 QUICK: dict[str, Any] = {"problems": ("lamp",), "seeds": 2, "folder_seeds": 1, "steps": 10}
-_SIZE, _DEPTH = 16, 4
+_SIZE, _DEPTH, _REFERENCE_SPP = 16, 4, 64
 _LIMITS = (1.0, 2.0)
 """Numbers of standard errors of which coverage is counted."""
 
@@ -110,7 +110,6 @@ def run(
     seeds: int = 100,
     folder_seeds: int = 20,
     steps: int = 16,
-    reference_spp: int = 64,
 ) -> Iterator[dict[str, Any]]:
     """Coverage of each problem.
 
@@ -119,14 +118,13 @@ def run(
         seeds: runs of each without a run folder
         folder_seeds: runs of each with one
         steps: of a run
-        reference_spp: samples per pixel of the references, whose noise counts
     """
     for name in problems:
         made, found = problem(name), {}
         for kind, number in (("without a folder", seeds), ("with a folder", folder_seeds)):
             scores = []
             for seed in range(number):
-                reference = ur.render(made, made.truth, spp=reference_spp, seed=1000 + seed)
+                reference = ur.render(made, made.truth, spp=_REFERENCE_SPP, seed=1000 + seed)
                 folder = records.scratch("uncertainty.numbers") if kind == "with a folder" else None
                 of = made.replaced(views=[ur.View(reference)])
                 result = ur.optimize(of, steps=steps, seed=seed, run_directory=folder, progress=False)
@@ -144,7 +142,7 @@ def table(record: Record) -> str:
         for kind, entry in kinds.items():
             shares = [f"{entry['inside'][limit]:.0%} ± {entry['error'][limit]:.0%}" for limit in entry["inside"]]
             rows.append([name, kind, "{} of {}".format(*entry["runs"]), *shares, f"{entry['std']:.2f}"])
-    text = "{steps} steps, references of {reference_spp} samples per pixel. A seed's numbers count as one draw of the errors shown."
+    text = f"{{steps}} steps, references of {_REFERENCE_SPP} samples per pixel. A seed's numbers count as one draw of the errors shown."
     head = "problem | runs | with standard errors | within 1 (68 % is right) | within 2 (95 %) | standard deviation of z (1)"
     return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
 

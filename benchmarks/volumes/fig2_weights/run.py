@@ -22,13 +22,13 @@ QUANTILES = [10, 50, 90]
 QUICK = {"steps": 6, "spp": 2, "runs": 3, "seeds": 1, "resolution": 8}
 
 
-def descents(problem: ur.Problem, steps: int, spp: int, rate: float, seeds: int) -> tuple[dict[str, Any], list[Any]]:
+def descents(problem: ur.Problem, steps: int, spp: int, seeds: int) -> tuple[dict[str, Any], list[Any]]:
     """{method: {parameter: (seeds, steps) of errors relative to the first}}, and the path of the first descent of "rcv"."""
     start, found, first = problem.parameter_error(problem.initial()), {}, []
     for method, image in METHODS.items():
         found[method] = {key: [] for key in start}
         for seed in range(seeds):
-            path = descent(problem, ur.PathGradient(image, spp=spp), rate, steps, seed)
+            path = descent(problem, ur.PathGradient(image, spp=spp), 0.01, steps, seed)
             first = first or path
             errors = [problem.parameter_error(state) for state in path]
             for key, begun in start.items():
@@ -58,9 +58,7 @@ def measure(problem: ur.Problem, path: list[Any], spp: int, runs: int) -> dict[s
     }
 
 
-def run(
-    steps: int = 250, spp: int = 4, rate: float = 0.01, runs: int = 16, seeds: int = 3, resolution: int = 32
-) -> dict[str, Any]:
+def run(steps: int = 250, spp: int = 4, runs: int = 16, seeds: int = 3, resolution: int = 32) -> dict[str, Any]:
     """Errors of the descents, weights and variance along the first.
 
     Args:
@@ -68,7 +66,7 @@ def run(
         seeds: descents
     """
     problem = ur.gallery.problem("three-bodies", resolution=resolution, reference_spp=4096)
-    errors, path = descents(problem, steps, spp, rate, seeds)
+    errors, path = descents(problem, steps, spp, seeds)
     return {"errors": errors, **measure(problem, path, spp, runs)}
 
 
@@ -81,7 +79,7 @@ def table(record: Record) -> str:
     ]
     keys = list(record["errors"]["rcv"])
     ends = [[method, *(_median(runs[key]) for key in keys)] for method, runs in record["errors"].items()]
-    text = "`three-bodies`, {resolution}², {spp} spp, L1, Adam at {rate:g}, {steps} steps; weights and variance over {runs} runs along one "
+    text = "`three-bodies`, {resolution}², {spp} spp, L1, Adam at 0.01, {steps} steps; weights and variance over {runs} runs along one "
     text += "descent's path."
     seeds = record["settings"]["seeds"]
     return markdown.blocks(

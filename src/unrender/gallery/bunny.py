@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
+from unrender.core.rotations import rotation
 from unrender.gallery import fields, meshes, parts, staging
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
@@ -56,10 +57,11 @@ class Bunny:
 def _animal(detail: int) -> list[meshes.Sheet]:
     """Return a sitting hare that looks along +x and slightly to the camera: body, haunch, chest, head, muzzle, two ears, a tail."""
 
-    def ball(centre: tuple[float, ...], radii: tuple[float, ...], tilt: float = 0.0) -> meshes.Sheet:
-        c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
-        turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) * np.array(radii)
-        return meshes.Sheet(_turned(meshes.ellipsoid(turned, np.array(centre), 16 * detail, 24 * detail)))
+    turn = rotation((0, 1, 0), np.radians(-35))  # from +x towards the camera
+
+    def ball(centre: tuple[float, float, float], radii: tuple[float, float, float], tilt: float = 0.0) -> meshes.Sheet:
+        axes = meshes.Ellipsoid(centre, radii, tilt).axes
+        return meshes.Sheet(meshes.ellipsoid(axes, np.array(centre), 16 * detail, 24 * detail) @ turn.T)
 
     return [
         ball((-0.05, 0.27, 0), (0.36, 0.25, 0.23), 12),
@@ -72,9 +74,3 @@ def _animal(detail: int) -> list[meshes.Sheet]:
         ball((0.2, 0.8, -0.08), (0.06, 0.22, 0.04), 18),
         ball((-0.42, 0.28, 0), (0.08, 0.08, 0.08)),
     ]
-
-
-def _turned(points: np.ndarray) -> np.ndarray:
-    """Rotate points about y by 35 degrees, from +x towards the camera."""
-    c, s = np.cos(np.radians(35)), np.sin(np.radians(35))
-    return points @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]]).T

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.core.rotations import rotation
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.described import load_described
 from unrender.rendering.mitsuba.description import load
@@ -300,8 +301,7 @@ class Ellipsoid:
     @property
     def axes(self) -> np.ndarray:
         """Half-axes as columns, (3, 3)."""
-        c, s = np.cos(np.radians(self.tilt)), np.sin(np.radians(self.tilt))
-        return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) * np.array(self.radii)
+        return rotation((0, 0, 1), np.radians(self.tilt)) * np.array(self.radii)
 
     def depth(self, points: np.ndarray) -> np.ndarray:
         """Return the depth of points (N, 3), (N,): positive inside, approximately the distance near the surface."""

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.registry import register
+from unrender.core.rotations import rotation
 from unrender.gallery import fields, meshes, parts, staging, textures
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
@@ -55,7 +56,7 @@ class Mug:
         pieces, glaze = _pieces(), parts.diffuse(0.75, 0.3, 0.15)
         if self.label:
             glaze = _labelled(glaze, pieces[0].positions, self.label)
-        turned = [meshes.Sheet(piece.positions @ _turn(_SIDE).T, origin=piece.origin) for piece in pieces]
+        turned = [meshes.Sheet(piece.positions @ rotation((0, 1, 0), _SIDE).T, origin=piece.origin) for piece in pieces]
         return {
             "type": "scene",
             "camera": parts.camera((0, 1.5, 3.6), (0, 0.42, 0), 30.0, self.resolution),
@@ -69,12 +70,6 @@ class Mug:
         """Return the angle relative to the truth, and the label, initially grey."""
         angle = staging.unknown("mug", "rotation", {"y": _HIDDEN - _SIDE})
         return (*angle, Parameter(_LABEL, initial=0.4)) if self.label else tuple(angle)
-
-
-def _turn(angle: float) -> np.ndarray:
-    """Return the rotation about y that maps +z to +x at a right angle."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
 def _labelled(glaze: dict[str, Any], cup: np.ndarray, texels: int) -> dict[str, Any]:
@@ -111,7 +106,7 @@ def _pieces() -> list[meshes.Sheet]:
     saucer = [(0, 0.005), (0.5, 0.005), (0.88, 0.075), (0.9, 0.09), (0.87, 0.09), (0.5, 0.03), (0, 0.03)]
     bend = np.linspace(np.radians(118), np.radians(-118), 24)
     path = np.stack([0.45 + 0.33 * np.cos(bend), 0.55 + 0.27 * np.sin(bend), 0 * bend], -1)
-    handle = meshes.sweep(path, 0.09, 16) @ _turn(-np.pi / 2).T
+    handle = meshes.sweep(path, 0.09, 16) @ rotation((0, 1, 0), -np.pi / 2).T
     return [
         meshes.Sheet(_lathe(cup, 40), origin=_CUP),
         meshes.Sheet(handle, origin=_ELSEWHERE),

@@ -12,12 +12,11 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, parts, staging, volumes
-from unrender.gallery.specification import reference
+from unrender.gallery.specification import views_of
 from unrender.losses import L2, Loss
 from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
 
 
 @register(name="nerf-volume", position=25)
@@ -60,10 +59,7 @@ class NerfVolume:
 
     def problem(self, name: str) -> Problem:
         """Return the problem: the volume's scene, with direct emission only, and references of the toy by Mitsuba's `path` integrator."""
-        true = load(self.target)
-        pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
-        views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
-        return Problem(self.scene, self.parameters(), views, self.loss, 1, name=name)
+        return Problem(self.scene, self.parameters(), views_of(load(self.target), self), self.loss, 1, name=name)
 
     def _stage(self) -> dict[str, Any]:
         sky = {"type": "constant", "radiance": parts.colour(0.3, 0.35, 0.4)}

@@ -35,6 +35,26 @@ def camera(origin: Vector, target: Vector, fov: float, resolution: int) -> dict[
     }
 
 
+def cameras_around(
+    angles: Sequence[float] | np.ndarray,
+    distance: float,
+    heights: Sequence[float],
+    target: Vector,
+    fov: float,
+    resolution: int,
+) -> dict[str, Any]:
+    """Return cameras "camera_0", "camera_1", ... around the y axis.
+
+    Args:
+        angles: angle of each camera in radians, from +z towards +x.
+        distance: distance of all from the axis.
+        heights: their y in turn: two are alternately lower and higher.
+        target, fov, resolution: see `camera`.
+    """
+    places = [(distance * np.sin(a), heights[n % len(heights)], distance * np.cos(a)) for n, a in enumerate(angles)]
+    return {f"camera_{n}": camera(place, target, fov, resolution) for n, place in enumerate(places)}
+
+
 def rectangle(centre: Vector, right: Vector, up: Vector, bsdf: dict[str, Any], **more: Any) -> dict[str, Any]:
     """Return a rectangle that faces `right` × `up`; a texture is upright when viewed from its front.
 

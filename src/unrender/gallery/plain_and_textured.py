@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
+from unrender.core.rotations import rotation
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
@@ -74,7 +75,5 @@ def _cushion(steps: int) -> np.ndarray:
     bulge = 0.22 * np.sqrt(np.clip((1 - x**2) * (1 - y**2), 0, None))
     x, y = x * (1 - 0.08 * (1 - y**2)), y * (1 - 0.08 * (1 - x**2))
     flat = np.stack([0.47 * x, 0.47 * y, bulge], -1)
-    lean, turn = np.radians(-20), np.radians(-18)
-    back = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
-    aside = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]])
+    back, aside = rotation((1, 0, 0), np.radians(-20)), rotation((0, 1, 0), np.radians(-18))
     return flat @ back.T @ aside.T + np.array([0.42, -0.53, 0.05])

@@ -12,12 +12,11 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, staging
-from unrender.gallery.specification import reference
+from unrender.gallery.specification import views_of
 from unrender.losses import L2, Loss
 from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
 
 _RADIUS = 0.7
 _WALL = 3.4
@@ -56,8 +55,7 @@ class ShadowArt:
 
     def problem(self, name: str) -> Problem:
         """Return the problem: the sphere's scene, and references of the two shadows by Mitsuba's `path` integrator."""
-        true = load(self.target)
-        views = [View(reference(true, view, self.reference_spp, self.max_depth), view) for view in range(2)]
+        views = views_of(load(self.target), self)
         return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name)
 
     def _stage(self) -> dict[str, Any]:

@@ -176,12 +176,15 @@ def build_problem(name: str, specification: Specification) -> Problem:
     renderer = MitsubaRenderer(specification.scene, specification.max_depth)
     parameters = specification.parameters()
     truth = {key: value.numpy() for key, value in renderer.values([p.key for p in parameters]).items()}
-    scene = renderer.pair.current
-    views = [
-        View(reference(scene, sensor, specification.reference_spp, specification.max_depth), sensor)
-        for sensor in range(len(scene.sensors()))
-    ]
+    views = views_of(renderer.pair.current, specification)
     return Problem(renderer, parameters, views, specification.loss, specification.max_depth, truth=truth, name=name)
+
+
+def views_of(scene: Any, specification: Specification, aov: str = "") -> list[View]:
+    """Return a view of each sensor of a loaded scene, with its `reference`."""
+    spp, depth = specification.reference_spp, specification.max_depth
+    sensors = range(len(scene.sensors()))
+    return [View(reference(scene, sensor, spp, depth, aov), sensor, aov=aov or None) for sensor in sensors]
 
 
 def reference(scene: Any, sensor: int, spp: int, max_depth: int, aov: str = "") -> np.ndarray:

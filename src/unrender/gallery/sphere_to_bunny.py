@@ -9,12 +9,11 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, staging
-from unrender.gallery.specification import reference
+from unrender.gallery.specification import views_of
 from unrender.losses import L2, Loss
 from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
 
 _CENTRE, _RADIUS = np.array([0.0, -0.15, 0.0]), 0.62
 _SPACING = 0.035
@@ -72,24 +71,18 @@ class SphereToBunny:
     def problem(self, name: str) -> Problem:
         """Return the problem: the sphere's scene, references of the animal by Mitsuba's `path` integrator, and its surface."""
         true = load(self.target)
-        pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
-        views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
         body = next(shape for shape in true.shapes() if shape.is_mesh())
         surfaces = {"sphere.vertex_positions": meshes.surface(body)}
-        return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name, surfaces=surfaces)
+        return Problem(
+            self.scene, self.parameters(), views_of(true, self), self.loss, self.max_depth, name=name, surfaces=surfaces
+        )
 
     def _stage(self) -> dict[str, Any]:
         angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
-        heights = np.where(np.arange(self.views) % 2 == 0, 0.4, 2.0)
         fov = 44.0 if self.mesh else 36.0  # a mesh from a file may fill its bounding box
         return {
             "type": "scene",
-            **{
-                f"camera_{number}": parts.camera(
-                    (3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), fov, self.resolution
-                )
-                for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
-            },
+            **parts.cameras_around(angles, 3.6, (0.4, 2.0), (0, 0, 0), fov, self.resolution),
             "sky": {"type": "constant", "radiance": parts.colour(0.25, 0.3, 0.4)},
             "sun": staging.sun((0.5, 1.0, 0.4), 0.7),
         }

@@ -13,14 +13,13 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, staging, textures
-from unrender.gallery.specification import reference
+from unrender.gallery.specification import views_of
 from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.rendering.mitsuba.scene_loading import load
 from unrender.rendering.picture_format import AOVS
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
 
 _RADIUS = 0.7
 """Radius of the sphere; the body fits into a ball of radius about 1."""
@@ -66,24 +65,15 @@ class SphereToMesh:
 
     def problem(self, name: str) -> Problem:
         """Return the problem: the sphere's scene, and references of the body by Mitsuba's `path` integrator."""
-        true = load(self.target)
-        aov = "" if self.pictures == "colour" else self.pictures
-        pictures = [reference(true, view, self.reference_spp, self.max_depth, aov) for view in range(self.views)]
-        views = [View(picture, sensor, aov=aov or None) for sensor, picture in enumerate(pictures)]
+        views = views_of(load(self.target), self, "" if self.pictures == "colour" else self.pictures)
         return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name)
 
     def _stage(self) -> dict[str, Any]:
         floor = parts.rectangle((0, -1.3, 0), (20, 0, 0), (0, 0, -20), parts.diffuse(0.12, 0.18, 0.25))
         angles = 2 * np.pi * np.arange(self.views) / self.views
-        heights = np.where(np.arange(self.views) % 2 == 0, 1.9, 3.2)
         return {
             "type": "scene",
-            **{
-                f"camera_{number}": parts.camera(
-                    (3.8 * np.sin(angle), height, 3.8 * np.cos(angle)), (0, -0.1, 0), 34.0, self.resolution
-                )
-                for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
-            },
+            **parts.cameras_around(angles, 3.8, (1.9, 3.2), (0, -0.1, 0), 34.0, self.resolution),
             "sun": staging.sun((0.35, 1.0, 0.45), 1.0),
             **({} if self.pictures == "mask" else {"floor": floor}),
         }

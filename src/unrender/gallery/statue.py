@@ -9,12 +9,11 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, staging, textures
-from unrender.gallery.specification import reference
+from unrender.gallery.specification import views_of
 from unrender.losses import L2, Loss
 from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
-from unrender.scene.view import View
 
 _RADIUS = 0.68
 _FINE = 5
@@ -62,22 +61,16 @@ class Statue:
     def problem(self, name: str) -> Problem:
         """Return the problem: the sphere's scene, references of the bust by Mitsuba's `path` integrator, and its surface."""
         true = load(self.target)
-        pictures = [reference(true, view, self.reference_spp, self.max_depth) for view in range(self.views)]
-        views = [View(picture, sensor) for sensor, picture in enumerate(pictures)]
         surfaces = {"statue.vertex_positions": meshes.surface(next(s for s in true.shapes() if s.is_mesh()))}
-        return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name, surfaces=surfaces)
+        return Problem(
+            self.scene, self.parameters(), views_of(true, self), self.loss, self.max_depth, name=name, surfaces=surfaces
+        )
 
     def _stage(self) -> dict[str, Any]:
         angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
-        heights = np.where(np.arange(self.views) % 2 == 0, 0.3, 1.8)
         return {
             "type": "scene",
-            **{
-                f"camera_{number}": parts.camera(
-                    (3.6 * np.sin(angle), height, 3.6 * np.cos(angle)), (0, 0, 0), 34.0, self.resolution
-                )
-                for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
-            },
+            **parts.cameras_around(angles, 3.6, (0.3, 1.8), (0, 0, 0), 34.0, self.resolution),
             "sky": {"type": "constant", "radiance": parts.colour(0.3, 0.33, 0.4)},
             "sun": staging.sun((0.6, 0.9, 0.7), 0.6),
         }

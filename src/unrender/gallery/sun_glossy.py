@@ -47,12 +47,7 @@ class SunGlossy:
         }
         return {
             "type": "scene",
-            **{
-                f"camera_{number}": parts.camera(
-                    (4.2 * np.sin(a), 1.7, 4.2 * np.cos(a)), (0, 0.84, 0), 27.0, self.resolution
-                )
-                for number, a in enumerate(angles)
-            },
+            **parts.cameras_around(angles, 4.2, (1.7,), (0, 0.84, 0), 27.0, self.resolution),
             "sky": parts.environment(parts.picture(_SUN, np.radians(2.5), (500.0, 450.0, 370.0))),
             "ground": parts.rectangle((0, 0, 0), (60, 0, 0), (0, 0, -60), parts.diffuse(0.3, 0.27, 0.22)),
             "doll": meshes.sheet("doll", meshes.lathe(*_profile(96), 96), lacquer, closed=True),

@@ -50,12 +50,7 @@ class SunlitVase:
         gravel = textures.bitmap(textures.photograph("gravel", 128), repeat=(10, 10))
         return {
             "type": "scene",
-            **{
-                f"camera_{number}": parts.camera(
-                    (4.2 * np.sin(a), 1.9, 4.2 * np.cos(a)), (0, 0.82, 0), 28.0, self.resolution
-                )
-                for number, a in enumerate(angles)
-            },
+            **parts.cameras_around(angles, 4.2, (1.9,), (0, 0.82, 0), 28.0, self.resolution),
             "sky": parts.environment(_sky()),
             "ground": parts.rectangle((0, 0, 0), (15, 0, 0), (0, 0, -15), {"type": "diffuse", "reflectance": gravel}),
             "vase": vase(self.texture_resolution),

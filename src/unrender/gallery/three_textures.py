@@ -49,12 +49,7 @@ class ThreeTextures:
         planet = textures.bitmap(two_planets.blue(self.texture_resolution))
         return {
             "type": "scene",
-            **{
-                f"camera_{number}": parts.camera(
-                    (4.4 * np.sin(a), 2.2, 4.4 * np.cos(a)), (0, 0.4, 0), 32.0, self.resolution
-                )
-                for number, a in enumerate(angles)
-            },
+            **parts.cameras_around(angles, 4.4, (2.2,), (0, 0.4, 0), 32.0, self.resolution),
             "sky": parts.environment(parts.picture(_SUN, np.radians(8.0), (45.0, 40.0, 32.0))),
             "ground": parts.rectangle((0, 0, 0), (30, 0, 0), (0, 0, -30), parts.diffuse(0.3, 0.27, 0.22)),
             "ball": _painted("ball", ball + _place(0), planet),

@@ -48,15 +48,9 @@ class TwoPlanets:
     def scene(self) -> dict[str, Any]:
         """Return the planets: at x = -1.05 the free blue one, at x = 1.05 the enclosed red one, and the sky."""
         angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
-        heights = np.where(np.arange(self.views) % 2 == 0, 1.6, -0.5)
         return {
             "type": "scene",
-            **{
-                f"camera_{number}": parts.camera(
-                    (6.2 * np.sin(angle), height, 6.2 * np.cos(angle)), (0, 0, 0), 41.0, self.resolution
-                )
-                for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
-            },
+            **parts.cameras_around(angles, 6.2, (1.6, -0.5), (0, 0, 0), 41.0, self.resolution),
             "sky": sky(),
             "free": _ball("free", -_APART, blue(self.texture_resolution)),
             "enclosed": _ball("enclosed", _APART, red(self.texture_resolution)),

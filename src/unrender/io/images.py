@@ -1,4 +1,4 @@
-"""Reading of images: files and arrays become linear float32 arrays, or a one-line error."""
+"""Reading of images: files and arrays become linear float32 arrays, or a one-line error. Writing of pictures."""
 
 from __future__ import annotations
 
@@ -114,6 +114,30 @@ def orientation(picture: Image.Image) -> int:
         return int(picture.getexif().get(_ORIENTATION, 1))
     except Exception:  # EXIF data is often malformed, and Pillow raises many types of exceptions
         return 1
+
+
+def write(picture: Any, path: Path, half: bool = False) -> None:
+    """Write a picture in the format of the file name extension.
+
+    Args:
+        picture: linear (H, W) or (H, W, C) with C of 1, 3 or 4, written as float32; or a `mitsuba.Bitmap`, written as it is.
+        path: the file.
+        half: whether to write 16 bits, for OpenEXR.
+
+    Raises:
+        InputError: an array has another number of channels.
+    """
+    import mitsuba as mi
+
+    if not isinstance(picture, mi.Bitmap):
+        values = np.ascontiguousarray(picture if picture.ndim == 3 else picture[..., None], np.float32)
+        if values.ndim != 3 or values.shape[2] not in (1, 3, 4):
+            raise InputError(f"no picture has {picture.shape[-1]} channels; expected 1, 3 or 4")
+        picture = mi.Bitmap(values)
+    with variant.two_threads():
+        if half:
+            picture = picture.convert(picture.pixel_format(), mi.Struct.Type.Float16, False)
+        picture.write(str(path))
 
 
 def resize(values: np.ndarray, height: int, width: int, around: bool = False) -> np.ndarray:

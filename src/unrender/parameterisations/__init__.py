@@ -1,6 +1,6 @@
 """Changes of variables for the optimizer, so that one learning rate suits reflectances, radiances and extinctions alike."""
 
 from unrender.parameterisations.base import Parameterisation
-from unrender.parameterisations.elementwise import Identity, Log, Logit, Softplus
+from unrender.parameterisations.elementwise import Identity, Log
 
-__all__ = ["Identity", "Log", "Logit", "Parameterisation", "Softplus"]
+__all__ = ["Identity", "Log", "Parameterisation"]

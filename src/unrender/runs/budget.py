@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 _MOST_SKIPPED = 20
 _FEW_STEPS, _MEASURED = 20, 3
 """Number of steps below which a warning is given, and number of steps that are timed for it."""
-_FEW = "allows about"
-"""Words of that warning."""
 _LEAST_SPP, _FEW_PIXELS = 2, 4096
 """Least samples per pixel, and pixels per step, that it advises."""
 _END_SHARE, _END_SECONDS = 0.1, 1.0
@@ -72,7 +70,7 @@ class Budget(Callback):
         if run.last_step is not None and run.step and time.perf_counter() + 0.5 * run.clock / run.step >= run.last_step:
             run.stop("seconds")
         if (run.stopped == "seconds" and run.step) or (run.step == _MEASURED and not run.stopped):
-            _warn_of_few_steps(run)
+            self._warn_of_few_steps(run)
         if run.state.skipped_in_a_row >= _MOST_SKIPPED:
             run.stop(NON_FINITE)
             line = f"{_MOST_SKIPPED} steps in a row were not finite: the run was stopped; the result holds the last finite values"
@@ -87,6 +85,18 @@ class Budget(Callback):
         self._looked = now
         end = min((_END_SHARE * run.seconds + _END_SECONDS) * min(slowdown(), MOST_SLOWDOWN), 0.5 * run.seconds)
         run.last_step = max(run.deadline - end, self._least)
+
+    def _warn_of_few_steps(self, run: Run) -> None:
+        """Warn once if the time of the first steps shows that the budget allows few steps, or at the end if it did."""
+        if run.told_of_few_steps or run.seconds is None or run.clock <= 0.0:
+            return
+        expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
+        steps, spp = max(expected, run.step), getattr(run.estimator, "spp", None)
+        whole = spp if isinstance(spp, int) else None
+        line = few_steps(run.seconds, steps, run.steps, whole, run.problem.pixels > _FEW_PIXELS)
+        if line:
+            run.warnings.append(line)
+            run.told_of_few_steps = True
 
 
 def slowdown() -> float:
@@ -103,18 +113,6 @@ def slowdown() -> float:
             continue
         running, waiting = running + ran, waiting + waited
     return 1.0 + waiting / running if running else 1.0
-
-
-def _warn_of_few_steps(run: Run) -> None:
-    """Warn once if the time of the first steps shows that the budget allows few steps, or at the end if it did."""
-    if run.seconds is None or run.clock <= 0.0 or any(_FEW in line for line in run.warnings):
-        return
-    expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
-    spp, smaller = getattr(run.estimator, "spp", None), run.problem.pixels > _FEW_PIXELS
-    if line := few_steps(
-        run.seconds, max(expected, run.step), run.steps, spp if isinstance(spp, int) else None, smaller
-    ):
-        run.warnings.append(line)
 
 
 def few_steps(seconds: float, steps: int, most: int | None = None, spp: int | None = None, large: bool = False) -> str:
@@ -135,7 +133,7 @@ def few_steps(seconds: float, steps: int, most: int | None = None, spp: int | No
     if large:
         ways.append(f"fewer pixels a step (--set pixels={_FEW_PIXELS})")
     advice = ", ".join(ways[:-1]) + (", or " if len(ways) > 2 else " or ") + ways[-1]
-    return f"the budget of {seconds:g} s {_FEW} {steps} step{'' if steps == 1 else 's'}; {advice}"
+    return f"the budget of {seconds:g} s allows about {steps} step{'' if steps == 1 else 's'}; {advice}"
 
 
 def check_budget(steps: int | None, seconds: float | None) -> None:

@@ -52,6 +52,7 @@ class Run:
         skipped: number of steps that were not applied.
         ahead: number of steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
         warnings: one line each.
+        told_of_few_steps: whether one of them says that the budget allows few steps.
         stopped: reason to end after the current step; "" for none.
         deadline: time of `time.perf_counter` at which everything should be finished, with final images; None without such a budget.
         last_step: time of `time.perf_counter` at which the steps should end, so that everything fits into the budget; None if the budget
@@ -80,6 +81,7 @@ class Run:
     skipped: int = 0
     ahead: int = 0
     warnings: list[str] = field(default_factory=list)
+    told_of_few_steps: bool = False
     stopped: str = ""
     last_step: float | None = None
     deadline: float | None = None
@@ -165,6 +167,7 @@ class Run:
         state, noise, executor = self.state, self.state.noise, self.problem.executor
         candidate = None if state.candidate is None else vars(state.candidate)
         parts = {"sent": executor.snapshot(), "candidate": candidate, "ahead": self.ahead or None}
+        parts |= {"told_of_few_steps": self.told_of_few_steps or None}
         parts |= {"numbers": state.numbers.snapshot()}
         return {
             "parameters": self.parameters,
@@ -185,6 +188,7 @@ class Run:
         """Restore a snapshot, which has been checked to be one of this run's."""
         self.parameters, self.step, self.clock = saved["parameters"], saved["step"], saved["clock"]
         self.skipped, self.warnings, self.ahead = saved["skipped"], list(saved["warnings"]), saved.get("ahead", 0)
+        self.told_of_few_steps = saved.get("told_of_few_steps") is True
         state = self.state
         state.estimator, state.optimizer = saved["estimator"], saved["optimizer"]
         state.noise = GradientNoise(**saved["noise"])

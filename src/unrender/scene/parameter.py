@@ -39,9 +39,8 @@ class Parameter:
         learning_rate: learning rate of this parameter; None takes the optimizer's.
         preconditioner: e.g. `unrender.preconditioners.LargeSteps(10.0)`, or None.
         coarse_to_fine: `CoarseToFine`, or its steps, for a texture or grid with a coarse initial resolution; None for one resolution.
-        parameterisation: "identity", "log", "logit", "softplus" or "softplus(0.1)", or one of `unrender.parameterisations`. It is the
-            variable that preconditioner, optimizer and learning rate act on; values, bounds and results remain those of the parameter. None
-            for the identity.
+        parameterisation: "identity", "log", or one of `unrender.parameterisations`: the variable that preconditioner, optimizer and
+            learning rate act on. Values, bounds and results remain those of the parameter. None for the identity.
         regularizer: for the vertex positions of a mesh, an additional term of the loss: `MeshRegularizer`, or a table of its options such
             as {"bilaplacian": 0.001}; None for none.
         prior: prior knowledge of the values: `Prior`, or a table of its options such as {"smoothness": 0.05}; None for none.

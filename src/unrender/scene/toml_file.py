@@ -15,7 +15,7 @@
     learning_rate = 0.01
     preconditioner = { type = "LargeSteps", strength = 10.0 }
     coarse_to_fine = [200, 400]                # steps at which the resolution doubles, see CoarseToFine
-    parameterisation = "logit"                 # variable of the optimizer: identity, log, logit, softplus
+    parameterisation = "log"                   # variable of the optimizer: identity or log
     prior = { total_variation = 0.1 }          # what is known of the values beforehand
     truth = "wall.exr"                         # true value, if known, to measure the error
 
@@ -71,9 +71,7 @@ class _Parameter(Table):
         None,
         description='a list of steps such as [200, 400], or a table such as { steps = [200, 400], states = "reset" }',
     )
-    parameterisation: StrictStr | dict[str, Any] | None = Field(
-        None, description='"identity", "log", "logit", "softplus" or, with a scale, "softplus(0.1)"'
-    )
+    parameterisation: StrictStr | dict[str, Any] | None = Field(None, description='"identity" or "log"')
     regularizer: dict[str, Any] | None = Field(
         None, description="for vertex positions, a table such as { bilaplacian = 0.001, edges = 0.001 }"
     )

@@ -21,7 +21,6 @@ from unrender.app.capture.writing import (
     SCENE,
     add_value,
     encoded,
-    write_exr,
     write_mask,
     write_problems,
 )
@@ -30,7 +29,7 @@ from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.app.stages.stages_file import Stage, Stages
 from unrender.core.errors import InputError
-from unrender.io import volumes
+from unrender.io import images, volumes
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
 
@@ -114,7 +113,7 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
         shown = view.shown > INSIDE
         if not view.held_out:
             means.append(float(view.values[shown].mean()))
-        write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
+        images.write(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
         masked.append(not shown.all())
         if masked[-1]:
             write_mask(shown, folder / MASKS / f"{stem}.png")
@@ -125,7 +124,7 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
     for number, file in enumerate(_HARMONICS):
         values = np.zeros((*coarse, 3), np.float32) if number else np.full((*size, 3), level, np.float32)
         volumes.write_grid(folder / GRIDS / f"{file}.vol", values)
-    write_exr(np.full((*_LIGHT_SIZE, 3), level, np.float32), folder / LIGHT)
+    images.write(np.full((*_LIGHT_SIZE, 3), level, np.float32), folder / LIGHT)
     (folder / SCENE).write_bytes(_scene(bare, stems, middle, half))
     rates = {one: rate if one == "extinction" else rate * level for one, rate in _RATES.items()}
     bounds: dict[str, Any] = {"extinction": _LOGARITHM, "light": {"bounds": [0.0, math.inf]}}

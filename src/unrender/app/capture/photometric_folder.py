@@ -35,13 +35,13 @@ from unrender.app.capture.writing import (
     add_texture,
     add_value,
     encoded,
-    write_exr,
     write_mask,
     write_problems,
 )
 from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.core.errors import InputError
+from unrender.io import images
 from unrender.losses.metrics import srgb
 from unrender.rendering.exposure import EXPOSURE
 from unrender.rendering.mitsuba import turntable_light
@@ -204,14 +204,16 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
     _, colour = least_squares(training_values[:, inside], views.directions[chosen_views])
     strength = max(float(np.quantile(colour.max(1), 0.99)) / _BRIGHTEST, 1e-4)
     height, width = views.mask.shape
-    write_exr(np.full((height, width, 3), np.median(colour) / strength, np.float32), folder / TEXTURES / _COLOUR)
-    write_exr(np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), (height, width, 3)), folder / TEXTURES / _NORMAL)
+    images.write(np.full((height, width, 3), np.median(colour) / strength, np.float32), folder / TEXTURES / _COLOUR)
+    images.write(
+        np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), (height, width, 3)), folder / TEXTURES / _NORMAL
+    )
     (folder / SCENE).write_bytes(_scene(views, strength))
     write_mask(inside, folder / MASKS / "mask.png")
     listed = []
     for index, (photograph, values) in enumerate(zip(views.names, views.values, strict=True)):
         file = f"{REFERENCES}/{index:04d}-{file_name(Path(photograph).stem)}.exr"
-        write_exr(values, folder / file, half=True)
+        images.write(values, folder / file, half=True)
         listed.append((views.held_out[index], {"reference": file, "sensor": index, "mask": f"{MASKS}/mask.png"}))
     unknowns = [{"key": _KEYS[one], **({} if one == "exposure" else {"bounds": [0.0, 1.0]})} for one in chosen]
     write_problems(folder, name, listed, unknowns, "L1", 2)

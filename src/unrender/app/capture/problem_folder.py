@@ -24,7 +24,6 @@ from unrender.app.capture.writing import (
     add_texture,
     add_value,
     encoded,
-    write_exr,
     write_mask,
     write_problems,
 )
@@ -33,6 +32,7 @@ from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.core.errors import InputError
 from unrender.core.text import printable
+from unrender.io import images
 from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.mitsuba import turntable_light
 
@@ -86,14 +86,14 @@ def write(
         level.append(float(view.values[mask].mean()))
         clipped |= bool((view.values[mask] >= _WHITE).any())
         brightest = max(brightest, float(view.values.max()))
-        write_exr(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
+        images.write(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
         weights = _banded(mask, 0 if view.held_out else band)
         write_mask(weights, folder / MASKS / f"{stem}.png")
     for file, values in unknowns.textures(chosen, texture).values():
-        write_exr(values, folder / TEXTURES / file)
+        images.write(values, folder / TEXTURES / file)
     # Under uniform light, a surface shows its base colour times the light's radiance.
     radiance = max(float(np.median(level)) / unknowns.COLOUR, 1e-4)
-    write_exr(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
+    images.write(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
     # Values above 1 cannot come from files of 8 or 16 bits.
     white = clipped and brightest <= 1.001
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"

@@ -11,7 +11,6 @@ import numpy as np
 import tomli_w
 
 from unrender.app.evaluation.scenes import HELD_OUT
-from unrender.backend import variant
 from unrender.display.pictures import png
 from unrender.io import toml_lines
 from unrender.rendering.photographs import OF_PHOTOGRAPHS
@@ -100,14 +99,3 @@ def add_texture(parent: Xml.Element, name: str, file: str, raw: bool, pixels: bo
         transform = Xml.SubElement(texture, "transform", name="to_uv")
         Xml.SubElement(transform, "scale", x="1", y="-1")
         Xml.SubElement(transform, "translate", x="0", y="1")
-
-
-def write_exr(values: np.ndarray, path: Path, half: bool = False) -> None:
-    """Write (H, W, C) as OpenEXR with 32 bits, or 16."""
-    import mitsuba as mi
-
-    with variant.two_threads():
-        bitmap = mi.Bitmap(np.ascontiguousarray(values, np.float32))
-        if half:
-            bitmap = bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float16, False)
-        bitmap.write(str(path))

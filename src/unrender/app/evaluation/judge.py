@@ -16,7 +16,6 @@ import numpy as np
 from unrender.app.evaluation import pictures, scenes
 from unrender.app.evaluation.measures import Albedo, Measures, best_factors, compare_albedo, mean, measure
 from unrender.app.evaluation.pictures import names_of
-from unrender.app.exporting import ready_made
 from unrender.app.exporting.asset import read_environment
 from unrender.app.stages import run_folders, stages_file
 from unrender.backend import variant
@@ -24,6 +23,7 @@ from unrender.core import arrays, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.io import files
+from unrender.io.images import write as write_image
 from unrender.losses import metrics
 from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE
@@ -219,7 +219,7 @@ def _render(
     own, _ = read_environment(scenes.load_scene(path), [])
     if own is not None:
         (folder / f"{LIGHT}.png").write_bytes(pictures.environment_picture(own))
-        ready_made.write_bitmap(ready_made.as_bitmap(own), folder / f"{LIGHT}.exr")
+        write_image(own, folder / f"{LIGHT}.exr")
     relit = []
     if light is not None:
         up = scenes.turned_up(scenes.up_axis(scenes.sensors(problem))) if upright else None

@@ -10,7 +10,6 @@ from xml.etree import ElementTree as Xml
 import mitsuba as mi
 import numpy as np
 
-from unrender.app.exporting import ready_made
 from unrender.app.exporting.scene_folder import export
 from unrender.app.stages import run_folders
 from unrender.core.errors import InputError
@@ -91,7 +90,7 @@ def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray
             for value in sensor.findall(f"float[@name='{name}']"):
                 sensor.remove(value)
     file = path.parent / "other-light.exr"
-    ready_made.write_bitmap(ready_made.as_bitmap(light), file)
+    images.write(light, file)
     emitter = Xml.SubElement(root, "emitter", type="envmap", id=LIGHT)
     Xml.SubElement(emitter, "string", name="filename", value=str(file.absolute()))
     if to_world is not None:

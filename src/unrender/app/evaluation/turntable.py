@@ -20,6 +20,7 @@ from unrender.backend import variant
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
+from unrender.core.rotations import rotation
 from unrender.display.pictures import quantized
 from unrender.io import files
 from unrender.losses.metrics import exposure, srgb
@@ -57,9 +58,7 @@ class _Table:
     def turned(self, angle: float) -> np.ndarray:
         """Return the rotation of the world, (4, 4), by an angle in radians about the axis through the centre."""
         transform = np.eye(4)
-        axis = np.array(self.up)
-        k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        transform[:3, :3] = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+        transform[:3, :3] = rotation(self.up, angle)
         transform[:3, 3] = self.middle - transform[:3, :3] @ self.middle
         return transform
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from unrender.app.exporting import gltf, ready_made, textures, usd
+from unrender.app.exporting import gltf, textures, usd
 from unrender.app.exporting.asset import Asset, Part
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.display.pictures import png
-from unrender.io import mesh_files
+from unrender.io import images, mesh_files
 
 
 def write_obj(asset: Asset, folder: Path) -> None:
@@ -115,9 +115,7 @@ def _write_environment(asset: Asset, folder: Path) -> None:
     if asset.environment is None:
         return
     for ending in (".exr", ".hdr"):
-        ready_made.write_bitmap(
-            ready_made.as_bitmap(np.ascontiguousarray(asset.environment)), folder / f"environment{ending}"
-        )
+        images.write(asset.environment, folder / f"environment{ending}")
 
 
 def _in_folder(name: str, write: Callable[[Asset, Path], None]) -> Callable[[Asset, Path], None]:

@@ -14,8 +14,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.backend import variant
 from unrender.core.errors import InputError
+from unrender.io import images
 from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.described import Recorded, recorded_descriptions
@@ -95,10 +95,10 @@ class FilesOnly:
         return description
 
     def _bitmap(self, value: Any, place: tuple[str, ...]) -> str:
-        bitmap = value if isinstance(value, mi.Bitmap) else as_bitmap(np.array(value))
-        eight = bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16)
+        bitmap = value if isinstance(value, mi.Bitmap) else None
+        eight = bitmap is not None and bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16)
         path = self._path(BITMAPS, place[:-1], ".png" if eight else ".exr")
-        write_bitmap(bitmap, path)
+        images.write(np.array(value) if bitmap is None else bitmap, path)
         return str(path)
 
     def _volume(self, value: Any, place: tuple[str, ...]) -> str:
@@ -140,20 +140,6 @@ def _diffuse(bsdf: Any, parameters: Any, key: str) -> dict[str, Any] | None:
     if kind == "SRGBReflectanceSpectrum" and len(flat) == 3:
         return {"type": "diffuse", "reflectance": {"type": "rgb", "value": flat}}
     return None
-
-
-def as_bitmap(values: np.ndarray) -> Any:
-    """Return a float32 bitmap of (H, W) or (H, W, C) values, with C of 1, 3 or 4."""
-    pixels = np.ascontiguousarray(values if values.ndim == 3 else values[..., None], np.float32)
-    if pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4):
-        raise InputError(f"no picture has {values.shape[-1]} channels; expected 1, 3 or 4")
-    return mi.Bitmap(pixels)
-
-
-def write_bitmap(bitmap: mi.Bitmap, path: Path) -> None:
-    """Write a picture in the format of the file name extension."""
-    with variant.two_threads():
-        bitmap.write(str(path))
 
 
 def file_name(text: str) -> str:

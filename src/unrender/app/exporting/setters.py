@@ -9,8 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.app.exporting.graph import Place, SceneGraph
-from unrender.app.exporting.ready_made import BITMAPS, MESHES, VOLUMES, as_bitmap, file_name, write_bitmap
+from unrender.app.exporting.ready_made import BITMAPS, MESHES, VOLUMES, file_name
 from unrender.core.errors import InputError
+from unrender.io import images
 from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba import mesh_layout
 
@@ -78,7 +79,7 @@ def _map(props: Any, value: np.ndarray, name: str, folder: Path) -> None:
     elif plugin in ("bitmap", "envmap"):
         path = _path(folder, BITMAPS, name, ".exr")
         # Mitsuba repeats the first column behind the last one, and the last before the first.
-        write_bitmap(as_bitmap(value[:, 1:-1, :3] if plugin == "envmap" else value), path)
+        images.write(value[:, 1:-1, :3] if plugin == "envmap" else value, path)
     else:
         raise InputError(f"a {plugin} reads its values from no file that could be written")
     for other in ("bitmap", "data", "grid"):

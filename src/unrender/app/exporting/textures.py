@@ -13,8 +13,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from unrender.app.exporting.asset import Part
-from unrender.app.exporting.ready_made import as_bitmap, file_name, write_bitmap
+from unrender.app.exporting.ready_made import file_name
 from unrender.display.pictures import quantized
+from unrender.io import images
 from unrender.io.resampling import upsample
 from unrender.io.volumes import write_grid
 from unrender.losses.metrics import srgb
@@ -85,7 +86,7 @@ def _base(key: str) -> str:
 def _values(base: str, value: np.ndarray, folder: Path) -> str:
     """Write an array as it is, and return the file's name."""
     if value.ndim == 3 and value.shape[2] in (1, 3, 4):
-        write_bitmap(as_bitmap(value), folder / f"{base}.exr")
+        images.write(value, folder / f"{base}.exr")
         return f"{base}.exr"
     if value.ndim == 4:
         write_grid(folder / f"{base}.vol", value)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unrender.core.rotations import rotation
 from unrender.display import formatting
 from unrender.display.pictures import data_uri
 from unrender.runs.folder.reader import RunFolder
@@ -93,8 +94,7 @@ def _picture(solids: list[tuple[np.ndarray, np.ndarray]]) -> str:
 
     image = Image.new("RGBA", (_SIZE * len(solids), _SIZE))
     draw = ImageDraw.Draw(image)
-    c, s, d, t = np.cos(_TURN), np.sin(_TURN), np.cos(_TILT), np.sin(_TILT)
-    turn = np.array([[1, 0, 0], [0, d, -t], [0, t, d]]) @ np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+    turn = rotation((1, 0, 0), _TILT) @ rotation((0, 1, 0), -_TURN)
     for number, (vertices, faces) in enumerate(solids):
         rotated = vertices @ turn.T
         normals = area_normals(rotated, faces)
