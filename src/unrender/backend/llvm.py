@@ -39,7 +39,6 @@ class Library:
     """An installed LLVM library.
 
     Attributes:
-        path: path of the file.
         major: major version, or None if neither the file's name nor the library reports it.
     """
 

@@ -197,7 +197,6 @@ def differences(images: np.ndarray, distances: np.ndarray) -> np.ndarray:
     """Return derivative images (m, H, W, 3) from images (2 m, H, W, 3), first those of increased, then those of decreased parameters.
 
     Args:
-        images: the images.
         distances: distance of the two parameters of each difference, (m,); an element with 0 has no derivative.
     """
     over = np.divide(1.0, distances, out=np.zeros(distances.size), where=distances != 0.0)

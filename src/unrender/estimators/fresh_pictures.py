@@ -86,8 +86,6 @@ class FreshPictures:
     one recording. More paths use more pixels, and then more launches.
 
     Args:
-        problem: problem with the views.
-        seed: seed of the run.
         paths: approximate number of paths of one image.
         number: index of the run's independent set of random numbers.
         parts: power of two; largest number of parts of the launches whose images are kept apart. More images have a sharper test, since

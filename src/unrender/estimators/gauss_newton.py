@@ -246,8 +246,6 @@ class _System:
     Attributes:
         products: products of derivative images.
         slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
-        loss: loss at the parameters.
-        images: images by view.
         weighted: derivative images by view, see `DerivativeImages`; {} unless `GaussNewton.derivative_images`.
         variances: running mean of the variance of each view's image.
         derivatives: mean derivative images of each view.

@@ -80,7 +80,6 @@ class GradientRequest:
     (`PathGradient`). A single group traces `adjoint_spp` separate paths for the adjoint.
 
     Attributes:
-        parameters: Current parameters.
         image, state: Image estimator and its state. The state advances where full views are rendered.
         spp: Samples per pixel of the image.
         key: Random numbers of the step.
@@ -178,7 +177,6 @@ class GatheredFrames:
     """The contributions of the frames of a step: gradients are summed in the order of arrival.
 
     Args:
-        request: the request of the step.
         frames: the frames, in the order of their contributions.
     """
 
@@ -237,7 +235,6 @@ def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, ad
     Args:
         owner: class name for messages.
         pixels: the sampler.
-        image: the image estimator.
         fewest: minimum number of samples per pixel of any gradient of a step.
         adjoint_spp: see `PathGradient`.
     """
@@ -343,7 +340,6 @@ def fresh_weights(problem: Problem, frame: Frame, image: ImageEstimate, others: 
 
     Args:
         problem, frame: they determine loss and reference.
-        image: image estimate.
         others: its leave-one-out images.
         weights: loss derivative at these; it must be damped (`tolerance`) if it is not linear, since the secant would be unbounded.
     """

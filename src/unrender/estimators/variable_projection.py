@@ -91,7 +91,6 @@ def update_response(
     Args:
         response: response so far.
         problem: problem with path gradients of the textures.
-        parameters: all parameters.
         images: derivative images J along the present response.
         spp: samples per pixel of the adjoints.
         key: random numbers, independent of those of J.

@@ -23,7 +23,6 @@ class Option:
     Attributes:
         name: keyword.
         kind: `int`, `str`, or `Loss`, which can be passed by name.
-        default: default value.
         about: description in one line.
     """
 

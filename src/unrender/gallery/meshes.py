@@ -24,7 +24,6 @@ def sheet(name: str, positions: np.ndarray, bsdf: dict[str, Any], closed: bool =
     Args:
         name: id of the mesh.
         positions: (rows, columns, 3); u runs from 0 to 1 along columns, v from 0 to 1 along rows. The front faces columns × rows.
-        bsdf: material.
         closed: whether the last column coincides with the first one (with u = 1 there).
 
     Returns:
@@ -54,7 +53,6 @@ def sheets(name: str, pieces: Sequence[Sheet], bsdf: dict[str, Any]) -> Any:
     Args:
         name: id of the mesh.
         pieces: at least one sheet; texture coordinates run from 0 to 1 on each, unless it has another origin.
-        bsdf: material.
 
     Returns:
         `mitsuba.Mesh` with normals and texture coordinates; an entry of a scene dictionary.
@@ -84,7 +82,6 @@ def triangles(
         name: id of the mesh.
         positions: (V, 3).
         faces: vertex indices (F, 3), counter-clockwise seen from outside.
-        bsdf: material.
         coordinates: texture coordinates, (V, 2); None for none.
 
     Returns:

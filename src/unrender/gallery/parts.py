@@ -59,9 +59,7 @@ def rectangle(centre: Vector, right: Vector, up: Vector, bsdf: dict[str, Any], *
     """Return a rectangle that faces `right` × `up`; a texture is upright when viewed from its front.
 
     Args:
-        centre: centre of the rectangle.
         right, up: vectors from the centre to the midpoints of two edges; perpendicular.
-        bsdf: material.
         more: further entries, such as an emitter.
     """
     x, y = np.asarray(right, float), np.asarray(up, float)
@@ -150,7 +148,6 @@ def picture(
         radius: angular radius of the sun in radians; a texel belongs to it if its centre does.
         radiance: RGB of the sun.
         colours: RGB radiance of zenith, horizon, and below the horizon.
-        rows: number of rows.
     """
     columns = 2 * rows
     theta = np.pi * (np.arange(rows)[:, None] + 0.5) / rows

@@ -169,7 +169,6 @@ def build_problem(name: str, specification: Specification) -> Problem:
     """Return the problem: true values from the scene, one view per sensor, references by Mitsuba's integrators.
 
     Args:
-        name: name of the problem.
         specification: specification with its options.
     """
     ensure()

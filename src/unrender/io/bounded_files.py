@@ -103,7 +103,6 @@ def open_regular(path: Path, folder: Path | None = None) -> IO[bytes]:
     """Open a regular file, links followed.
 
     Args:
-        path: path of the file.
         folder: folder that must contain it; None for any.
 
     Raises:

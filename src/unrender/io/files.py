@@ -50,7 +50,6 @@ def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) 
     If `durable`, leftovers of processes that died while writing the file are removed first.
 
     Args:
-        path: path of the file.
         data: content of the file.
         durable: whether the bytes are flushed to the disk before the file is renamed. False suits files that may be lost in a power cut.
         name_too: whether the name is also flushed before this returns. False suits several files of one folder, which one call of

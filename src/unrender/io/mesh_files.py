@@ -74,7 +74,6 @@ def check_ply(path: Path, splats: bool = False) -> None:
     """Raise `InputError` unless a PLY file has the rows that it declares, and triangles of existing vertices.
 
     Args:
-        path: path of the file.
         splats: whether it contains ellipsoids, whose properties must be float32 and in Mitsuba's order.
     """
     with bounded_files.open_regular(path) as file:

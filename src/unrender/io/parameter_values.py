@@ -38,7 +38,6 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
 
     Args:
         initial: the value as passed.
-        shape: shape of the parameter.
         conversion: the renderer's conversion of such a file in a scene.
 
     Raises:

@@ -34,7 +34,6 @@ class AssetChecks:
 
         Args:
             plugin: type of the object.
-            path: path of the file.
             index: `shape_index` of the object.
 
         Raises:

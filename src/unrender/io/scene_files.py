@@ -85,8 +85,6 @@ class _Reader:
         """Read an XML file and its includes.
 
         Args:
-            path: path of the file.
-            shown: name in messages.
             search: folders that Mitsuba will search for its files; its `path` elements are added.
             depth: nesting depth of the include.
         """

@@ -20,11 +20,7 @@ _LONGEST = 1 << 20
 
 @dataclass(frozen=True)
 class PlanFile:
-    """Plan in a TOML file, as printed by `unrender methods --plan`, with the members of `Method` that a run needs.
-
-    Attributes:
-        path: Path of the file.
-    """
+    """Plan in a TOML file, as printed by `unrender methods --plan`, with the members of `Method` that a run needs."""
 
     path: Path
 

@@ -137,7 +137,6 @@ class Rendered:
     """Record of one render for `Stream.backward`.
 
     Attributes:
-        parameters: rendered parameters.
         frames: records of the launches.
         shape: shape of the returned image.
         batch: its pixels; None for a full image.

@@ -24,7 +24,6 @@ class LoopParameters:
     """Parameters in the loop's framework.
 
     Attributes:
-        framework: framework of the loop.
         values: {key: array} in that framework, in the order of the renderer's keys.
     """
 

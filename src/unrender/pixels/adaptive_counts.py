@@ -46,7 +46,6 @@ class AdaptiveCountsState:
         step: number of steps so far.
         maps: second moments of the parameter derivatives and of the loss derivative, (tiles, 3) each; empty before the first update.
         counts: weighted number of paths of each tile, (tiles,); earlier ones count less.
-        pooled: the pooled maps.
         density: relative density of additional samples, with mean 1 over the pixels, (tiles,).
         uniform: fraction of these that is equal for all pixels.
         evidence: evidence for that fraction.

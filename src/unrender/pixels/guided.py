@@ -130,7 +130,6 @@ class GuidedSampler:
     """Sampler of mini-batches in proportion to an importance map, mixed with uniform sampling.
 
     Attributes:
-        owner: name for messages.
         options: options of the public sampler.
         rule: rule that computes the importance map.
     """

@@ -23,7 +23,6 @@ def pool(tiles: Tiles, means: np.ndarray, counts: np.ndarray, prior: float) -> n
     bright path is not mistaken for dark.
 
     Args:
-        tiles: tiles of all views.
         means: (tiles, C).
         counts: n, number of paths of each tile, (tiles,), >= 0.
         prior: κ > 0, in paths.
@@ -68,7 +67,6 @@ def denoise_map(tiles: Tiles, values: np.ndarray, by: MapDenoiser, counts: np.nd
     """Denoise a map (tiles, 3), with the tiles of each view as an image; unchanged for "none".
 
     Args:
-        tiles: tiles of all views.
         values: mean over each tile's paths.
         by: "auto" is optix on a GPU, oidn if it is installed, else pooling (`pool`). Pooling spreads single bright paths, which dominate
             second moments, without losing them.

@@ -58,7 +58,6 @@ class PilotRequest:
     """Request for one path through each pixel of a sample, for `Problem.executor`.
 
     Attributes:
-        parameters: Current parameters.
         sample: Pixels, with weights of 1.
         key: Key of the random numbers.
         references: Further references, (N, 3) each, with which the paths are compared.
@@ -117,7 +116,6 @@ def estimate_statistics(
 
     Args:
         problem, parameters: what to render.
-        tiles: tiles of all views.
         uniform_table: table of these tiles with equal pixel probabilities.
         spp: paths per tile, >= 1.
         key: key of the random numbers.
@@ -155,7 +153,6 @@ def costs(
 
     Args:
         problem, parameters: what to render.
-        tiles: tiles of all views.
         uniform_table: table of these tiles with equal pixel probabilities.
         key: key of the random numbers.
     """

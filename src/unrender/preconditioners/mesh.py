@@ -100,7 +100,6 @@ class MeshSolver:
 
     Args:
         strength: λ, >= 0.
-        topology: topology of the mesh.
     """
 
     def __init__(self, strength: float, topology: MeshTopology):
@@ -140,7 +139,6 @@ class MeshSpectrum:
     to an error of a few percent. The sum is symmetric and positive definite, as a preconditioner must be, and preserves constants.
 
     Args:
-        topology: topology of the mesh.
         strongest: largest λ, >= 0.
 
     Attributes:

@@ -36,7 +36,6 @@ class ExposedRenderer(PictureFactors):
     `PictureFactors` states the biases.
 
     Args:
-        inner: renderer of the scene.
         sensors: indices of the sensors that have a row, in the order of the rows. Pictures of other sensors do not change.
 
     Attributes:

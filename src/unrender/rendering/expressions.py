@@ -27,7 +27,6 @@ class Expression:
     """A parameter of the scene as a differentiable function of unknowns.
 
     Attributes:
-        key: Parameter of the scene.
         function: Maps {name: Dr.Jit tensor of the unknown's shape} to a tensor that broadcasts to the parameter's shape.
         text: The text form; None for a Python function.
     """

@@ -60,7 +60,6 @@ class ErrorMeasure:
         Return None if the shapes differ, `where` does not fit, or no element remains.
 
         Args:
-            values: values of the parameter.
             truth: ground truth, of the same shape.
             where: booleans over leading axes of `values`; None for all cells. A cell of normals or directions is a vector.
         """

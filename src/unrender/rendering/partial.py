@@ -23,7 +23,6 @@ class PartialDerivatives(RendererWrapper):
     their current values.
 
     Args:
-        inner: renderer of the scene.
         constant: keys of the parameters whose derivatives are 0.
     """
 
@@ -58,7 +57,6 @@ class HeldParameters(RendererWrapper):
     """A renderer of the scene with some parameters fixed at constant values.
 
     Args:
-        inner: renderer of the scene.
         held: {key: array} of the fixed parameters. Sessions return no derivatives by them.
     """
 
@@ -78,7 +76,6 @@ class EliminatedParameters(HeldParameters):
     """A renderer of the scene in which eliminated parameters are linear functions of those of a session.
 
     Args:
-        inner: renderer of the scene.
         held: {key: array} of the fixed parameters.
         origin: values of the session's parameters at which the fixed ones are at `held`, (n,).
         slopes: {key: change per unit of each of the n elements, (n, *shape)} of the eliminated parameters.

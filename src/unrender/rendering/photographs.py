@@ -66,7 +66,6 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
     Args:
         renderer: renderer of a scene, with or without these parameters. If it has them and its rows include all `sensors`, it is returned
             unchanged: the views are a subset of its views.
-        keys: keys of all parameters.
         sensors: indices of the views' sensors.
 
     Raises:

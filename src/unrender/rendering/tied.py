@@ -136,7 +136,6 @@ class TiedRenderer(RendererWrapper):
     """A renderer whose unknowns are ties. Images, gradients and tangents are as unbiased as the inner renderer's.
 
     Args:
-        inner: renderer of the scene.
         ties: unknowns that set several parameters each.
     """
 

@@ -41,9 +41,6 @@ class VignettedRenderer(PictureFactors):
 
     `PictureFactors` states the biases.
 
-    Args:
-        inner: renderer of the scene.
-
     Attributes:
         notices: of the inner renderer.
     """

@@ -32,11 +32,7 @@ from unrender.rendering.renderer import (
 
 
 class RendererWrapper:
-    """A renderer that forwards every call to its inner renderer. Subclasses override what they change.
-
-    Args:
-        inner: renderer of the scene.
-    """
+    """A renderer that forwards every call to its inner renderer. Subclasses override what they change."""
 
     inner: Renderer
 
@@ -95,9 +91,6 @@ class SessionWrapper:
     """A session that maps parameters, images and gradients to and from an inner session.
 
     Subclasses override the maps `_state`, `_tangents`, `_gradient`, `_shown`, `_paths` and `_weights`, or public methods.
-
-    Args:
-        inner: session that renders the scene.
     """
 
     def __init__(self, inner: RenderSession):

@@ -65,7 +65,6 @@ def undetermined(
     other line.
 
     Args:
-        problem: problem with views and scene.
         values: {key: array}, values of the other parameters.
         spp: samples per pixel of each of four renderings per view.
         seconds: time after which no further parameter is tested; the first one always is.
@@ -131,7 +130,6 @@ def common_factor(
     Emitters become brighter by a factor, and reflectances darker by the same factor. The images distinguish the two if they change.
 
     Args:
-        problem: problem with views and scene.
         values: {key: array}, parameters at which it is tested.
         spp: samples per pixel of each of eight renderings per view.
         seconds: time limit; nothing is tested if one rendering shows that it would be exceeded.

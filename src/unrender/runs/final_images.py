@@ -105,8 +105,6 @@ def render_final_images(
     which separate its error, weighted by the view's mask, from its noise (`statistics.debiased`).
 
     Args:
-        problem: problem of the run.
-        result: result of the run.
         spp: samples per pixel. None takes a power of two, at least 2, that fits into a twentieth of the time of the run's steps, or one
             second if that is longer, and into about four million paths per image. That time excludes compiling.
         left: function that returns the remaining seconds. If few remain, images have fewer samples, and tests of undetermined parameters

@@ -146,7 +146,6 @@ def check_numbers(
     no numbers (see `Numbers.of`), or if the renderer rejects a value.
 
     Args:
-        problem: problem with views and scene.
         values: {key: array} at the end.
         start: {key: array} at the start.
         seconds: time after which nothing further is started; the numbers are `unchecked` then.

@@ -27,7 +27,6 @@ class RunAnnotations:
         method: name of the method; "" for the estimator's.
         settings: settings of the method, in types of JSON.
         choices: choices of the method and their reasons, one line each.
-        command: the command line.
         final_spp: samples per pixel of the final images; None chooses.
         phases: {phase: seconds} before the run, such as loading.
         began: Time of `time.perf_counter` from which a budget in seconds counts, with loading, compiling and final images; None if it

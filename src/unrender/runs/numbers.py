@@ -73,9 +73,7 @@ class Numbers:
     """The n numbers of a problem at a point, and the factors of k directions of its textures and grids.
 
     Attributes:
-        problem: problem with views and scene.
         values: {key: array} of all unknowns.
-        keys: keys of the numbers.
         views: indices of the rendered views.
         point: numbers, then the factors, which are 0, (n + k,).
         start: numbers at the start of the run, (n,).
@@ -109,7 +107,6 @@ class Numbers:
         the pictures of a pass are too large.
 
         Args:
-            problem: problem with views and scene.
             values: {key: array} of all unknowns.
             start: {key: array}, initial values, for the sizes.
         """

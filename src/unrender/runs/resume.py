@@ -49,7 +49,6 @@ class StoredRun:
     """A run folder whose run can be resumed.
 
     Attributes:
-        folder: the run folder.
         record: run.json.
         method: method.toml, with the new budget.
     """
@@ -63,7 +62,6 @@ def load_run(directory: str | Path, steps: int | None = None, seconds: float | N
     """Read the description of a run from its folder, before anything that takes time.
 
     Args:
-        directory: the run folder.
         steps, seconds: a budget from the run's start that replaces the run's.
 
     Raises:
@@ -217,7 +215,6 @@ class _Restore(Callback):
         record: run.json of the run so far.
         source: point from which it is resumed.
         changes: changes since then, "" for none.
-        writer: writer of the run folder.
     """
 
     record: RunRecord

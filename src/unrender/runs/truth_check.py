@@ -42,11 +42,9 @@ def further_from_truth(
     parameter, see `unrender.runs.sensitivity`.
 
     Args:
-        problem: problem with truth, views and scene.
         pictures: source of a new image at the truth, for the noise of the references.
         first, last: {key: array}, the parameters at the start and at the end.
         few: whether the run had fewer than `FEW_STEPS` steps; errors must then exceed the first by a half.
-        seconds: seconds of the run.
     """
     ratio = _FURTHER_EARLY if few else _FURTHER
     before, after = problem.parameter_error(first), problem.parameter_error(last)

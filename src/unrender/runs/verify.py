@@ -188,8 +188,6 @@ class Verify(Callback):
         """Return a warning if the images differ from the references by more than noise, and the loss stays or still falls fast.
 
         Args:
-            problem: problem of the run.
-            result: result of the run.
             unaveraged: parameters of the last step, as the images of earlier steps have them.
             pictures: renderer of the last image, with random numbers independent of those of earlier steps.
             end: the last image.

@@ -83,7 +83,6 @@ def project(x: Array, low: float | None, high: float | None, scale: float = 1.0)
     """Project onto the bounds, with a margin. A projection, unlike a sigmoid, does not change the gradient inside the bounds.
 
     Args:
-        x: values.
         low: lower bound; None if unbounded.
         high: upper bound; None if unbounded.
         scale: scale of the margin if the range is unbounded, see `open_scale`.

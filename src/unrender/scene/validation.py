@@ -313,7 +313,6 @@ def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tup
     """Return the true value of a parameter, float32, and a notice of how it was converted, "" if it was not.
 
     Args:
-        key: key of the parameter.
         value: the value as passed.
         known: the problem's parameters.
 

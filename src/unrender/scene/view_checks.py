@@ -203,7 +203,6 @@ def _check_view(
     Raises `FieldError` for an invalid field.
 
     Args:
-        index: index of the view in the problem, for messages.
         view: view as passed.
         resolutions: (height, width) of each sensor's film.
         films: renderer that may know the films' formats.

@@ -20,7 +20,6 @@ class CapturedView:
     """One photograph, prepared for comparison with a render.
 
     Attributes:
-        name: name of the photograph.
         lens: a pinhole with square pixels.
         camera_to_world: (4, 4), axes right, up, backwards.
         values: (H, W, 3) float32, linear.
@@ -54,10 +53,8 @@ class Photograph:
 
     Attributes:
         name: name in the capture, for messages.
-        file: its path.
         lens: lens of the camera; None if it depends on the size of the file (`field_of_view`).
         camera_to_world: (4, 4), camera axes as in `cameras`: x right, y up, z backwards; rotation and position only.
-        mask: path of the mask, or None.
         held_out: whether it is for evaluation only; None if the capture does not specify it.
         field_of_view: horizontal field of view in radians, if there is no lens.
         scale: scale of the axes of the matrix in the file, which `camera_to_world` does not include.
@@ -78,7 +75,6 @@ class Capture:
     """Posed photographs.
 
     Attributes:
-        folder: their folder.
         kind: name of the format.
         photographs: at least one.
         axes: camera axes in the files, a key of `conventions.AXES`.

@@ -95,7 +95,6 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
 
     Args:
         folder: an existing folder.
-        name: name of the problem.
         views: views of the photographs; their masks are not used.
         voxels: number of voxels along a side of the cube.
         chosen: the unknowns, from `NAMES`.

@@ -138,7 +138,6 @@ class Imported:
         folder: the new folder.
         kind: format of the capture.
         views: number of training views.
-        held_out: number of held-out views.
         size: width and height of the largest view.
         faces: number of faces of the mesh; 0 without a mesh.
         overlaps: overlaps of the silhouettes of the mesh with the masks, in order of the views; empty without masks.

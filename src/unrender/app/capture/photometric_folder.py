@@ -58,7 +58,6 @@ class LitViews:
     """Photographs at the chosen resolution.
 
     Attributes:
-        names: file names of the photographs.
         values: (N, H, W, 3) float32, linear.
         directions: (N, 3) unit, towards the lights.
         mask: (H, W) in [0, 1], the fraction of a pixel that the object covers.
@@ -183,8 +182,6 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
 
     Args:
         folder: an existing folder.
-        name: name of the problem.
-        views: views of the photographs.
         chosen: the unknowns, from `NAMES`.
 
     Raises:

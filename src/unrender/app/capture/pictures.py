@@ -86,7 +86,6 @@ def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
     """Read a photograph. 8- and 16-bit integers are decoded, floating-point numbers are linear; CMYK becomes RGB.
 
     Args:
-        path: the file.
         orientation: EXIF orientation to apply; 1 for none.
         response: response of integers, see `decode`.
 

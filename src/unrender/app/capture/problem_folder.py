@@ -63,10 +63,7 @@ def write(
 
     Args:
         folder: an existing folder.
-        name: name of the problem.
-        views: views of the photographs.
         mesh: mesh with texture coordinates.
-        silhouettes: silhouettes of the mesh.
         texture: texels along the sides of the textures.
         chosen: the unknowns, from `unknowns.NAMES`.
         band: width in pixels of the border of training masks with reduced weight.

@@ -44,7 +44,6 @@ class Resampling:
     """A resampling of the picture of a lens to that of a pinhole camera.
 
     Attributes:
-        source: lens of the photograph.
         target: pinhole of the result, with square pixels, as from `pinhole`.
     """
 

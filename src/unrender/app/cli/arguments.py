@@ -251,7 +251,6 @@ def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> 
     """Open the problem of a TOML file or of the gallery. A variant must be active. Raise `InputError`.
 
     Args:
-        name: typed name.
         options: options of a gallery problem.
         cached: whether its references are read from and written to the cache.
     """

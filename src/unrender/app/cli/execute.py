@@ -34,7 +34,6 @@ class RunOrder:
     """Specification of a run.
 
     Attributes:
-        method: the method.
         settings: settings of the method that differ from the defaults.
         steps, seed: see `optimize`.
         seconds: time limit with compilation and final pictures; None for no limit.

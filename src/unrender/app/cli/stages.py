@@ -38,8 +38,6 @@ class StagesRun:
 
     Attributes:
         stages: stages with their budget and run options.
-        problem: their problem.
-        out: folder of the run folders.
         variant: Mitsuba variant.
         command: typed command, which is saved with the results.
         lock: held lock of `out`; `run_remaining` releases it.

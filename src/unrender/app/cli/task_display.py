@@ -38,7 +38,6 @@ class TaskDisplay:
 
     Args:
         console: output console.
-        total: number of tasks.
         what: name of the tasks, such as "trials".
         below: renderable below the table of running tasks; None for nothing.
     """

@@ -21,7 +21,6 @@ class Place:
     """Location of a worker.
 
     Attributes:
-        machine: name of the machine.
         process: process id.
         free: bytes of memory available to it if it were alone, of the GPU or of the machine.
         gpu: its GPU, "" for none.

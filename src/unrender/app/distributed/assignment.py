@@ -57,8 +57,6 @@ def split(problem: Problem, sample: PixelSample, shares: Sequence[Sequence[int]]
 
     Args:
         problem: the full problem.
-        sample: pixels of all views.
-        shares: views of each share.
     """
     views, pixels = (arrays.numpy(x).astype(np.uint32) for x in (sample.views, sample.pixels))
     weights = arrays.numpy(sample.weights).reshape(-1)
@@ -128,7 +126,6 @@ def check(problem: Problem, shares: Sequence[Sequence[int]], free: Sequence[tupl
 
     Args:
         problem: the full problem.
-        shares: views of each share.
         free: machine of each share, and its available bytes; 0 for unknown.
         has_memory: see `needed`.
     """

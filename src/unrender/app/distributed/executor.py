@@ -61,7 +61,6 @@ class DistributedExecutor:
 
     Args:
         problem: the full problem.
-        shares: views of each share.
         hosts: hosts of the shares.
         compress: see `Outbox`.
         variant: see `Executor.variant`.

@@ -96,7 +96,6 @@ class Call:
     Attributes:
         arrays: {number: array} that the worker does not have yet.
         drop_arrays, drop_memories: numbers that the worker may drop.
-        parameters: the current parameters.
         image: the image estimator.
         state: its state; None for one without memory.
         result: number of the memory after this step; None for none.

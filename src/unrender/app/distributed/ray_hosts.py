@@ -65,7 +65,6 @@ class RayHosts:
 
     Args:
         cluster: a connected cluster.
-        shares: views of each share.
         blobs: the problem of each share, see `transfer.packed`.
         threads: threads of each worker; None for its share of the processor.
         tell: function that receives one-line messages on events.

@@ -39,7 +39,6 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
     Args:
         problem: the full problem.
         views: indices of the views.
-        ray: the module.
 
     Raises:
         InputError: the problem cannot be sent: it has a loaded scene, or a function or object of this process.

@@ -71,9 +71,6 @@ class Memory:
     """Placeholder of the workers' memory of all views in the state of an image estimator. Workers drop the memory when this object dies.
 
     This is not a dataclass, since Dr.Jit would search it for arrays.
-
-    Args:
-        recipe: recipe of the memory.
     """
 
     def __init__(self, recipe: Recipe):
@@ -126,7 +123,6 @@ class Sent:
     """An array as workers have it.
 
     Attributes:
-        number: its number.
         value: its value on the host.
         difference: difference from an earlier one; None if it is sent in full.
     """

@@ -84,7 +84,6 @@ def write(
 
     Args:
         folder: an existing folder.
-        problem: the problem of the views.
         images: renderings, linear (H, W, 3).
         relit: renderings under another light, with one exposure of their own; empty to show differences instead.
         measures: measures of `images` for the labels; empty if they were not measured.

@@ -32,7 +32,6 @@ class Part:
         faces: (F, 3) uint32, counter-clockwise seen from the side of the normals.
         normals: (V, 3) float32 unit vectors; None for flat shading.
         uv: (V, 2) float32; None without texture coordinates.
-        material: the material.
     """
 
     name: str

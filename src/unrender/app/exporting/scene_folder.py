@@ -54,7 +54,6 @@ class Exported:
     """The result of an export.
 
     Attributes:
-        folder: the folder.
         scene: the XML file; None if it was not requested, or for an emissive medium, which plain Mitsuba does not have.
         notices: notices for the user, one line each.
         renamed: {key: key in the exported scene} of all parameters of the scene whose key differs there.

@@ -26,7 +26,6 @@ def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: 
 
     Args:
         graph: the description; its live scene already has all recovered values.
-        place: place of the parameter.
         value: recovered value.
         key: key of the parameter, which names its file.
         folder: folder of the exported scene.

@@ -46,7 +46,6 @@ class Stage:
     """One run of several.
 
     Attributes:
-        name: name of its folder.
         unknowns: keys of the parameters that it optimises; the others keep the values of earlier stages.
         share: its share of the budget, relative to the other stages, > 0.
         coarser: factor by which its textures and grids have fewer texels along each side, >= 1. They are interpolated at its end.
@@ -83,7 +82,6 @@ class Stages:
     """Consecutive runs of one problem, each of which starts at the result of the previous one.
 
     Attributes:
-        problem: a problem file.
         stages: the stages, at least one.
         method, settings: defaults of the stages.
         steps, seconds: total budget of all stages; None without such a budget.

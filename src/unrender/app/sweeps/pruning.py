@@ -95,7 +95,6 @@ class Pruning(Callback):
     is a function of the run alone.
 
     Args:
-        folder: the run folder.
         limits: `medians` of other trials; {} ends no run.
     """
 

@@ -117,9 +117,6 @@ class Redirect:
     Args:
         url: the target address.
 
-    Attributes:
-        path: path of the file.
-
     Raises:
         OSError: the file cannot be written.
     """

@@ -43,7 +43,6 @@ class RunRow:
         label, state, state_text: its name, its state (see `monitor`), and the description of its state.
         step, seconds, samples, loss, error: its progress.
         accepts_commands, paused: whether its buttons are shown, and whether it is paused.
-        path: its folder.
     """
 
     number: int

@@ -40,7 +40,6 @@ class Snapshot:
     """The known state of a run.
 
     Attributes:
-        path: the run folder.
         state: one of the states above.
         run: the data that could be read; None without any.
         status: status of a live run; None otherwise.
@@ -63,7 +62,6 @@ class RunMonitor:
     """A monitor of a run folder. Its content is untrusted, and every file may be missing.
 
     Attributes:
-        path: the folder.
         revision: number of changes so far.
     """
 

@@ -32,7 +32,6 @@ class SmoothedFunction:
         f: (B, n) to (B,).
         theta: (n,), finite.
         sigma: > 0, a number or (n,).
-        options: sampling options.
         sides: evaluations of f per sample point.
 
     Raises:

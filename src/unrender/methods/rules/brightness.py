@@ -38,7 +38,6 @@ def start_factors(problem: Problem, keys: Sequence[str], constants: Constants) -
     The problem's own loss must be less, too. A saturated reference, for example, says nothing against a brighter image.
 
     Args:
-        problem: Problem with views and scene.
         keys: Keys of unknown lights.
         constants: Constants of the rules; `far_light` is the least ratio that counts as far.
     """

@@ -108,9 +108,7 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     """Return a path-gradient plan with a separate block of these unknowns; None if Gauss-Newton steps do not suit them.
 
     Args:
-        traits: Traits of the problem.
         keys: Keys of the unknowns of the block.
-        plan: Plan of the others.
     """
     constants, problem = traits.constants, traits.problem
     own = any(problem.unknowns[key].preconditioner is not None for key in keys)

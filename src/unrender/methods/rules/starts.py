@@ -38,9 +38,7 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan) -> Plan:
     would find it. Unknowns with a prior keep their start.
 
     Args:
-        traits: Traits of the problem.
         keys: Keys of the unknowns with Gauss-Newton steps.
-        plan: Plan for the problem.
     """
     varied = [key for key in keys if _dimensions(traits, key)]
     if not varied:

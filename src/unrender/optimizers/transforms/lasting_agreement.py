@@ -35,7 +35,6 @@ class GradientBlocks(TransformState):
         last: Mean gradient of the last complete block.
         earlier: Mean gradient of the block before that.
         agreement: {key: Σ g_t · g_{t-1} over the current block, a scalar}.
-        count: Number of gradients of the current block.
         blocks: Number of complete blocks.
         fractions: {key: lasting fraction, unclamped; 1 before it is known}.
     """

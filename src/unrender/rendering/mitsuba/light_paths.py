@@ -108,7 +108,6 @@ def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -
 
     Args:
         scene: the loaded scene.
-        bsdfs: its BSDFs.
         keys: the unknown parameters.
     """
     integrator = scene.integrator()

@@ -218,8 +218,6 @@ def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Ro
     """Return the meaning of a parameter's values.
 
     Args:
-        parameters: parameters of the scene.
-        key: key of the parameter.
         shape: shape of its array.
     """
     vectors = math.prod(shape) % 3 == 0 if len(shape) == 1 else bool(shape) and shape[-1] == 3

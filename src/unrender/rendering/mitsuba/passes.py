@@ -30,7 +30,6 @@ class LaunchSize:
     Attributes:
         sensor: index of the sensor; ignored if each pixel has its own.
         spp: samples per pixel.
-        pixels: number of pixels.
         hiding: whether emitters are invisible to camera rays.
     """
 
@@ -310,12 +309,7 @@ class VerticesPass(Pass):
 
 @dataclass(frozen=True, eq=False)
 class PosesPass(Pass):
-    """Radiance of many poses per lane, as concatenated images.
-
-    Attributes:
-        posed: the posed scene.
-        copies: number of poses.
-    """
+    """Radiance of many poses per lane, as concatenated images."""
 
     posed: PosedScene
     copies: int

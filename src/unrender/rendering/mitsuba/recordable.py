@@ -40,8 +40,6 @@ def for_every_sensor(request: SampleRequest, sensors: Sequence[mi.Sensor], count
     alone, not on other scenes of the process.
 
     Args:
-        request: request of one sensor.
-        sensors: all sensors of the scene.
         count: number of pixels.
     """
     supported = all(sensor.class_name() in _COMPLETE for sensor in sensors)

@@ -73,7 +73,6 @@ class RigidMotions:
         """Move the targets, with derivatives if the poses are attached, and update the scene.
 
         Args:
-            parameters: parameters of the scene.
             values: {key: `mi.Float`} of all poses that are set.
         """
         rotated: dict[str, Any] = {}

@@ -33,7 +33,6 @@ class ObjectGraph:
         owners: {object: its holders}, in the order of visits; the scene has none.
         slots: {object: (object that holds it, name of the slot)}, one pair per path to it.
         properties, hierarchy: attributes of `mitsuba.SceneParameters`.
-        names: names of the objects.
     """
 
     def __init__(self, scene: Any):

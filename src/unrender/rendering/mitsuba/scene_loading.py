@@ -224,7 +224,6 @@ def read_vertices(description: SceneDescription, key: str, path: Path) -> np.nda
     texture coordinates.
 
     Args:
-        description: description of the scene.
         key: such as "block.vertex_positions".
         path: an .obj, .ply or .serialized file.
 

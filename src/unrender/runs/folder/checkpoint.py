@@ -95,7 +95,6 @@ def candidates(
     """Yield the readable checkpoints of a run folder that are not rejected, latest first; None alone if there are none.
 
     Args:
-        folder: the run folder.
         reject: function that returns why a checkpoint is unsuitable, "" if it is suitable.
 
     Yields:

@@ -80,7 +80,6 @@ def record(result: Result, status: str, error: str = "") -> dict[str, Any]:
     """Return the contents of run.json, see `schema.RunRecord`.
 
     Args:
-        result: the result.
         status: "running", or a value of `Result.status`.
         error: exception by which the run failed; "" for none.
     """

@@ -196,7 +196,6 @@ class HistoryReader:
     """Reader of a history that may still grow. A file that was replaced or truncated is read from the start.
 
     Attributes:
-        path: path of the file.
         folder: run folder that must contain it.
     """
 

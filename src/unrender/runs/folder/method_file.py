@@ -26,9 +26,7 @@ class Method(BaseModel):
     Attributes:
         name: name of the method; "" for none.
         steps, seconds: the budget.
-        seed: seed of the run.
         checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
-        threads: number of threads of the run.
         estimator, optimizer, settings: See `Plan.table`.
     """
 

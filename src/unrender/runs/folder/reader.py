@@ -41,7 +41,6 @@ class RunFolder:
     """Contents of a run folder.
 
     Attributes:
-        path: path of the folder.
         record: run.json.
         history: history.jsonl.
         parameters, initial, truth: {key: array}; `truth` contains the keys with a known truth.

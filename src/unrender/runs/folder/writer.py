@@ -78,7 +78,6 @@ class RunWriter(Callback):
     holds the folder's lock; `start` or `resume` must be called before the run.
 
     Args:
-        folder: path of the folder.
         save_problem: function that writes the problem's file into a folder.
         method: contents of method.toml, see `method_file`.
         checkpoint_every: steps between checkpoints. None takes about 50: fewer if they take over a minute, more if writing would take

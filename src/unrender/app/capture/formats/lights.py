@@ -29,7 +29,6 @@ class LitCapture:
     """Photographs of one camera under one light each.
 
     Attributes:
-        folder: their folder.
         photographs: files, at least four.
         directions: (N, 3) unit, towards the lights: x right, y up, z towards the camera.
         mask: a file, white on the object, or None.

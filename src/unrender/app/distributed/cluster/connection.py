@@ -97,11 +97,9 @@ class Cluster:
     """A connected Ray cluster.
 
     Attributes:
-        ray: the module.
         variant: variant of the workers, for `prepare_worker`.
         share: number of workers, and resources of each.
         address: address of the cluster; None for a local one.
-        head: its head node.
     """
 
     ray: Any

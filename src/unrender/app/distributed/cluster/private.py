@@ -43,9 +43,6 @@ def private_cluster(ray: Any) -> Iterator[dict[str, Any]]:
     The token is in the environment of these processes, which other users cannot read, and is never written. All services listen on the
     loopback interface. Ray's files are below a folder of mode 0700.
 
-    Args:
-        ray: the module.
-
     Yields:
         Arguments of `ray.init`.
 

@@ -22,7 +22,6 @@ class Ended:
     """A completed task.
 
     Attributes:
-        key: its key.
         value: result of its function; None if it failed.
         message: reason of the failure, one line; "" on success.
         attempts: number of starts.

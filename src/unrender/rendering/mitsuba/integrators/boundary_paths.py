@@ -159,7 +159,6 @@ class EyePath:
     """Subpath from x_a, behind an edge point, to the sensor, with a random number of intermediate vertices.
 
     Attributes:
-        time: time of the picture.
         first: x_a, `mi.SurfaceInteraction3f`.
         moved: x_a as hit by a ray from the sensor's side; attached.
         throughput: importance over density.

@@ -82,7 +82,6 @@ class EmitterPoints:
 
     Args:
         scene: the Mitsuba scene, which has emitters.
-        seed: seed of the points.
         count: number of points of all emitters; each has at least one.
         time: time of the picture, `mi.Float`.
 

@@ -42,7 +42,6 @@ class SilhouetteCurves:
 
     Args:
         scene: the Mitsuba scene.
-        table: its edges.
 
     Attributes:
         count: number of pieces.

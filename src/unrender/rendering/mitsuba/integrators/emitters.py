@@ -74,7 +74,6 @@ def direct_emission(
     """Return Le of each state: the weighted emission of the surface (or the environment) that BSDF sampling hit.
 
     Args:
-        context: context of the path.
         last: last scattering vertex of the path.
         surfaces: the interaction on the shape of each state.
         β: throughput of each state.

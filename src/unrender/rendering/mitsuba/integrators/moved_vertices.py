@@ -88,7 +88,6 @@ class Direction:
     Attributes:
         si, bsdf: surface interaction and BSDF.
         bs, weight: BSDF sample and its weight.
-        ray: ray in that direction.
         delta: lanes that sampled a perfectly specular lobe.
         active: lanes that have a vertex where the path may continue.
     """

@@ -44,10 +44,8 @@ class Evaluation:
 
         Args:
             vertices: cached paths.
-            states: objects of each state.
             replay: for each state, the film's weights and the result of `radiance`.
             spp: samples per pixel.
-            pixels: number of pixels.
         """
         finite = is_finite(*(radiance for _, radiance in replay))
         parts = [

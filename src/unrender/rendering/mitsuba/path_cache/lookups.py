@@ -30,7 +30,6 @@ class Lookups:
 
     Args:
         pair: both loads of the scene.
-        keys: keys of the parameters.
         previous: whether to use the second load.
 
     Attributes:

@@ -44,7 +44,6 @@ class CachingSession(SessionWrapper):
     Args:
         pair: both loads of the scene.
         inner: session that traces the paths, and handles everything that is not cached.
-        keys: all parameters of the session.
         derivatives: parameters that have gradients.
         paths: settings of the light paths.
 
