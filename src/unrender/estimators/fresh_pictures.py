@@ -19,18 +19,18 @@ from unrender.scene.batches import PixelBatch, PixelSample
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, view_request
 from unrender.statistics import paired_losses
+from unrender.statistics.paired_losses import DISTANCE
 
 _GROUPS = 4
 """Number of independent groups of each new image."""
-_LEAST_PATHS, _MOST_PATHS = 1 << 13, 1 << 22
+_LEAST_PATHS, _MOST_PATHS = 1 << 12, 1 << 22
 """Limits of the paths of a new image."""
-_LONGER = 4
+_LONGER = 2
 """Ratio of the allowed paths to the minimum below which an image has the minimum, because another number of pixels needs another
 recording."""
-_FEW_PIXELS = 1 << 12
-"""Number of pixels of all views up to which full views are rendered, for any number of paths."""
-_LAG = 2
-"""Distance of the pixels of a pair; a reconstruction filter correlates the references' noise in adjacent pixels."""
+_FEW_PIXELS, _FEW_OF_VIEWS = 1 << 10, 1 << 12
+"""Number of pixels of all views up to which full views are rendered, for any number of paths; the same number where only full views can
+be rendered."""
 _STREAM = 2
 """Stream of the run's key for new images; the steps use 0, the warm-up 1."""
 _MOST_NON_FINITE = 0.01
@@ -100,6 +100,8 @@ class FreshPictures:
         self._spp = _GROUPS * power_of_two(_LEAST_PATHS // (_GROUPS * max(self.pixels, 1)))
         self._launches = power_of_two(allowed // max(self.pixels * self._spp, 1))
         self._parts = min(parts, self._launches)
+        self.rendered = 0
+        """Number of paths of all images so far."""
 
     @property
     def paths(self) -> int:
@@ -123,6 +125,7 @@ class FreshPictures:
         }
         session = renderer.prepare(list(tree), None, derivatives=False)
         images_by_frame = []
+        self.rendered += self.paths
         for index, frame in enumerate(self.frames):
             key, total = self._key.fold(index + 1), np.zeros((self._parts, _GROUPS, len(frame.pixels), 3))
             for launch in range(self._launches):
@@ -150,9 +153,12 @@ class FreshPictures:
         return float((weights * squares).sum() / max(float(weights.sum()), 1e-300))
 
     @property
-    def in_pairs(self) -> bool:
-        """Whether the pixels are pairs at random places, a distance of two apart. Otherwise they are the rows of views."""
-        return self.sampled and self.frames[0].view is None
+    def sizes(self) -> list[tuple[int, int]]:
+        """(height, width) of the views that are rendered, row by row; [] for a sample of pairs, see `paired_losses.nearby`."""
+        sizes = self._problem.sizes
+        if self.frames[0].view is None:
+            return [] if self.sampled else list(sizes)
+        return [sizes[frame.view] for frame in self.frames if frame.view is not None]
 
     @property
     def weights(self) -> np.ndarray:
@@ -218,12 +224,13 @@ def is_finite(first: Picture, other: Picture) -> bool:
 def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], bool]:
     """Return the tested pixels, at most about `allowed`, and whether they are a sample."""
     count, total = len(problem.views), problem.pixels
-    if total <= _FEW_PIXELS:
-        return [_full_view(problem, view) for view in range(count)], False
-    generator = np.random.default_rng(key.uint32())
     known = problem.renderer.parameters()
     rigid = any(known[parameter.key].rigid for parameter in problem.parameters)
-    if not problem.loss.pixelwise or (rigid and count > 1):
+    of_views = not problem.loss.pixelwise or (rigid and count > 1)
+    if total <= (_FEW_OF_VIEWS if of_views else _FEW_PIXELS):
+        return [_full_view(problem, view) for view in range(count)], False
+    generator = np.random.default_rng(key.uint32())
+    if of_views:
         many = max(1, min(count, allowed * count // total))
         chosen = np.sort(generator.choice(count, many, replace=False))
         return [_full_view(problem, int(view)) for view in chosen], many < count
@@ -239,7 +246,7 @@ def _full_view(problem: Problem, view: int) -> _Frame:
 
 
 def _pixel_list(problem: Problem, count: int | None, generator: np.random.Generator) -> _Frame:
-    """Return pairs of nearby pixels, stratified over all pixels of all views; all pixels if `count` is None."""
+    """Return pairs of nearby pixels, along a row and along a column in turn, stratified over all views; all pixels if `count` is None."""
     sizes = np.array([height * width for height, width in problem.sizes])
     starts = np.cumsum([0, *sizes])
     place = np.arange(starts[-1])
@@ -250,9 +257,21 @@ def _pixel_list(problem: Problem, count: int | None, generator: np.random.Genera
     views = np.searchsorted(starts, place, side="right") - 1
     pixels = place - starts[views]
     if count is not None:
-        partners = np.where(pixels + _LAG < sizes[views], pixels + _LAG, np.maximum(pixels - _LAG, 0))
+        partners = _partners(pixels, np.array(problem.sizes)[views])
         pixels, views = np.stack([pixels, partners], axis=1).reshape(-1), np.repeat(views, 2)
     like = problem.renderer.array(np.zeros(1))
     reference, factors = problem.references.at(arrays.like_integers(views, like), arrays.like_integers(pixels, like))
     weight = starts[-1] / len(pixels)
     return _Frame(None, views, pixels, arrays.numpy(reference), arrays.numpy(factors).astype(np.float64) * weight)
+
+
+def _partners(pixels: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return the second pixel of each pair, along rows and columns in turn of films of the given (height, width), (N, 2).
+
+    Rows and columns are closed to circles, so that all pixels are equally probable.
+    """
+    heights, widths = sizes.T
+    along_row = np.where(np.minimum(heights, widths) > DISTANCE, np.arange(len(pixels)) % 2 < 1, widths >= heights)
+    side, place = np.where(along_row, widths, heights), np.where(along_row, pixels % widths, pixels // widths)
+    moved = (place + np.minimum(DISTANCE, side - 1)) % side
+    return pixels + (moved - place) * np.where(along_row, 1, widths)

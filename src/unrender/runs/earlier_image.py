@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.estimators.fresh_pictures import FreshPictures, Picture
 from unrender.runs.verification import misfit
+from unrender.statistics.paired_losses import difference
 
 FIRST_CANDIDATE = 64
 """Step after which the first candidate is taken; the interval doubles each time."""
@@ -30,14 +30,15 @@ class EarlierImage:
 
     Attributes:
         step: number of completed steps.
-        loss, loss_error: loss without noise, and its standard error.
+        picture: its picture, with the random numbers of other steps' ones.
         residuals: independent images minus the references, (K, N, 3).
+        sampled: whether its pixels are a sample.
     """
 
     step: int
-    loss: float
-    loss_error: float
+    picture: Picture
     residuals: np.ndarray
+    sampled: bool
 
     @property
     def is_short(self) -> bool:
@@ -53,18 +54,21 @@ class EarlierImage:
         """Return the smallest difference from the references that counts at the end, relative to the image."""
         return _OF_PICTURE_SHORT if self.is_short else _OF_PICTURE
 
+    def change(self, earlier: EarlierImage, factor: float) -> tuple[float, float]:
+        """Return the loss minus `factor` times that of an earlier step, and its standard error; infinite for images that are not finite."""
+        first, second = factor * earlier.picture.losses, self.picture.losses
+        of = difference(first, second, self.sampled)
+        return (of.value, of.standard_error) if math.isfinite(of.value) else (math.inf, math.inf)
+
     def is_still(self, earlier: EarlierImage) -> bool:
-        """Return whether the loss has hardly fallen since an earlier step."""
-        if not earlier.is_short:
-            return _STILL * earlier.loss < self.loss < math.inf
-        noise = math.hypot(self.loss_error, _STILL_SHORT * earlier.loss_error)
-        return _STILL_SHORT * earlier.loss + _SURE * noise < self.loss < math.inf
+        """Return whether the loss has hardly fallen since an earlier step: surely for a short run, as far as noise tells for others."""
+        value, error = self.change(earlier, _STILL_SHORT if earlier.is_short else _STILL)
+        return (_SURE if earlier.is_short else -1.0) * error < value < math.inf
 
     @classmethod
-    def of(cls, step: int, pictures: FreshPictures, values: Mapping[str, np.ndarray]) -> EarlierImage:
-        """Render the parameters of a step."""
-        picture = pictures.picture(values)
-        return cls(step, *picture.loss, pictures.differences(picture.images))
+    def of(cls, step: int, pictures: FreshPictures, picture: Picture) -> EarlierImage:
+        """Return the image of a step that `pictures` has rendered."""
+        return cls(step, picture, pictures.differences(picture.images), pictures.sampled)
 
 
 def not_converged(last: EarlierImage, earlier: EarlierImage, pictures: FreshPictures) -> list[str]:
@@ -75,12 +79,12 @@ def not_converged(last: EarlierImage, earlier: EarlierImage, pictures: FreshPict
             without progress, so neither is of averages.
         pictures: renderer of both images.
     """
-    noise = math.hypot(last.loss_error, _FALLS * earlier.loss_error)
-    if not last.loss + _SURE * noise < _FALLS * earlier.loss:
+    value, error = last.change(earlier, _FALLS)
+    if not value + _SURE * error < 0.0:
         return []
-    of = last.residuals, last.residuals, pictures.references, pictures.weights, _OF_PICTURE_FALLING
-    difference = misfit(*of, sampled=pictures.in_pairs)
-    if difference is None:
+    of = last.residuals, last.residuals, pictures.references, pictures.weights, pictures.sizes
+    differs = misfit(*of, _OF_PICTURE_FALLING)
+    if differs is None:
         return []
-    fallen = f"its loss has fallen by {1 - last.loss / earlier.loss:.0%} since step {earlier.step} of {last.step}"
-    return [f"{difference.describe()}, and the run has not converged: {fallen}; give it more steps or seconds"]
+    fallen = f"its loss has fallen by {1 - last.picture.loss[0] / earlier.picture.loss[0]:.0%} since step {earlier.step} of {last.step}"
+    return [f"{differs.describe()}, and the run has not converged: {fallen}; give it more steps or seconds"]

@@ -24,8 +24,8 @@ relative to the image in this case."""
 _FEW_NUMBERS, _OF_PICTURE = 24, 0.01
 """Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image."""
 
-_ROWS, _PAIRS = ((3, 1), (2, 1)), ((1, 0), (1, 2))
-"""Layout for `paired_losses.systematic`, and distances for `paired_losses.nearby`: of rows of pixels, and of pairs of a sample."""
+_ROWS, _PAIRS = (3, 1), (1, 0)
+"""Layout for `paired_losses.systematic` of rows of pixels, and of pairs of a sample."""
 _RARE, _ERRORS = 25.0, 2.0
 """Number of paths, of which one brings light, from which a warning says so, and standard errors by which it must be reached."""
 _OF_TRUTH = 4.0
@@ -69,10 +69,10 @@ def misfit(
     others: np.ndarray,
     references: np.ndarray,
     weights: np.ndarray,
+    sizes: Sequence[tuple[int, int]],
     least: float,
-    fresh: np.ndarray | None = None,
+    halves: tuple[np.ndarray, np.ndarray] | None = None,
     by_pixel: bool = False,
-    sampled: bool = False,
 ) -> Misfit | None:
     """Return the difference from the references that two pictures share; None if it may be noise or is small.
 
@@ -83,10 +83,11 @@ def misfit(
         others: those of another picture, whose noise may depend on the first one's at the same pixel, (K, N, 3).
         references: references, (N, 3).
         weights: weight of each pixel, (N,), in [0, 1].
+        sizes: (height, width) of the images; () for a sample of pairs, see `paired_losses.nearby`.
         least: smallest difference relative to the references.
-        fresh: differences of K >= 2 images with independent noise, (K, N, 3). With these, few pixels are also judged one by one.
+        halves: differences of K >= 2 images each at the end, with independent noise, (K, N, 3). With these, few pixels are also judged
+            one by one.
         by_pixel: whether many pixels are, too.
-        sampled: whether the pixels are pairs at random places, see `FreshPictures.in_pairs`; rows of pixels otherwise.
     """
     one, other = residuals.mean(axis=0), others.mean(axis=0)
     if not (np.isfinite(one).all() and np.isfinite(other).all()):
@@ -98,16 +99,13 @@ def misfit(
         beyond = shared.score > paired_losses.SIGNIFICANT and error > smallest * size
         return Misfit(error, size, math.sqrt(max(total**2 - error**2, 0.0)), one_by_one) if beyond else None
 
-    layout, places = _PAIRS if sampled else _ROWS
-    shared = (
-        paired_losses.systematic(one, weights, other, layout),
-        paired_losses.nearby(one, weights, other, *places),
-    )
-    scales = (significant(part, least, False) for part in shared)
+    tiles = paired_losses.systematic(one, weights, other, _ROWS if sizes else _PAIRS)
+    edges = (paired_losses.nearby(one, weights, sizes, axes, other) for axes in ((0,), (1,), (0, 1)))
+    scales = (significant(part, least, False) for part in (tiles, *edges))
     difference = max(filter(None, scales), key=lambda found: found.error, default=None)
-    if difference or fresh is None or not (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
+    if difference or halves is None or not (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
         return difference
-    return significant(paired_losses.repeated(residuals, fresh, weights), _OF_FEW, True)
+    return significant(paired_losses.repeated(*halves, weights), _OF_FEW, True)
 
 
 def misfit_of_numbers(
@@ -115,10 +113,10 @@ def misfit_of_numbers(
     residuals: np.ndarray,
     references: np.ndarray,
     weights: np.ndarray,
+    sizes: Sequence[tuple[int, int]],
     known: Sequence[str] = (),
     improved: bool = True,
     at_truth: Callable[[], float] | None = None,
-    sampled: bool = False,
 ) -> str:
     """Return a warning if only few numbers are unknown and the images differ from the references; else "".
 
@@ -130,10 +128,10 @@ def misfit_of_numbers(
         residuals: differences of K independent images from the references, (K, N, 3); K < 2 gives "".
         references: references, (N, 3).
         weights: weight of each pixel, (N,), in [0, 1].
+        sizes: see `misfit`.
         known: warnings of the run; one that says so already is returned.
         improved: whether the images are better than at the start.
         at_truth: see `Misfit.is_references_noise`.
-        sampled: see `misfit`.
     """
     elements = sum(math.prod(shape) for shape in problem.shapes().values())
     if elements > _FEW_NUMBERS or len(residuals) < 2:
@@ -141,8 +139,8 @@ def misfit_of_numbers(
     if line := next((warning for warning in known if DIFFERS in warning), ""):
         return line
     one, other = residuals[0::2], residuals[1::2]
-    fresh = None if improved or len(residuals) < 4 else other
-    difference = misfit(one, other, references, weights, _OF_PICTURE, fresh, by_pixel=True, sampled=sampled)
+    halves = None if improved or len(residuals) < 4 else (one, other)
+    difference = misfit(one, other, references, weights, sizes, _OF_PICTURE, halves, by_pixel=True)
     if difference is None or difference.is_references_noise(at_truth):
         return ""
     noise = (
@@ -164,7 +162,8 @@ def misfit_of_views(
     weights = [problem.views[view].pixel_weights(x.shape[:2]) for view, x in zip(views, references, strict=True)]
     pixels = np.concatenate([image.reshape(-1, 3) for image in references])
     residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
-    return misfit_of_numbers(problem, residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), known)
+    sizes = [(height, width) for height, width, _ in map(np.shape, references)]
+    return misfit_of_numbers(problem, residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), sizes, known)
 
 
 def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) -> str:

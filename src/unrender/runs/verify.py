@@ -30,14 +30,14 @@ from unrender.statistics import paired_losses
 if TYPE_CHECKING:
     from unrender.runs.run import Run
 
-_SHARE = 0.004
-"""Fraction of the run's paths for one new image; there are at most four."""
-_LARGER_SHARE, _PARTS = 0.01, 8
-"""The same fraction, and the number of parts with images of their own, where the first images do not tell whether the end is better or
-worse than the start: few bright pixels, such as those of a visible lamp, may hold most of the noise. All images then use at most 6 % of
-the run's paths. Samples of pixels, those of more than 4,096 pixels, get no larger images."""
-_LARGER_IMAGES = 4
-"""Number of larger images for which time must be left: the start, the end, a candidate and a control variate."""
+_MOST_SHARE = 0.02
+"""Largest fraction of the run's paths for all new images, from about a million paths on; images of shorter runs have the least size."""
+_SHARE, _PARTS = 0.0025, 8
+"""Fraction of the run's paths for one new image, of which there are at most five: the start, the last values, the means of numbers, a
+candidate and a control variate. Number of parts, with images of their own, of larger images that judge start and end where these do not
+tell them apart: few bright pixels, such as those of a visible lamp, may hold most of the noise. They use the paths that are left."""
+_LEAST_LARGER = 1 << 13
+"""Paths that such an image may have in any run whose images show all pixels: twice as many as others of short runs."""
 _LEVEL, _LEVEL_AGAIN = 1e-4, 1e-3
 """False positive rate of each test; that of the test by more paths, which few runs reach."""
 _LEAST_CHANGE = 1e-3
@@ -46,9 +46,9 @@ _OF_RESIDUAL, _OF_PICTURE = 0.1, 0.02
 """Smallest error of a control variate, as a fraction of the mean square residual, and relative to the image."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
-_FIRST_EARLIER, _COST = 4, 0.02
+_FIRST_EARLIER, _COST = 4, 0.005
 """Step from which images of earlier steps are taken for short runs, if their paths are at most this fraction of the steps' paths."""
-_CANDIDATES, _END, _AGAIN = 1, 2, 3
+_SMALL, _END, _AGAIN = 1, 2, 3
 """Indices of the sets of random numbers."""
 
 
@@ -82,39 +82,41 @@ class Verify(Callback):
     """Callback that verifies a run at its end by new images, and returns the best parameters.
 
     Candidates are the start, the parameters after 64, 128, 256, … steps, and the end. The one with the least loss becomes
-    `Result.parameters`; another one than the end must be significantly better. Each image uses 0.4 % of the run's paths, or about 8,000
-    paths in a short run. Where these leave open which end of the run is better, larger images of 1 % judge it, if time is left. Films of
-    more than 4,096 pixels in total get no larger images if a sample of their pixels is rendered. The steps are not affected.
+    `Result.parameters`; another one than the end must be significantly better. All images together use at most 2 % of the run's paths,
+    if these are a million or more. Each uses 0.25 %, or about 4,000 paths in a short run. Where start and end are not told apart, larger
+    images use the paths that are left, if there is time. The steps are not affected.
     """
 
-    _pictures: FreshPictures | None = field(default=None, init=False)
+    _small: FreshPictures | None = field(default=None, init=False)
+    _first: Picture | None = field(default=None, init=False)
+    _candidate: tuple[int, Picture] | None = field(default=None, init=False)
     _earlier: list[EarlierImage] = field(default_factory=list, init=False)
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
-        """Compile the kernels of fresh pictures, so that nothing compiles after the last step."""
+        """Render the start, which also compiles the kernels of fresh pictures, so that nothing compiles after the last step."""
         del fresh, warm
         with phases.phase(phase_times.COMPILING):
-            FreshPictures(run.problem, run.seed, 0, _END).images(run.full())
+            self._small = FreshPictures(run.problem, run.seed, 0, _SMALL)
+            if _other_meshes(run.problem):
+                self._small.images(run.full())
+            else:
+                self._first = self._small.picture(run.initial)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """Render a candidate at steps 64, 128, 256, …, and images for the residual of short runs at steps 4, 8, 16 and 32."""
         del record
-        if run.step < _FIRST_EARLIER or run.step & (run.step - 1) or _other_meshes(run.problem):
+        pictures = self._small
+        if pictures is None or run.step < _FIRST_EARLIER or run.step & (run.step - 1) or _other_meshes(run.problem):
             return
-        if self._pictures is None:
-            self._pictures = FreshPictures(run.problem, run.seed, 0, _CANDIDATES)
         short = run.step < FIRST_CANDIDATE
-        if short and self._pictures.paths > _COST * run.state.samples:
+        if short and pictures.paths > _COST * run.state.samples:
             return
         values = run.full()
-        earlier = EarlierImage.of(run.step, self._pictures, values)
-        self._earlier = [*self._earlier[-1:], earlier]
-        if short:
-            return
-        loss = earlier.loss
-        known = run.state.candidate
-        if known is None or loss < known.loss:
-            run.state.candidate = Candidate(run.step, loss, values)
+        picture = pictures.picture(values)
+        self._earlier = [*self._earlier[-1:], EarlierImage.of(run.step, pictures, picture)]
+        known, loss = run.state.candidate, picture.loss[0]
+        if not short and (known is None or loss < known.loss):
+            run.state.candidate, self._candidate = Candidate(run.step, loss, values), (run.step, picture)
 
     def on_result(self, run: Run, result: Result) -> Result:
         """Verify the result, unless the run was interrupted, terminated or pruned."""
@@ -127,28 +129,29 @@ class Verify(Callback):
 
     def _verified(self, run: Run, result: Result) -> Result:
         problem = run.problem
-        unaveraged = result.parameters
-        pictures, first, result, last, worse = _ends(run, result)
+        pictures, first = self._start(run, result)
+        began = time.perf_counter()
+        result, last, unaveraged = _end(run, result, pictures)
+        seconds = time.perf_counter() - began
+        candidate = None if _other_meshes(problem) else run.state.candidate
+        if candidate is not None and candidate.loss >= last.loss[0]:
+            candidate = None
+        memory, candidate_picture = _memory(run, pictures, last), None
+        if candidate is not None:
+            candidate_picture = self._candidate_picture(pictures, candidate)
+        judged = self._judged(run, result, pictures, (first, last), seconds)
+        worse = _is_worse(pictures, first, last) or judged[0] is not first
         places: dict[str, tuple[Picture, Mapping[str, np.ndarray]]] = {}
         if worse and problem.remeshed_from is None:
             places["start"] = first, result.initial
-        candidate = run.state.candidate
-        if candidate is not None and not _other_meshes(problem) and not candidate.loss >= last.loss[0]:
-            candidate_picture = pictures.picture(candidate.parameters)
-            if _is_worse(pictures, candidate_picture, last):
-                places[f"step {candidate.step}"] = candidate_picture, candidate.parameters
+        if candidate is not None and candidate_picture is not None and _is_worse(pictures, candidate_picture, last):
+            places[f"step {candidate.step}"] = candidate_picture, candidate.parameters
         best = min(places, key=lambda name: places[name][0].loss[0], default="end")
-        memory = _memory(run, pictures, last)
         disagrees = memory is not None and memory.disagrees
-        best_picture = places[best][0] if places else last
-        lines = self._residual(problem, result, unaveraged, pictures, last)
+        best_loss = {"start": judged[0], "end": judged[1]}.get(best, candidate_picture or last).loss
+        lines = self._residual(problem, result, pictures, last, unaveraged)
         if result.standard_error and not (lines or places):
-            differences = pictures.differences(last.images)
-            improved = _is_worse(pictures, last, first)
-            arguments = problem, differences, pictures.references, pictures.weights
-            at_truth = partial(_at_truth, problem, pictures, result) if problem.has_truth else None
-            differs = misfit_of_numbers(*arguments, improved=improved, at_truth=at_truth, sampled=pictures.in_pairs)
-            lines = [differs] if differs else []
+            lines = _misfit_of_numbers(problem, pictures, result, first, last)
         if lines:
             result = replace(result, standard_error={})
         # A Gauss-Newton step solves for all unknowns, so few of them may converge.
@@ -156,15 +159,15 @@ class Verify(Callback):
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
             lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds)
-        lines += _lines(first, last, best, best_picture.loss[0], memory if disagrees else None, worse)
+        lines += _lines(*judged, best, best_loss[0], memory if disagrees else None, worse)
         spp = pictures.paths / (pictures.pixels * len(last.images[0]))
         lines += filter(None, [rare_light(last.images, pictures.weights, spp)])
         verification: dict[str, Any] = {
             "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
-            "start": _numbers(*first.loss),
-            "end": _numbers(*last.loss),
+            "start": _numbers(*judged[0].loss),
+            "end": _numbers(*judged[1].loss),
             "best": best,
-            "best_loss": _numbers(*best_picture.loss),
+            "best_loss": _numbers(*best_loss),
             "paths": pictures.paths,
         }
         if memory is not None:
@@ -177,36 +180,75 @@ class Verify(Callback):
             warnings=[*result.warnings, *lines],
         )
 
+    def _start(self, run: Run, result: Result) -> tuple[FreshPictures, Picture]:
+        """Return the renderer of new images, and the image of the start: the one before the first step, unless the run is long."""
+        pictures = FreshPictures(run.problem, run.seed, _SHARE * run.state.samples, _END)
+        if self._small is not None and self._first is not None and pictures.paths <= self._small.paths:
+            return self._small, self._first
+        return pictures, pictures.picture(result.initial, run.problem.remeshed_from or run.problem)
+
+    def _candidate_picture(self, pictures: FreshPictures, candidate: Candidate) -> Picture:
+        if pictures is self._small and self._candidate is not None and self._candidate[0] == candidate.step:
+            return self._candidate[1]
+        return pictures.picture(candidate.parameters)
+
+    def _judged(
+        self, run: Run, result: Result, pictures: FreshPictures, ends: tuple[Picture, Picture], seconds: float
+    ) -> tuple[Picture, Picture]:
+        """Return images of start and end: larger ones where `ends` do not tell which one is better and the end is worse by the larger ones.
+
+        The larger ones show all pixels. They use the paths that are left, and need time in the run's budget.
+
+        Args:
+            pictures: the renderer of `ends`.
+            ends: images of the start and of the end.
+            seconds: time of the images of the end.
+        """
+        first, last = ends
+        if _is_worse(pictures, first, last) or _is_worse(pictures, last, first):
+            return ends
+        spent = pictures.rendered
+        if self._small is not None and self._small is not pictures:
+            spent += self._small.rendered + len(ends) * self._small.paths  # `_residual` renders these
+        left = (_MOST_SHARE * run.state.samples - spent) / len(ends)
+        left = left if pictures.sampled else max(left, _LEAST_LARGER)
+        larger = FreshPictures(run.problem, run.seed, left, _AGAIN, _PARTS)
+        expected = len(ends) * seconds * larger.paths / pictures.paths
+        if larger.sampled or not pictures.paths < larger.paths <= left or expected > run.time_left():
+            return ends
+        start = run.problem.remeshed_from or run.problem
+        others = larger.picture(result.initial, start), larger.picture(result.parameters)
+        return others if _is_worse(larger, *others, _LEVEL_AGAIN) else ends
+
     def _residual(
-        self,
-        problem: Problem,
-        result: Result,
-        unaveraged: Mapping[str, np.ndarray],
-        pictures: FreshPictures,
-        end: Picture,
+        self, problem: Problem, result: Result, pictures: FreshPictures, end: Picture, unaveraged: Picture
     ) -> list[str]:
         """Return a warning if the images differ from the references by more than noise, and the loss stays or still falls fast.
 
         Args:
-            unaveraged: parameters of the last step, as the images of earlier steps have them.
-            pictures: renderer of the last image, with random numbers independent of those of earlier steps.
-            end: the last image.
+            pictures: renderer of the images of the end.
+            end: image of the result.
+            unaveraged: image of the parameters of the last step, as the images of earlier steps have them.
         """
         earlier = next((one for one in reversed(self._earlier) if one.is_compared(result.steps)), None)
-        if self._pictures is None or earlier is None:
+        small = self._small
+        if small is None or earlier is None:
             return []
+        averages = unaveraged is not end
+        if small is not pictures:
+            unaveraged = small.picture(result.last)
         # Averages over steps lower the loss without progress, so the comparison with an earlier step is of the last step itself.
-        last = EarlierImage.of(result.steps, self._pictures, unaveraged)
+        last = EarlierImage.of(result.steps, small, unaveraged)
         if not last.is_still(earlier):
-            return not_converged(last, earlier, self._pictures)
-        if unaveraged is not result.parameters:
-            last = EarlierImage.of(result.steps, self._pictures, result.parameters)
-        references, weights = self._pictures.references, self._pictures.weights
-        sampled = pictures.sampled or self._pictures.sampled  # each has other pixels then
-        fresh = None if sampled else pictures.differences(end.images)
-        of = last.residuals, earlier.residuals, references, weights, earlier.least, fresh
-        difference = misfit(*of, sampled=self._pictures.in_pairs)
-        at_truth = partial(_at_truth, problem, self._pictures, result) if problem.has_truth else None
+            return not_converged(last, earlier, small)
+        if averages:
+            last = EarlierImage.of(result.steps, small, end if small is pictures else small.picture(result.parameters))
+        own = small.references, small.weights, small.sizes
+        differences = pictures.differences(end.images)
+        # A sample of pixels has others than the images of earlier steps.
+        halves = None if pictures.sampled or small.sampled else (differences[0::2], differences[1::2])
+        difference = misfit(last.residuals, earlier.residuals, *own, earlier.least, halves)
+        at_truth = partial(_at_truth, problem, small, result) if problem.has_truth else None
         if difference is None or difference.is_references_noise(at_truth):
             return []
         cause = "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
@@ -219,37 +261,30 @@ class Verify(Callback):
         return [f"{difference.describe()}, and {still}: {cause}"]
 
 
-def _ends(run: Run, result: Result) -> tuple[FreshPictures, Picture, Result, Picture, bool]:
-    """Return the renderer of new images, the image of the start, the result as `_end` returns it, its image, and whether it is worse.
-
-    If these images show all pixels and do not decide which end of the run is better, larger ones with other random numbers decide. This
-    needs time in the run's budget. They are returned only if the end is worse by them.
-    """
-    start = run.problem.remeshed_from or run.problem
-    pictures = FreshPictures(run.problem, run.seed, _SHARE * run.state.samples, _END)
-    began = time.perf_counter()
-    first = pictures.picture(result.initial, start)
-    seconds = time.perf_counter() - began
-    ended, last = _end(run, result, pictures)
-    worse = _is_worse(pictures, first, last)
-    if not (pictures.sampled or worse or _is_worse(pictures, last, first)):
-        larger = FreshPictures(run.problem, run.seed, _LARGER_SHARE * run.state.samples, _AGAIN, _PARTS)
-        expected = _LARGER_IMAGES * seconds * larger.paths / pictures.paths
-        if larger.paths > pictures.paths and expected < run.time_left():
-            others = larger.picture(result.initial, start), larger.picture(ended.parameters)
-            if _is_worse(larger, *others, _LEVEL_AGAIN):
-                return larger, others[0], ended, others[1], True
-    return pictures, first, ended, last, worse
-
-
-def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Picture]:
-    """Return the result with means of its numbers, unless its picture is worse than with the last values, and that picture."""
+def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Picture, Picture]:
+    """Return the result with means of its numbers, unless its image is worse than with the last values, its image, and that of these."""
     mean = averaged(run, result)
-    picture = pictures.picture(mean.parameters)
-    if mean is result:
-        return result, picture
     last = pictures.picture(result.parameters)
-    return (result, last) if _is_worse(pictures, last, picture) else (mean, picture)
+    if mean is result:
+        return result, last, last
+    picture = pictures.picture(mean.parameters)
+    return (result, last, last) if _is_worse(pictures, last, picture) else (mean, picture, last)
+
+
+def _misfit_of_numbers(
+    problem: Problem, pictures: FreshPictures, result: Result, first: Picture, last: Picture
+) -> list[str]:
+    """Return `misfit_of_numbers` of the image of the end."""
+    line = misfit_of_numbers(
+        problem,
+        pictures.differences(last.images),
+        pictures.references,
+        pictures.weights,
+        pictures.sizes,
+        improved=_is_worse(pictures, last, first),
+        at_truth=partial(_at_truth, problem, pictures, result) if problem.has_truth else None,
+    )
+    return [line] if line else []
 
 
 def _at_truth(problem: Problem, pictures: FreshPictures, result: Result) -> float:

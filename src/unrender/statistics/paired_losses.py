@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 _TILES, _ROBUST = 48, 1.8
 """Maximum number of tiles of an image; maximum ratio of the sharp score to the robust one."""
+DISTANCE = 2
+"""Distance of the pixels of a pair; a reconstruction filter correlates the references' noise in adjacent pixels."""
 _OF_FILTER = 0.03
 """Correlation at a distance of 2 pixels that counts as noise. Mitsuba's default filter, a Gaussian, leaves exp(-4) = 0.018."""
 
@@ -180,25 +183,49 @@ def systematic(
 
 
 def nearby(
-    values: np.ndarray, weights: np.ndarray, earlier: np.ndarray | None = None, distance: int = 2, stride: int = 1
+    values: np.ndarray,
+    weights: np.ndarray,
+    sizes: Sequence[tuple[int, int]],
+    axes: Sequence[int],
+    earlier: np.ndarray | None = None,
 ) -> SystematicDifference:
-    """Estimate the part of the differences that pixels at a distance share, such as differences along edges.
+    """Estimate the part of the differences that pixels at a distance of 2 share, such as differences along edges.
 
     Noise of references with a reconstruction filter has a correlation at a distance of 2. The score is therefore that of the products of
     two pixels minus 3 % of the product at the first one: their sum divided by the root of the sum of their squares.
 
     Args:
         values, weights, earlier: see `systematic`.
-        distance: distance in the order of the pixels.
-        stride: distance in the order between two products.
+        sizes: (height, width) of the images, whose pixels follow each other row by row. () for a sample of pairs: two pairs of consecutive
+            pixels each, the first in a row, the second in a column.
+        axes: 0 for pairs in columns, 1 for those in rows.
     """
     other = values if earlier is None else earlier
     one, two = (np.asarray(of, np.float64) * weights[:, None] for of in (values, other))
-    first = one[:-distance:stride]
-    products = (first * two[distance::stride]).sum(axis=1)
-    beyond = products - _OF_FILTER * (first * two[:-distance:stride]).sum(axis=1)
-    counted = float((weights[:-distance:stride] * weights[distance::stride]).sum()) * values.shape[1]
-    total, deviation = float(beyond.sum()), float(np.sqrt(np.square(beyond).sum()))
-    return SystematicDifference(
-        float(products.sum()) / max(counted, 1e-300), total / deviation if deviation > 0 else 0.0
-    )
+
+    def pairs(array: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [pair for axis in axes for pair in _pairs(array, sizes, axis)]
+
+    total = squares = shared = counted = 0.0
+    for (here, _), (same, there), (weight, partner) in zip(
+        pairs(one), pairs(two), pairs(weights[:, None]), strict=True
+    ):
+        products = (here * there).sum(axis=-1)
+        beyond = products - _OF_FILTER * (here * same).sum(axis=-1)
+        total, squares = total + float(beyond.sum()), squares + float(np.square(beyond).sum())
+        shared, counted = shared + float(products.sum()), counted + float((weight * partner).sum())
+    deviation, channels = math.sqrt(squares), values.shape[1]
+    return SystematicDifference(shared / max(counted * channels, 1e-300), total / deviation if deviation > 0 else 0.0)
+
+
+def _pairs(values: np.ndarray, sizes: Sequence[tuple[int, int]], axis: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the first and the second pixels of the pairs of each image, (..., C)."""
+    if not sizes:
+        pairs = values[: len(values) // 4 * 4].reshape(-1, 2, 2, values.shape[1])[:, 1 - axis]
+        return [(pairs[:, 0], pairs[:, 1])]
+    images, start = [], 0
+    for height, width in sizes:
+        image = values[start : start + height * width].reshape(height, width, -1).swapaxes(0, axis)
+        images.append((image[:-DISTANCE], image[DISTANCE:]))
+        start += height * width
+    return images
