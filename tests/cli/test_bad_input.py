@@ -194,7 +194,10 @@ def _edit(name: str, old: str, new: str):
 
 SPOILT = [
     (_nan, "problem.toml:8: views[0].reference: photo.exr: 1 pixels are NaN or infinite, the first in row 1, column 2"),
-    (_wrong_size, "problem.toml:8: views[0].reference: 4x6 pixels (width x height), but the film of sensor 0 is 6x4"),
+    (
+        _wrong_size,
+        "problem.toml:8: views[0].reference: photo.exr: 4x6 pixels (width x height), but the sensor's film is 6x4",
+    ),
     (lambda folder: (folder / "photo.exr").write_bytes(b"v/1\x01"), "photo.exr: cannot be read as a picture"),
     (lambda folder: (folder / "photo.exr").unlink(), "problem.toml:8: views[0].reference: photo.exr: no such file"),
     (lambda folder: (folder / "wall.xml").unlink(), "problem.toml:1: scene: wall.xml: no such file"),

@@ -44,6 +44,23 @@ def test_every_phase_is_named_in_its_order_and_its_time_told(unrender, problem: 
     assert "compiling" in page
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", "quad", "-s", "lr=1"], "no option lr"),
+        (["run", "quad", "-m", "nothing"], "unknown method nothing"),
+        (["run", "quad", "--variant", "nothing"], "--variant nothing"),
+        (["run", "quad", "--out", "problem.toml"], "--out problem.toml: a file"),
+        (["compare", "quad", "-s", "lr=1"], "no option lr"),
+    ],
+)
+def test_options_are_refused_before_anything_is_loaded(unrender, problem: Path, words: list[str], message: str) -> None:
+    answer = unrender(*words)
+    assert answer.status == 2
+    assert message in answer.error
+    assert not answer.out
+
+
 def test_what_will_hardly_do_is_said_before_the_first_step(unrender, problem: Path, mitsuba_variant: str) -> None:
     words = ["run", "problem.toml", "--steps", 1, "--out", "result", "--variant", mitsuba_variant, *QUICK]
     answer = unrender(*words, "-m", "rcv", "-s", "learning_rate=2")

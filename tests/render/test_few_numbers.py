@@ -179,6 +179,11 @@ def test_auto_finds_the_right_values(name: str) -> None:
     assert result.status == "finished"
     errors = problem.parameter_error(result.parameters)
     assert max(errors.values()) < tolerance, errors
+    if name == "sunlight":  # two returned lengths were 0.2 and 1.1
+        (direction,) = result.parameters.values()
+        assert np.linalg.norm(direction) == pytest.approx(1.0, abs=1e-5)
+        (error,) = result.standard_error.values()
+        assert np.linalg.norm(error) < 0.05
 
 
 LIGHTS = {

@@ -225,7 +225,7 @@ MISTAKES = [
         "photo.exr",
         "scenes/paint.exr",
         6,
-        "views[0].reference: 8x8 pixels (width x height), but the film of sensor 0 is 6x4",
+        "views[0].reference: paint.exr: 8x8 pixels (width x height), but the sensor's film is 6x4",
     ),
     ("photo.exr", "photo.gif", 6, "views[0].reference: "),
     ("[[views]]", "[[views]]\nsensor = 1", 6, "views[0].sensor: expected 0, the only sensor, got 1"),

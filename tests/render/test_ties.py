@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +154,8 @@ def test_values_are_tied_unless_they_are_encoded_differently(role: Role) -> None
         ([{"keys": [LEFT, LAMPS[0]]}], "has the shape (3,), left.bsdf.alpha.value (); expected equal shapes"),
         ([{"keys": [LEFT, RIGHT]}, {"key": RIGHT}], "is an unknown of its own"),
         ([{"key": "a", "keys": [LEFT, RIGHT]}, {"key": "b", "keys": [RIGHT]}], "is tied to a already"),
-        ([{"keys": {LEFT: 0.0}}], "expected a factor other than 0"),
+        ([{"keys": {LEFT: 0.0}}], f"keys: {LEFT}: expected a finite factor other than 0, got 0.0"),
+        ([{"keys": {LEFT: math.nan}}], f"keys: {LEFT}: expected a finite factor other than 0, got nan"),
         (
             [{"keys": {LAMPS[0]: -1.0, LAMPS[1]: 1.0}}],
             "no range of values is within the ranges of key.intensity.value and fill",
@@ -219,7 +221,7 @@ def test_a_problem_file_has_keys_and_factors_and_a_run_folder_keeps_them(tmp_pat
             "no parameter sky.radiance.valu",
         ),
         ('keys = "a.bsdf.reflectance.value"', "problem.toml:4", "scene parameters that share one value"),
-        ('keys = { "a.bsdf.reflectance.value" = 0 }', "problem.toml:4", "expected a factor other than 0"),
+        ('keys = { "a.bsdf.reflectance.value" = 0 }', "problem.toml:4", "expected a finite factor other than 0"),
     ],
 )
 def test_a_wrong_tie_in_a_file_is_one_line_that_names_its_line(

@@ -247,7 +247,7 @@ def test_a_file_has_worlds_and_its_run_resumes(tmp_path: Path) -> None:
         ('with = { "lamp.intensity.value" = -1 }', r"views\[0\].with: lamp.intensity.value: expected at least 0"),
         ('with = { "lamp.intensity.value" = [1, 2] }', r"views\[0\].with: lamp.intensity.value: "),
         ('scene = "missing.xml"', r"views\[0\].scene: "),
-        ('scene = "other.xml"', r"views\[0\].reference: 8x8 pixels"),
+        ('scene = "other.xml"', r"views\[0\].reference: \w+.npy: 8x8 pixels"),
         ('scene = "other.xml"\nsensor = 3', r"views\[0\].sensor: expected 0, the only sensor, got 3"),
         ("when = 3", r"views\[0\].when: no such field; there are reference, sensor, weight, mask, with, scene"),
     ],
@@ -267,6 +267,21 @@ def test_a_part_of_the_views_may_know_an_unknown() -> None:
         assert len(unpacked(packed(made, [view], ray), ray).views) == 1
     with pytest.raises(InputError, match=f"{LAMP} is known in all views"):
         made.replaced(views=made.original_views[1:])
+
+
+def test_a_tie_may_have_a_member_that_all_views_know() -> None:
+    """It was refused, though the other member determines the value."""
+    left = "left.intensity.value"
+    view = ur.View(picture(left=2.0, right=0.0), known={LAMP: DARK})
+    tie = ur.Parameter("lamps", keys=[left, LAMP], initial=1.5)
+    made = ur.Problem(scene, [tie], [view])
+    alone = ur.Problem(scene, [ur.Parameter(left, initial=1.5)], [view])
+    estimator = ur.PathGradient(spp=8)
+    (one,), (other,) = (ur.estimate(p, estimator).gradient.values() for p in (made, alone))
+    assert np.abs(other).min() > 0
+    np.testing.assert_allclose(one, other, rtol=1e-5)
+    with pytest.raises(InputError, match="lamps is known in all views"):
+        made.replaced(views=[ur.View(picture(), known={LAMP: DARK, left: DARK})])
 
 
 def test_a_stage_has_a_scene_though_the_first_view_knows_what_is_fixed(tmp_path: Path) -> None:

@@ -92,6 +92,7 @@ def test_advice_on_few_steps_suits_the_run() -> None:
     )
     assert budget.few_steps(4.0, 3, spp=2).endswith("; use more seconds or a smaller picture (resolution)")
     assert not budget.few_steps(4.0, 20, spp=16)
+    assert "; use at least 13 seconds or a smaller picture" in budget.few_steps(4.0, 3, enough=12.1)
 
 
 def test_a_budget_of_few_steps_is_told_after_the_first() -> None:
@@ -120,6 +121,28 @@ def test_a_budget_of_few_steps_is_told_at_the_end_if_the_first_were_quick(monkey
     assert found.steps < 20
     (line,) = (line for line in found.warnings if "allows about" in line)
     assert f"allows about {found.steps} steps" in line
+
+
+def test_steps_that_become_quick_leave_no_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first three steps took 0.3 s, those that followed a hundredth of it; the line still said that the budget allows 6 steps."""
+    now = [100.0]
+
+    class Quick(Callback):
+        def on_step(self, run: Any, record: Any) -> None:
+            noted.append([line for line in run.warnings if "allows about" in line])
+            object.__setattr__(estimator, "pause", 0.1 if run.step < 3 else 0.001)
+
+    def passed(seconds: float) -> None:
+        now[0] += seconds
+
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time, "sleep", passed)
+    monkeypatch.setattr(budget, "slowdown", lambda: 1.0)
+    estimator, noted = slow(0.1), []
+    found = ur.optimize(problem(), estimator, ur.optimizers.Adam(0.01), seconds=0.6, callbacks=[Quick()])
+    assert found.steps > 20
+    assert "; use at least 2 seconds" in noted[3][0]
+    assert not found.warnings
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,9 @@ READABLE = (".exr", ".hdr", ".rgbe", ".pfm", ".png", ".jpg", ".jpeg", ".bmp", ".
 """File name extensions that `read` supports."""
 
 _ORIENTATION = 0x0112
-_OPAQUE = 0.999
-"""Least floating-point alpha that counts as 1."""
+OPAQUE = 0.999
+"""Least alpha that counts as 1."""
+_COUNTED = "only its opaque pixels count"
 
 
 @dataclass(frozen=True)
@@ -205,7 +206,7 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
         opacity = _opacity(stored[..., -1]) if bitmap.has_alpha() and not encoded else None
         return Picture(values, alpha=opacity, labelled_xyz=labelled, premultiplied=opacity is not None)
     coverage = _coverage(stored[..., -1]) if transparent and alpha else None
-    note = f", its alpha {'left out' if coverage is None else 'taken as mask'}" if transparent else ""
+    note = f", {'its alpha left out' if coverage is None else _COUNTED}" if transparent else ""
     return Picture(values, f"{bits}-bit sRGB, linearised{note}", coverage)
 
 
@@ -217,7 +218,7 @@ def _coverage(stored: np.ndarray) -> np.ndarray:
 def _opacity(alpha: np.ndarray) -> np.ndarray | None:
     """Return floating-point alpha in [0, 1]; None if it is 1 everywhere up to the rounding of a film's filter."""
     values = np.clip(np.nan_to_num(alpha.astype(np.float32)), 0, 1)
-    return values if values.min() < _OPAQUE else None
+    return values if values.min() < OPAQUE else None
 
 
 def _colour_channels(bitmap: Any) -> np.ndarray:
@@ -248,7 +249,7 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
             return Picture(values.astype(np.float32))
         transparent = array.shape[2] in (2, 4) and bool((array[..., -1] < 2**bits - 1).any())
         coverage = _coverage(array[..., -1]) if alpha and transparent else None
-        note = ", its alpha taken as mask" if coverage is not None else ""
+        note = f", {_COUNTED}" if coverage is not None else ""
         return Picture(srgb_to_linear(values).astype(np.float32), f"{bits}-bit sRGB, linearised{note}", coverage)
     if array.dtype.kind in "iu" and not ((values == 0) | (values == 1)).all():
         raise InputError(

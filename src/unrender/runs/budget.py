@@ -69,8 +69,8 @@ class Budget(Callback):
             run.stop("seconds")
         if run.last_step is not None and run.step and time.perf_counter() + 0.5 * run.clock / run.step >= run.last_step:
             run.stop("seconds")
-        if (run.stopped == "seconds" and run.step) or (run.step == _MEASURED and not run.stopped):
-            self._warn_of_few_steps(run)
+        if run.step and (run.stopped or run.step == _MEASURED):
+            _warn_of_few_steps(run)
         if run.state.skipped_in_a_row >= _MOST_SKIPPED:
             run.stop(NON_FINITE)
             line = f"{_MOST_SKIPPED} steps in a row were not finite: the run was stopped; the result holds the last finite values"
@@ -85,18 +85,6 @@ class Budget(Callback):
         self._looked = now
         end = min((_END_SHARE * run.seconds + _END_SECONDS) * min(slowdown(), MOST_SLOWDOWN), 0.5 * run.seconds)
         run.last_step = max(run.deadline - end, self._least)
-
-    def _warn_of_few_steps(self, run: Run) -> None:
-        """Warn once if the time of the first steps shows that the budget allows few steps, or at the end if it did."""
-        if run.told_of_few_steps or run.seconds is None or run.clock <= 0.0:
-            return
-        expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
-        steps, spp = max(expected, run.step), getattr(run.estimator, "spp", None)
-        whole = spp if isinstance(spp, int) else None
-        line = few_steps(run.seconds, steps, run.steps, whole, run.problem.pixels > _FEW_PIXELS)
-        if line:
-            run.warnings.append(line)
-            run.told_of_few_steps = True
 
 
 def slowdown() -> float:
@@ -115,7 +103,35 @@ def slowdown() -> float:
     return 1.0 + waiting / running if running else 1.0
 
 
-def few_steps(seconds: float, steps: int, most: int | None = None, spp: int | None = None, large: bool = False) -> str:
+def _warn_of_few_steps(run: Run) -> None:
+    """Warn if the time of the first steps shows that the budget allows few steps. At the end the line has the number of steps taken."""
+    if run.seconds is None or run.clock <= 0.0:
+        return
+    expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
+    spp, large = getattr(run.estimator, "spp", None), run.problem.pixels > _FEW_PIXELS
+    spp, steps = spp if isinstance(spp, int) else None, max(expected, run.step)
+    line = few_steps(run.seconds, steps, run.steps, spp, large, _enough(run))
+    run.warnings[:] = [known for known in run.warnings if known != run.few_steps] + [line] * bool(line)
+    run.few_steps = line
+
+
+def _enough(run: Run) -> float:
+    """Return the seconds that 20 steps need, with everything before and after the steps if the budget covers it."""
+    steps = _FEW_STEPS * run.clock / run.step
+    if run.deadline is None or run.seconds is None:
+        return steps
+    before = max(time.perf_counter() - (run.deadline - run.seconds) - run.clock, 0.0)
+    return (before + steps + _END_SECONDS) / (1.0 - _END_SHARE)
+
+
+def few_steps(
+    seconds: float,
+    steps: int,
+    most: int | None = None,
+    spp: int | None = None,
+    large: bool = False,
+    enough: float | None = None,
+) -> str:
     """Return a line with advice if a budget allows fewer than 20 steps and fewer than `most`; else "".
 
     Args:
@@ -123,10 +139,11 @@ def few_steps(seconds: float, steps: int, most: int | None = None, spp: int | No
         spp: samples per pixel of a step, of which it advises a quarter, at least 2, since gradients without bias need two groups of
             samples; None if unknown.
         large: whether the views have more pixels than the number that it advises per step.
+        enough: seconds that 20 steps need; None if unknown.
     """
     if steps >= min(_FEW_STEPS, most or _FEW_STEPS):
         return ""
-    ways = ["use more seconds"]
+    ways = ["use more seconds" if enough is None else f"use at least {max(math.ceil(enough), 1)} seconds"]
     if spp is not None and spp > _LEAST_SPP:
         ways.append(f"fewer samples (--set spp={max(spp // 4, _LEAST_SPP)})")
     ways.append("a smaller picture (resolution)")

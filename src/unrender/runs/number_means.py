@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -65,6 +66,25 @@ def averaged(run: Run, result: Result) -> Result:
         standard_error=result.standard_error if set(run.problem.shapes()) - set(shapes) else errors,
         adapted=[*result.adapted, f"numbers are means of their last steps: {grouped(steps)}"],
     )
+
+
+def unit_directions(problem: Problem, result: Result) -> Result:
+    """Return the result with directions (3,) of length 1, and their standard errors. No picture depends on the length."""
+    lengths = {
+        key: float(np.linalg.norm(result.parameters[key]))
+        for key, unknown in problem.unknowns.items()
+        if unknown.is_direction
+    }
+
+    def scaled(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {
+            key: np.asarray(x / lengths[key], np.float32) if lengths.get(key) else np.asarray(x)
+            for key, x in values.items()
+        }
+
+    if not lengths:
+        return result
+    return replace(result, parameters=scaled(result.parameters), standard_error=scaled(result.standard_error))
 
 
 def _means(

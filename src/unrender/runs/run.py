@@ -52,7 +52,7 @@ class Run:
         skipped: number of steps that were not applied.
         ahead: number of steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
         warnings: one line each.
-        told_of_few_steps: whether one of them says that the budget allows few steps.
+        few_steps: the one of them that says that the budget allows few steps; "" for none.
         stopped: reason to end after the current step; "" for none.
         deadline: time of `time.perf_counter` at which everything should be finished, with final images; None without such a budget.
         last_step: time of `time.perf_counter` at which the steps should end, so that everything fits into the budget; None if the budget
@@ -81,7 +81,7 @@ class Run:
     skipped: int = 0
     ahead: int = 0
     warnings: list[str] = field(default_factory=list)
-    told_of_few_steps: bool = False
+    few_steps: str = ""
     stopped: str = ""
     last_step: float | None = None
     deadline: float | None = None
@@ -167,7 +167,7 @@ class Run:
         state, noise, executor = self.state, self.state.noise, self.problem.executor
         candidate = None if state.candidate is None else vars(state.candidate)
         parts = {"sent": executor.snapshot(), "candidate": candidate, "ahead": self.ahead or None}
-        parts |= {"told_of_few_steps": self.told_of_few_steps or None}
+        parts |= {"few_steps": self.few_steps or None}
         parts |= {"numbers": state.numbers.snapshot()}
         return {
             "parameters": self.parameters,
@@ -188,7 +188,7 @@ class Run:
         """Restore a snapshot, which has been checked to be one of this run's."""
         self.parameters, self.step, self.clock = saved["parameters"], saved["step"], saved["clock"]
         self.skipped, self.warnings, self.ahead = saved["skipped"], list(saved["warnings"]), saved.get("ahead", 0)
-        self.told_of_few_steps = saved.get("told_of_few_steps") is True
+        self.few_steps = str(saved.get("few_steps") or "")
         state = self.state
         state.estimator, state.optimizer = saved["estimator"], saved["optimizer"]
         state.noise = GradientNoise(**saved["noise"])

@@ -19,7 +19,7 @@ from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
 from unrender.runs.earlier_image import FIRST_CANDIDATE, EarlierImage, not_converged
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
-from unrender.runs.number_means import averaged
+from unrender.runs.number_means import averaged, unit_directions
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
@@ -124,7 +124,7 @@ class Verify(Callback):
             return result
         started = time.perf_counter()
         with phases.phase(phase_times.VERIFYING):
-            result = self._verified(run, result)
+            result = unit_directions(run.problem, self._verified(run, result))
         return phase_times.with_phase(result, phase_times.VERIFYING, time.perf_counter() - started)
 
     def _verified(self, run: Run, result: Result) -> Result:

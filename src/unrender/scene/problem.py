@@ -26,7 +26,7 @@ from unrender.scene.coordinates import Coordinates
 from unrender.scene.errors import FieldError
 from unrender.scene.executor import LOCAL, Executor
 from unrender.scene.mesh_checks import check_surfaces
-from unrender.scene.parameter import Parameter, ParameterSettings, scene_keys, tied, ties_of
+from unrender.scene.parameter import Parameter, ParameterSettings, members_of, scene_keys, tied, ties_of
 from unrender.scene.references import References, likelihood_scale
 from unrender.scene.surfaces import Surface
 from unrender.scene.unknown import Unknown
@@ -136,7 +136,7 @@ class Problem(ViewLosses):
         path = Path(scene) if isinstance(scene, (str, Path)) else None
         renderer, located = _opened(scene, max_depth, checked_parameters, original_views, expressions or {})
         if not partial:
-            check_determined(original_views, scene_keys(checked_parameters))
+            check_determined(original_views, members_of(checked_parameters))
         unknowns = _unknowns(checked_parameters, renderer, truth or {}, surfaces or {})
         checked_views, view_notices = check_views(located, renderer, checked_loss)
         check_loss_function(checked_loss, np.asarray(checked_views[0].reference))

@@ -72,6 +72,11 @@ class Unknown:
     def _scale(self) -> float:
         return open_scale(self.initial) if None in self.bounds else 1.0
 
+    @property
+    def is_direction(self) -> bool:
+        """Return whether the unknown is one direction (3,), of which no picture shows the length."""
+        return self.measure.role == "direction" and self.initial.shape == _VECTOR
+
     def project(self, values: Array) -> Array:
         """Return the nearest values inside the bounds, less the margin."""
         return project(values, *self.bounds, self._scale)
@@ -80,7 +85,7 @@ class Unknown:
         """Return `values` projected onto the bounds. A direction (3,) whose length is outside [1e-3, 1e3] is normalised."""
         inside = self.project(values)
         # Normalisation at every step would look like a projection onto bounds to the optimizer.
-        if self.measure.role != "direction" or self.initial.shape != _VECTOR:
+        if not self.is_direction:
             return inside
         length = float(np.linalg.norm(arrays.numpy(inside)))
         return inside / arrays.scalar(length, inside) if 0.0 < length < 1e-3 or length > 1e3 else inside

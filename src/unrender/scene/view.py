@@ -18,8 +18,9 @@ class View:
 
     Args:
         reference: file, or array (H, W, 3), in linear RGB. 8- and 16-bit files are converted from sRGB. An array has the film's format:
-            luminance (H, W) or XYZ (H, W, 3) according to the film's `pixel_format`. Alpha of 8- and 16-bit images multiplies the mask.
-            Alpha of floating-point images is ignored, because films store premultiplied colours.
+            luminance (H, W) or XYZ (H, W, 3) according to the film's `pixel_format`. Of 8- and 16-bit images with alpha only opaque pixels
+            count, since rendered edges mix an object with what is behind it. Alpha of floating-point images is ignored, because films
+            store premultiplied colours.
         sensor: index of the scene's sensor.
         weight: factor of this view's loss, > 0.
         mask: file or array (H, W), in [0, 1], the factor of each pixel's loss; None for ones.

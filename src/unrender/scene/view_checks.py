@@ -10,8 +10,9 @@ References are linear in what the camera saw. Files with 8 and 16 bits per chann
 | `luminance`, `luminance_alpha` | (H, W), (H, W, 1) or (H, W, 2) | with the luminance of the image |
 
 A floating-point file with channels R, G and B is refused for a film of XYZ, since `mi.util.write_bitmap` names XYZ values so. Alpha of
-8- and 16-bit pictures multiplies the view's mask. Alpha of floating-point pictures is left out with a notice, since Mitsuba's films
-multiply colours with it. Negative values are refused, unless the film's reconstruction filter has negative lobes.
+8- and 16-bit pictures restricts the view's mask to opaque pixels: at edges, a rendered pixel mixes the object with what is behind it.
+Alpha of floating-point pictures is left out with a notice, since Mitsuba's films multiply colours with it. Negative values are refused,
+unless the film's reconstruction filter has negative lobes.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Reference:
 
     Attributes:
         values: (H, W, 3) float32, linear RGB; luminance is repeated in each channel.
-        alpha: (H, W) in [0, 1] for an 8- or 16-bit image with alpha; else None.
+        alpha: (H, W), 1 for opaque pixels and 0 for others of an 8- or 16-bit image with alpha; else None.
         limited: whether values are clipped at white.
         notices: one line for each conversion.
         loses_alpha: whether the source has alpha that becomes no mask, and the film stores none.
@@ -63,8 +64,8 @@ class Reference:
 def read_reference(source: Any, form: PictureFormat) -> Reference:
     """Read the reference from a file or an array.
 
-    An array, or a .npy file, contains the film's format. Other files specify their own colour space. Alpha of 8- and 16-bit images
-    becomes a mask. Alpha of floating-point images is ignored, because films store premultiplied colours.
+    An array, or a .npy file, contains the film's format. Other files specify their own colour space. Opaque pixels of 8- and 16-bit images
+    become a mask. Alpha of floating-point images is ignored, because films store premultiplied colours.
 
     Raises `InputError` as `images.read` does, and if the number of channels differs from the film's or radiance is negative. It also
     does so for floating-point files labelled RGB of films that store XYZ: `mi.util.write_bitmap` labels XYZ values so.
@@ -105,7 +106,7 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
         notices.append("is 0 at every pixel; check the file, or leave the view out")
     full = np.array(np.broadcast_to(values, (*values.shape[:2], 3)))
     loses_alpha = image.premultiplied and not form.stores_alpha
-    alpha = None if image.premultiplied else image.alpha
+    alpha = None if image.premultiplied else _opaque(image.alpha)
     return Reference(full, alpha, bool(image.notice), tuple(notices), loses_alpha)
 
 
@@ -130,8 +131,16 @@ def _of_aov(source: Any, name: str) -> Reference:
     if name == "depth":
         _check_not_negative(values)
     full = np.array(np.broadcast_to(values, (*values.shape[:2], 3)))
-    alpha = image.alpha if name == "albedo" and not image.premultiplied else None
+    alpha = _opaque(image.alpha) if name == "albedo" and not image.premultiplied else None
     return Reference(full, alpha, False, tuple(notices))
+
+
+def _opaque(alpha: np.ndarray | None) -> np.ndarray | None:
+    """Return 1 for opaque pixels and 0 for others, (H, W); None for None.
+
+    The colour under straight alpha is the object's alone, but a rendered pixel at an edge mixes it with what is behind.
+    """
+    return None if alpha is None else (alpha >= images.OPAQUE).astype(np.float32)
 
 
 def _is_of_film(source: Any) -> bool:
@@ -221,12 +230,12 @@ def _check_view(
     limited, alpha, loses_alpha = None, None, False  # the reference, if it is clipped at white; its alpha
     try:
         if isinstance(view.reference, StoredPicture):
-            _check_size(view.reference, height, width, view.sensor)
+            _check_size(view.reference, height, width, view.reference)
             reference = view.reference
         else:
             read = read_reference(view.reference, format_of(films, view.sensor))
             reference, alpha, loses_alpha = read.values, read.alpha, read.loses_alpha
-            _check_size(reference, height, width, view.sensor)
+            _check_size(reference, height, width, view.reference)
             notices += [f"{owner}: reference {notice}" for notice in read.notices]
             limited = reference if read.limited else None
     except InputError as error:
@@ -236,7 +245,7 @@ def _check_view(
         try:
             mask = images.read(view.mask, linearise=False).values
             images.check_metadata(view.mask)
-            _check_size(mask, height, width, view.sensor)
+            _check_size(mask, height, width, view.mask)
             mask = mask.mean(axis=2)
             if mask.min() < 0 or mask.max() > 1:
                 raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
@@ -247,7 +256,8 @@ def _check_view(
     if alpha is not None:
         mask = alpha if mask is None else np.asarray(mask) * alpha
         if not mask.any():
-            raise wrong("reference", "its alpha times the mask is 0 everywhere, so no pixel would count")
+            what = "its alpha is below 1 wherever the mask is above 0, so no pixel would count; save it without alpha"
+            raise wrong("reference", what)
     counted = None if mask is None else np.asarray(mask) > 0
     if tell_saturated and limited is not None and (white := _saturated(limited, counted)) >= _WHITE:
         notices.append(
@@ -262,11 +272,11 @@ def _saturated(reference: np.ndarray, counted: np.ndarray | None) -> float:
     return float(np.mean(white if counted is None else white[counted]))
 
 
-def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, sensor: int) -> None:
+def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, source: Any) -> None:
     if values.shape[:2] != (height, width):
+        name = f"{Path(source).name}: " if isinstance(source, (str, Path)) else ""
         raise InputError(
-            f"{values.shape[1]}x{values.shape[0]} pixels (width x height), "
-            f"but the film of sensor {sensor} is {width}x{height}"
+            f"{name}{values.shape[1]}x{values.shape[0]} pixels (width x height), but the sensor's film is {width}x{height}"
         )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,10 +64,15 @@ def of_views(
     )
 
 
-def check_determined(views: Sequence[View], keys: Sequence[str]) -> None:
-    """Raise `FieldError` if all views know one of these keys. The views must be all views of a problem."""
-    for key in keys:
-        if all(key in (view.known or {}) for view in views):
+def check_determined(views: Sequence[View], unknowns: Mapping[str, Collection[str]]) -> None:
+    """Raise `FieldError` if all views know all parameters of the scene that an unknown sets.
+
+    Args:
+        views: all views of a problem.
+        unknowns: {key of an unknown: keys of the scene that it sets}.
+    """
+    for key, members in unknowns.items():
+        if all(set(members) <= (view.known or {}).keys() for view in views):
             what = f"{key} is known in all views, so none determines it; leave it out of one, or of the unknowns"
             raise FieldError(("views", 0, "with"), what, "view 0: known")
 

@@ -286,11 +286,10 @@ def _methods_and_settings(
     names: str | None, typed: Mapping[str, str]
 ) -> tuple[list[Method], dict[str, dict[str, str]]]:
     """Return the methods, and the validated settings of each. Raise `InputError`."""
-    with phases.phase("loading"):
-        chosen = _parse_methods(names)
-        by_method = _settings_by_method(chosen, typed)
-        for one in chosen:
-            one.start(by_method[one.name])
+    chosen = _parse_methods(names)
+    by_method = _settings_by_method(chosen, typed)
+    for one in chosen:
+        one.start(by_method[one.name])
     return chosen, by_method
 
 

@@ -85,21 +85,22 @@ def run(
     from unrender.runs.progress import Progress
 
     console, command = Console(highlight=False), arguments.command_line(context)
-    with Progress(console) as progress:
-        with phases.phase("loading"):
-            from unrender.app.cli.execute import RunOrder, execution, introduce
-            from unrender.runs.optimize import optimize
-
-            chosen, processes = _method(method_name), distribution.check(workers, compress, insecure)
-            if stages.is_stages(problem):
-                stages.refuse_settings(method_name, values, options, workers, no_cache)
-                first = seed if "--seed" in arguments.typed_options(context) else None
-                plan = (steps, seconds), first, out, overwrite, variant, threads, command, checkpoint_every, final_spp
-                return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
-            chosen.start(values)
-            arguments.check_problem(problem, options, not no_cache)
+    with Progress(console) as progress:  # options are refused before the slow imports of "loading"
+        chosen, processes = _method(method_name), distribution.check(workers, compress, insecure)
+        if stages.is_stages(problem):
+            stages.refuse_settings(method_name, values, options, workers, no_cache)
+            first = seed if "--seed" in arguments.typed_options(context) else None
+            plan = (steps, seconds), first, out, overwrite, variant, threads, command, checkpoint_every, final_spp
+            return stages.run_remaining(stages.begin(Path(problem), *plan), console, progress)
+        chosen.start(values)
+        arguments.check_variant(variant)
         folder = arguments.folder(out, f"{arguments.short_name(problem)}-{chosen.name}", overwrite, "run.json", "lock")
         try:
+            with phases.phase("loading"):
+                from unrender.app.cli.execute import RunOrder, execution, introduce
+                from unrender.runs.optimize import optimize
+
+                arguments.check_problem(problem, options, not no_cache)
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)

@@ -41,10 +41,7 @@ def cameras(traits: Traits) -> Plan | None:
         return None
     spp = traits.options.spp or sampling.within(constants.image_spp, constants.image_paths // problem.pixels)
     spp, derivative_spp = max(spp, 2), max(spp // constants.per_derivative, constants.fewest_derivative)
-    reason = (
-        f"Gauss-Newton steps of cameras by perturbed renders, {spp} samples per pixel of the image, {derivative_spp} of those; "
-        "the mean of all steps' models"
-    )
+    reason = f"Gauss-Newton steps for cameras from perturbed renders {_samples(spp, derivative_spp)}; the mean of all steps' models"
     widths = widths_of(traits.options.sigma, problem, traits.poses)
     largest = {key: constants.pose_reach * width for key, width in widths.items()}
     estimator = GaussNewton(spp, derivative_spp, tolerance=_damping(traits), largest=largest)
@@ -97,7 +94,7 @@ def few_numbers(traits: Traits) -> Plan | None:
         if not problem.loss.linear:
             return None
         plateau = not _explained(problem, trial) > least
-    why = f"change their form with {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
+    why = f"are not linear in {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
     plan = Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
     made = best_start(traits, keys, plan)
@@ -243,10 +240,14 @@ def _elements(traits: Traits, keys: tuple[str, ...]) -> int:
 
 def _reason(traits: Traits, keys: tuple[str, ...], estimator: GaussNewton) -> str:
     elements = _elements(traits, keys)
+    numbers = f"{elements} number{'s' * (elements > 1)}"
     return (
-        f"Gauss-Newton steps of {elements} number{'s' * (elements > 1)} by perturbed renders, {estimator.spp} samples per pixel of the "
-        f"image, {estimator.derivative_spp} of those"
+        f"Gauss-Newton steps for {numbers} from perturbed renders {_samples(estimator.spp, estimator.derivative_spp)}"
     )
+
+
+def _samples(spp: int, derivative_spp: int) -> str:
+    return f"({spp} samples per pixel of the image, {derivative_spp} of each perturbed render)"
 
 
 def _damping(traits: Traits) -> float:
