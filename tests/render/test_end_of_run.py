@@ -6,11 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
+import numpy as np
 import pytest
 
 import unrender as ur
 from tiers import quick
+from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.protocols import Callback
+from unrender.runs import verify
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.verify import Verify
 
@@ -58,3 +62,31 @@ def test_without_a_warm_up_kernels_compile_after_the_last_step(
     for hook in (RunWriter, Verify):
         monkeypatch.setattr(hook, "on_warm_up", lambda *_: None)
     assert _compiled(tmp_path / "late", name)
+
+
+def _camera(angle: float) -> dict[str, Any]:
+    origin = [4.0 * np.sin(angle), 1.5, 4.0 * np.cos(angle)]
+    film = {"type": "hdrfilm", "width": 48, "height": 40, "rfilter": {"type": "box"}}
+    to_world = mi.ScalarTransform4f().look_at(origin, [0, 0, 0], [0, 1, 0])
+    return {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
+
+
+@pytest.mark.parametrize("key", ["cube.translation", "second.translation"])
+def test_a_pose_that_several_views_show_is_verified(key: str) -> None:
+    """Samples of pixels show moving shapes and cameras, too: a sample of one view has no standard error."""
+    scene = {
+        "type": "scene",
+        **{name: _camera(angle) for name, angle in (("first", 0.0), ("second", 1.0), ("third", 2.5))},
+        "cube": {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.6)},
+        "sky": {"type": "constant"},
+    }
+    parameters = [ur.Parameter(key, initial=[0.0, 0.0, 0.0])]
+    made = ur.Problem(scene, parameters, [ur.View(np.zeros((40, 48, 3)), view) for view in range(3)])
+    views = [ur.View(ur.render(made, view=view, spp=64), view) for view in range(3)]
+    made = ur.Problem(scene, parameters, views)
+    pictures = FreshPictures(made, 0, 0)
+    assert pictures.sampled
+    truth, moved = (pictures.picture({key: np.array([x, 0.0, 0.0])}) for x in (0.0, 0.8))
+    assert verify._is_worse(pictures, truth, moved)
+    assert not verify._is_worse(pictures, moved, truth)
+    assert not verify._is_worse(pictures, truth, truth)

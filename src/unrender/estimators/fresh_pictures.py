@@ -29,8 +29,7 @@ _LONGER = 2
 """Ratio of the allowed paths to the minimum below which an image has the minimum, because another number of pixels needs another
 recording."""
 _FEW_PIXELS, _FEW_OF_VIEWS = 1 << 10, 1 << 12
-"""Number of pixels of all views up to which full views are rendered, for any number of paths; the same number where only full views can
-be rendered."""
+"""Number of pixels of all views up to which full views are rendered, for any number of paths; the same number for losses of full views."""
 _STREAM = 2
 """Stream of the run's key for new images; the steps use 0, the warm-up 1."""
 _MOST_NON_FINITE = 0.01
@@ -79,8 +78,8 @@ class FreshPictures:
     """Renders new images of any parameters, all with the same random numbers.
 
     The random numbers come from a separate stream of the run's key, so they are independent of the run's. Few pixels are rendered as full
-    views. Many pixels are rendered as a list, which is a random sample if there are too few paths. If the loss needs full views, or
-    cameras move, the sample consists of views.
+    views. Many pixels are rendered as a list, which is a random sample if there are too few paths. If the loss needs full views, the sample
+    consists of views.
 
     The samples per pixel of a launch depend on the problem only, so all images share one compiled kernel, and those of a short run share
     one recording. More paths use more pixels, and then more launches.
@@ -224,13 +223,10 @@ def is_finite(first: Picture, other: Picture) -> bool:
 def _frames(problem: Problem, allowed: int, key: Key) -> tuple[list[_Frame], bool]:
     """Return the tested pixels, at most about `allowed`, and whether they are a sample."""
     count, total = len(problem.views), problem.pixels
-    known = problem.renderer.parameters()
-    rigid = any(known[parameter.key].rigid for parameter in problem.parameters)
-    of_views = not problem.loss.pixelwise or (rigid and count > 1)
-    if total <= (_FEW_OF_VIEWS if of_views else _FEW_PIXELS):
+    if total <= (_FEW_PIXELS if problem.loss.pixelwise else _FEW_OF_VIEWS):
         return [_full_view(problem, view) for view in range(count)], False
     generator = np.random.default_rng(key.uint32())
-    if of_views:
+    if not problem.loss.pixelwise:
         many = max(1, min(count, allowed * count // total))
         chosen = np.sort(generator.choice(count, many, replace=False))
         return [_full_view(problem, int(view)) for view in chosen], many < count
