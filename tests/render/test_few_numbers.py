@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
@@ -12,6 +13,7 @@ import pytest
 import unrender as ur
 from tiers import quick, slow
 from unrender.methods import method
+from unrender.optimizers import ScheduleFree
 
 Scene = dict[str, Any]
 SIZE, STEPS = 32, 30
@@ -259,3 +261,21 @@ def test_the_pose_and_the_lens_of_a_camera_take_gauss_newton_steps_together() ->
     result = ur.optimize(problem, ur.GaussNewton(64, 8), ur.optimizers.AveragedNewton(), steps=12)
     np.testing.assert_allclose(result.parameters["cam.translation"], 0.0, atol=0.02)
     np.testing.assert_allclose(result.parameters["cam.aperture_radius"], 0.3, atol=0.05)
+
+
+def test_environment_maps_alone_are_pulled_to_their_start(tmp_path: Path) -> None:
+    """They have texels that pictures hardly show. The state of the pull is part of a checkpoint."""
+    made, _, _, _ = metal()
+    bitmap = mi.Bitmap(np.random.default_rng(1).uniform(0.2, 1.0, (4, 8, 3)).astype(np.float32))
+    made |= {"sky": {"type": "envmap", "bitmap": bitmap}, "cam": camera("perspective", [0, 1.5, 4])}
+    keys = ["sky.data", "lamp.emitter.radiance.value", "ball.bsdf.specular_reflectance.value"]
+    unknown = [ur.Parameter(key, initial=0.5) for key in keys]
+    problem = ur.Problem(made, unknown, [ur.View(np.ones((SIZE, SIZE, 3), np.float32))], max_depth=3)
+    plan = method("auto").plan(problem)
+    assert isinstance(plan.optimizer, ScheduleFree)
+    assert "a weak pull to their start, for texels that the pictures hardly show: sky.data" in plan.reasons
+    assert dict(plan.optimizer.pulled) == {"sky.data": pytest.approx(2 / (3 * SIZE**2 * 0.7**2))}
+    whole = ur.optimize(problem, steps=4, progress=False)
+    ur.optimize(problem, steps=2, run_directory=tmp_path / "run", progress=False)
+    resumed = ur.resume(tmp_path / "run", problem, steps=4)
+    np.testing.assert_array_equal(resumed.last["sky.data"], whole.last["sky.data"])

@@ -12,10 +12,13 @@ import pytest
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
+from unrender.estimators.capabilities import FreshGradient
 from unrender.optimizers import Adam, ScheduleFree
 from unrender.optimizers.transforms import agreement_rate, fitted_sobolev
 from unrender.optimizers.transforms.agreement_rate import Agreement
+from unrender.optimizers.transforms.base import StepUpdate
 from unrender.optimizers.transforms.fitted_sobolev import StrengthFit
+from unrender.optimizers.transforms.pull_to_start import PullToStart
 from unrender.optimizers.transforms.scale import MeanSquare
 from unrender.optimizers.transforms.schedule_free_average import Iterates
 from unrender.optimizers.transforms.wiener_shrinkage import GradientProducts
@@ -277,6 +280,41 @@ def test_texels_that_nothing_is_told_of_stay_where_they_are():
     noise_without, signal_without = walked(False)
     assert noise_of < 0.4 * noise_without
     assert signal_of > 0.7 * signal_without > 0.3
+
+
+def test_a_pull_keeps_what_pictures_hardly_show_from_making_up_for_errors_of_others():
+    """A sky adds little to the pixels of a wall that is too bright at first. Adam darkens both."""
+
+    def ends(pulled: dict[str, float]) -> dict[str, float]:
+        random = np.random.default_rng(1)
+        seen, truth = 0.01 * random.uniform(size=(64, 8)), {"wall": np.full(64, 0.3), "sky": np.full(8, 0.1)}
+        x = {"wall": np.full(64, 0.8), "sky": np.zeros(8)}
+        optimizer = ScheduleFree(0.1, pulled=pulled)
+        state = optimizer.init(x)
+        for _ in range(150):
+            away = x["wall"] - truth["wall"] + seen @ (x["sky"] - truth["sky"]) + 0.02 * random.normal(size=64)
+            gradient = {"wall": 2 * away / 64, "sky": 2 * seen.T @ away / 64}
+            found, state = optimizer.update(Estimate(float(np.mean(away * away)), gradient), state, x)
+            x = {key: value + found[key] for key, value in x.items()}
+        return {key: float(np.sqrt(np.mean((value - truth[key]) ** 2))) for key, value in x.items()}
+
+    free, pulled = ends({}), ends({"sky": 2 / (64 * 0.7**2)})
+    assert pulled["sky"] < 0.7 * free["sky"]
+    assert pulled["wall"] < free["wall"]
+
+
+def test_a_pull_is_the_derivative_of_a_normal_distribution_and_acts_on_new_gradients_too():
+    start, here = {"x": np.array([1.0, 2.0])}, {"x": np.array([1.5, 0.0])}
+    pull = PullToStart({"x": 0.25})
+    estimate = Estimate(4.0, {"x": np.zeros(2)}, (FreshGradient({"x": np.ones(2)}),))
+    update = StepUpdate(estimate, here, 0, {"x": 0.1}, estimate.gradient, estimate.gradient)
+    found, _ = pull.update(update, pull.init(start, {}))
+    for values, added in (
+        (found.gradient, 0.0),
+        (found.direction, 0.0),
+        (found.estimate.require("test", FreshGradient).values, 1.0),
+    ):
+        np.testing.assert_allclose(values["x"], np.array([0.5, -2.0]) + added)
 
 
 def test_rates_of_their_own():

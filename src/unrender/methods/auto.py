@@ -41,6 +41,7 @@ class AutoMethod(Options):
     | first rate | a tenth of the parameter's range or size; 0.3 of that for a number or a colour with two bounds | `learning_rate` |
     | logarithms | positive numbers, colours and textures without an upper bound | `parameterise` |
     | grids of media | a quarter of the resolution before step 8, half before step 20 | `coarse` |
+    | environment maps | a weak pull to the start, for texels that pictures hardly show | |
     | vertices | large steps, one rate for all | |
     | cameras; up to 24 numbers, one of a light or of the picture's form | Gauss-Newton steps | `image` |
     | poses, and what path gradients refuse | perturbed renders: Gauss-Newton steps, or a smoothed loss | `sigma` |

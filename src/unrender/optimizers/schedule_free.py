@@ -15,6 +15,7 @@ from unrender.optimizers.transforms.agreement_rate import AgreementRate
 from unrender.optimizers.transforms.base import StepTransform, checked_keys
 from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, FittedSobolev
 from unrender.optimizers.transforms.lasting_agreement import LastingAgreement
+from unrender.optimizers.transforms.pull_to_start import PullToStart
 from unrender.optimizers.transforms.scale import ScaleByRms
 from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
 from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
@@ -66,6 +67,7 @@ class ScheduleFree(Recipe):
         wiener: whether the steps of these parameters are multiplied by w.
         reparameterised: Keys of parameters with another variable (`unrender.parameterisations`), whose size does not measure their
             progress.
+        pulled: {key: weight} of parameters with a `PullToStart` before all other transforms.
     """
 
     learning_rate: float | Mapping[str, float] = 0.1
@@ -80,6 +82,7 @@ class ScheduleFree(Recipe):
     preconditioned: tuple[str, ...] = ()
     wiener: bool = True
     reparameterised: tuple[str, ...] = ()
+    pulled: Mapping[str, float] = field(default_factory=dict)
     _smoothing: FittedSobolev = field(default_factory=FittedSobolev, init=False, repr=False, compare=False)
 
     def __post_init__(self):
@@ -99,7 +102,7 @@ class ScheduleFree(Recipe):
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
         """Return the state before the first step. Raises `InputError` for an unknown parameter, or one that S does not support."""
-        for name in ("preconditioned", "reparameterised"):
+        for name in ("preconditioned", "reparameterised", "pulled"):
             if unknown := next((key for key in getattr(self, name) if key not in parameters), None):
                 raise InputError(f'ScheduleFree: {name}: unknown parameter "{unknown}"')
         return super().init(parameters, learning_rates)
@@ -107,6 +110,7 @@ class ScheduleFree(Recipe):
     def compose(self) -> tuple[StepTransform, ...]:
         shrunk = self.preconditioned if self.wiener and self.preconditioner is not None else ()
         return (
+            *((PullToStart(self.pulled),) if self.pulled else ()),
             self._smoothing,
             LastingAgreement(),
             AgreementRate(self.growth, self.decay, self.reparameterised),

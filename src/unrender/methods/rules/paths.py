@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from unrender import pixels
-from unrender.core.text import grouped
+from unrender.core.text import grouped, listed
 from unrender.estimators.hybrid import HybridGradient, beyond_paths
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
@@ -72,7 +72,7 @@ def paths(traits: Traits) -> Plan:
     image, image_reason = sampling.image(traits, sampler)
     spp = sampling.samples_per_pixel(traits, sampler)
     smoothed = tuple(key for part in parts if part.smoothed for key in part.keys)
-    own = [part for part in parts if part.optimizer]
+    own, pulled = [part for part in parts if part.optimizer], _pulled(traits, settings)
     apart = {key for part in own for key in part.keys}
     optimizer: Optimizer = ScheduleFree(
         {"*": options.learning_rate, **{key: rate for key, rate in rates.items() if key not in apart}},
@@ -80,6 +80,7 @@ def paths(traits: Traits) -> Plan:
         preconditioned=smoothed,
         wiener=not isinstance(sampler, pixels.Uniform),
         reparameterised=tuple(key for key, own in configured.unknowns.items() if own.transform is not None),
+        pulled=pulled,
     )
     for part in own:
         if part.optimizer is not None:
@@ -94,11 +95,22 @@ def paths(traits: Traits) -> Plan:
         reason,
         f"{type(problem.loss).__name__} damped where noise exceeds the residual" if tolerance else "",
         *(part.reason for part in parts),
+        f"a weak pull to their start, for texels that the pictures hardly show: {listed(list(pulled))}"
+        if pulled
+        else "",
         f"{'schedule-free Adam' if len(apart) < len(rates) else 'Adam'}, first rate {first}",
     )
     fresh_from = traits.constants.fresh_from if smoothed and renders_all and not plain else 0
     estimator = PathGradient(image, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
     return Plan(problem, estimator, optimizer, settings, tuple(filter(None, reasons)))
+
+
+def _pulled(traits: Traits, settings: Mapping[str, ParameterSettings]) -> dict[str, float]:
+    """Return {key: weight} of the environment maps that are optimised as logarithms, see `PullToStart`."""
+    problem = traits.problem
+    weight = (2.0 if problem.loss.linear else 1.0) / (3.0 * problem.pixels * traits.constants.sky_deviation**2)
+    keys = (key for key in traits.lights if problem.unknowns[key].measure.repeated and settings[key].parameterisation)
+    return dict.fromkeys(keys, weight)
 
 
 def _merged(traits: Traits, settings: list[Mapping[str, ParameterSettings]]) -> dict[str, ParameterSettings]:

@@ -5,6 +5,7 @@ from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, F
 from unrender.optimizers.transforms.lasting_agreement import LastingAgreement
 from unrender.optimizers.transforms.momentum import DecayingSum, GradientMean
 from unrender.optimizers.transforms.per_parameter import PerParameter
+from unrender.optimizers.transforms.pull_to_start import PullToStart
 from unrender.optimizers.transforms.scale import ClipDirection, ScaleByDeviation, ScaleByRms
 from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
 from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
@@ -18,6 +19,7 @@ __all__ = [
     "GradientMean",
     "LastingAgreement",
     "PerParameter",
+    "PullToStart",
     "ScaleByDeviation",
     "ScaleByRms",
     "ScheduleFreeAverage",
