@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import inspect
 import json
+import math
 import re
 import shlex
 from pathlib import Path
@@ -128,6 +130,22 @@ def test_entries_have_the_keys_on_the_way() -> None:
     assert list(markdown.named({"u": {"v": {"n": 1}}}, "one", "", "two")) == [{"n": 1, "two": "v", "one": "u"}]
     table = markdown.records("task | rate", "{task}, {method} | {rate:g}", rows)
     assert table.splitlines() == ["| task | rate |", "|---|---|", "| x, a | 1 |", "| x, b | 3 |"]
+
+
+def test_a_goal_that_a_run_never_reached_counts_as_zero_in_the_paper_s_means_alone() -> None:
+    run = importlib.import_module("benchmarks.higher_order.table2.run")
+    times = np.array([[1.0, 1.0, math.inf], [3.0, math.inf, math.inf], [8.0, 2.0, math.inf]])
+    np.testing.assert_array_equal(run.mean_times(times), [4.0, 1.0, math.inf])
+    np.testing.assert_array_equal(run.median_times(times), [3.0, 2.0, math.inf])
+    assert run.median_times(times[:2])[1] == math.inf, "half of the runs are too few"
+
+
+def test_the_paper_s_goals_are_squared_errors_of_single_steps() -> None:
+    descents = importlib.import_module("benchmarks.higher_order.table2.descents")
+    errors = np.array([1.0, 0.31, 0.5, *np.full(30, 0.09)])
+    found = descents.Descent(np.arange(33.0), errors, np.full(33, np.nan), 1.0, np.zeros(1))
+    assert found.reached("squared") == [1.0, 3.0, math.inf]
+    assert found.reached("parameter") == [12.0, math.inf, math.inf], "means over ten steps"
 
 
 def test_curves_show_the_median_and_the_range_of_runs() -> None:

@@ -7,22 +7,19 @@ no picture. Also kept: the error of the parameters at the end, over that at the 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.higher_order.table2.descents import WINDOW, descend
-from benchmarks.higher_order.table2.methods import METHODS, Config, configurations
-from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
+from benchmarks.higher_order.table2.descents import WINDOW
+from benchmarks.higher_order.table2.run import descend_by, recorded
+from benchmarks.higher_order.table2.tasks import TASKS, begin
 from benchmarks.internals import SampleRequest, arrays, dr, prepare, trees
-from benchmarks.runner import records
 from benchmarks.runner.records import Record
 
 METHOD_NAMES = ("FR22", "OurHVPA")
-_TABLE_2 = Path(__file__).parents[1] / "table2"
 _SPP = 256
 QUICK = {"task": ("MUG",), "resolution": 8, "seconds": 0.02}
 
@@ -33,17 +30,6 @@ def picture(problem: ur.Problem, point: np.ndarray) -> np.ndarray:
     session = prepare(problem, initial, None, derivatives=False)
     stacked = {key: value[None] for key, value in trees.unravel(point, initial).items()}
     return arrays.numpy(session.image_batch(stacked, SampleRequest(problem.views[0].sensor, _SPP, 1)))[0]
-
-
-def outcome(
-    problem: ur.Problem, task: Task, method: str, config: Config, number: int
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """The final error, and pictures of start and outcome."""
-    started = begin(problem, task, number, config.get("rate"))
-    n = sum(value.size for value in problem.truth.values())
-    found = descend(started, *METHODS[method].make(task, n, config), task.seconds, number)
-    start = trees.ravel(started.initial())
-    return float(found.parameter[-WINDOW:].mean()), picture(problem, start), picture(problem, found.end)
 
 
 def run(
@@ -59,8 +45,6 @@ def run(
         seconds: factor of every task's budget in Table 2
     """
     dr.set_thread_count(1)
-    record = records.read(_TABLE_2)
-    known = {} if record is None else record["tasks"]
     maps: dict[str, np.ndarray] = {}
     errors: dict[str, dict[str, float]] = {}
     for name in task:
@@ -70,11 +54,12 @@ def run(
         maps[f"{name}|reference"] = np.asarray(problem.views[0].reference)
         errors[name] = {}
         for method in METHOD_NAMES:
-            entry = known.get(name, {}).get("methods", {}).get(method)
-            config = entry["config"] if entry else configurations(name, method)[0]
-            errors[name][method], maps[f"{name}|start"], maps[f"{name}|{method}"] = outcome(
-                problem, sized, method, config, number
-            )
+            config = recorded(name)[method]["config"]
+            started = begin(problem, sized, number, config.get("rate"))
+            found = descend_by(name, sized, method, problem, config, number)
+            errors[name][method] = float(found.parameter[-WINDOW:].mean())
+            maps[f"{name}|start"] = picture(problem, trees.ravel(started.initial()))
+            maps[f"{name}|{method}"] = picture(problem, found.end)
         print(name, errors[name], flush=True)
     return {"errors": errors, "maps": maps}
 

@@ -17,25 +17,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks import figures, markdown
-from benchmarks.higher_order.table2.descents import WINDOW, descend
-from benchmarks.higher_order.table2.methods import METHODS, Config
-from benchmarks.higher_order.table2.tasks import TASKS, begin
+from benchmarks.higher_order.table2.descents import WINDOW
+from benchmarks.higher_order.table2.run import descend_by, recorded
+from benchmarks.higher_order.table2.tasks import TASKS
 from benchmarks.internals import dr
 from benchmarks.runner.records import Record
 
-CONFIGS: dict[str, dict[str, Config]] = {
-    "MUG": {
-        "FR22": {"half_life": 25.0, "rate": 0.5, "samples": 0.5},
-        "OurHVPA": {"adaptive": 0.0, "steps": 10.0, "radius": 1.5, "memory": 0.25, "samples": 0.5},
-        "OurJoint": {"adaptive": 0.0, "steps": 10.0, "radius": 1.0, "memory": 1.0, "samples": 0.5},
-    },
-    "BUNNY": {
-        "FR22": {"half_life": 10.0, "rate": 0.15, "samples": 0.5},
-        "OurHVPA": {"adaptive": 1.0, "steps": 10.0, "radius": 1.5, "memory": 0.5, "samples": 1.0},
-        "OurJoint": {"adaptive": 1.0, "steps": 10.0, "radius": 1.0, "memory": 1.0, "samples": 0.5},
-    },
-}
-"""As tuned in Table 2."""
 METHOD_NAMES = ("FR22", "OurHVPA", "OurJoint")
 MERGE = ("tasks",)
 QUICK = {"task": ("MUG",), "spp": (1, 2), "runs": 1, "renders": 30, "resolution": 8}
@@ -43,16 +30,15 @@ QUICK = {"task": ("MUG",), "spp": (1, 2), "runs": 1, "renders": 30, "resolution"
 
 def one(name: str, problem: Any, method: str, spp: int, number: int, renders: int) -> dict[str, float]:
     """One run: its final error, and renders to a tenth of the first (infinite where it is not met)."""
-    task, config = TASKS[name], {**CONFIGS[name][method], "spp": float(spp)}
-    started = begin(problem, task, number, config.get("rate"))
-    n = sum(value.size for value in problem.truth.values())
-    found = descend(started, *METHODS[method].make(task, n, config), np.inf, number, renders * spp)
+    config = {**recorded(name)[method]["config"], "spp": float(spp)}
+    task = replace(TASKS[name], seconds=math.inf)
+    found = descend_by(name, task, method, problem, config, number, renders * spp)
     counted = replace(found, seconds=np.linspace(0, found.evaluations / spp, len(found.seconds)))
     return {"final": float(found.parameter[-WINDOW:].mean()), "renders": counted.reached("parameter")[0]}
 
 
 def run(
-    task: tuple[str, ...] = tuple(CONFIGS),
+    task: tuple[str, ...] = ("MUG", "BUNNY"),
     spp: tuple[int, ...] = (1, 4, 16, 64),
     runs: int = 5,
     renders: int = 600,
@@ -67,11 +53,10 @@ def run(
     dr.set_thread_count(1)
     for name in task:
         problem = replace(TASKS[name], options={**TASKS[name].options, "resolution": resolution}).problem()
-        methods: dict[str, Any] = {method: {str(count): [] for count in spp} for method in METHOD_NAMES}
-        for number in range(runs):
-            for count in spp:
-                for method in METHOD_NAMES:
-                    methods[method][str(count)].append(one(name, problem, method, count, number, renders))
+        methods = {
+            method: {str(n): [one(name, problem, method, n, number, renders) for number in range(runs)] for n in spp}
+            for method in METHOD_NAMES
+        }
         for method, entry in methods.items():
             print(name, method, {count: float(np.median([r["final"] for r in rows])) for count, rows in entry.items()})
         yield {"tasks": {name: methods}}

@@ -48,8 +48,9 @@ class Descent:
     end: np.ndarray
 
     def reached(self, which: str) -> list[float]:
-        """Seconds to each goal, inf where it was not met."""
-        values = getattr(self, which)
+        """Return the seconds to each goal, inf where it was not met; "squared" stands for the squared error of the parameters in single
+        steps, the paper's."""
+        values = self.parameter**2 if which == "squared" else getattr(self, which)
         known = np.isfinite(values)
         seconds, values = self.seconds[known], values[known]
         if which == "parameter":
@@ -136,8 +137,7 @@ def numbers(descent: Descent) -> dict[str, Any]:
     """For results.json: times to the goals, and a curve of at most 120 points."""
     keep = np.unique(np.round(np.geomspace(1, len(descent.seconds), 120)).astype(int) - 1)
     return {
-        "parameter": descent.reached("parameter"),
-        "image": descent.reached("image"),
+        **{which: descent.reached(which) for which in ("parameter", "image", "squared")},
         "steps": len(descent.seconds) - 1,
         "evaluations": descent.evaluations,
         "final": float(descent.parameter[-WINDOW:].mean()),

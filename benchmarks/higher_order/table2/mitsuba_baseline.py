@@ -9,7 +9,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.higher_order.table2.descents import Descent, Track
-from benchmarks.internals import dr, mi, stock_scene
+from benchmarks.internals import dr, load_scene, mi, scene_description
 from benchmarks.runner.timing import work_time
 
 MITSUBA = ("BUNNY", "TEXTURE")
@@ -50,7 +50,8 @@ def _texture(problem: ur.Problem, parameters: Any) -> tuple[Any, Callable[[Any],
 
 def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Descent:
     """One run of `mi.render`, `dr.backward`, `mi.ad.Adam`: projective sampling of silhouettes for BUNNY, `prb` for TEXTURE."""
-    scene, parameters = stock_scene(problem)
+    scene = load_scene(scene_description(problem))  # its own: runs of other methods leave the problem's scene anywhere
+    parameters = mi.traverse(scene)
     track, step = Track(problem), 0
     integrator, place = _bunny(scene, parameters) if name == "BUNNY" else _texture(problem, parameters)
     for warm in (True, False):

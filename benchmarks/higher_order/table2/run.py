@@ -13,11 +13,11 @@ methods are done in turns.
 
 from __future__ import annotations
 
-import itertools
 import math
 import statistics
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,13 +25,13 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.higher_order.table2 import published
-from benchmarks.higher_order.table2.descents import Descent, descend, numbers
+from benchmarks.higher_order.table2.descents import GOALS, Descent, descend, numbers
 from benchmarks.higher_order.table2.methods import LEFT_OUT, METHODS, Config, configurations
 from benchmarks.higher_order.table2.mitsuba_baseline import MITSUBA, mitsuba
 from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
 from benchmarks.internals import dr
 from benchmarks.races import first_at
-from benchmarks.runner.records import Record, command
+from benchmarks.runner.records import Record, command, read
 
 TUNING = 3
 """Starts that a method is tuned on, numbered from 1000; TEXTURE, whose runs are all alike, takes one."""
@@ -44,8 +44,16 @@ MERGE = ("tasks.*.methods",)
 QUICK = {"task": ("MUG",), "method": ("FR22", "OurJoint"), "runs": 2, "resolution": 8, "seconds": 0.02}
 
 
-def descend_by(name: str, task: Task, method: str, problem: ur.Problem, config: Config, number: int) -> Descent:
-    """One run."""
+def descend_by(
+    name: str,
+    task: Task,
+    method: str,
+    problem: ur.Problem,
+    config: Config,
+    number: int,
+    evaluations: float = math.inf,
+) -> Descent:
+    """One run, of so many `Descent.evaluations` at most where ours runs it."""
     unit = 1.0 if method == "CMA-ES" else config.get("rate")
     started = begin(problem, task, number, unit)
     if method == "Mitsuba":
@@ -55,7 +63,7 @@ def descend_by(name: str, task: Task, method: str, problem: ur.Problem, config: 
     if method == "auto":
         return descend(started, "auto", None, task.seconds, number)
     n = sum(value.size for value in problem.truth.values())
-    return descend(started, *METHODS[method].make(task, n, config), task.seconds, number)
+    return descend(started, *METHODS[method].make(task, n, config), task.seconds, number, evaluations)
 
 
 def tune(name: str, task: Task, method: str, problem: ur.Problem) -> tuple[Config, list[dict[str, Any]]]:
@@ -77,36 +85,30 @@ def tune(name: str, task: Task, method: str, problem: ur.Problem) -> tuple[Confi
     return {key: value for key, value in best.items() if key != "score"}, tried
 
 
-def race(name: str, task: Task, runs: int, first: int, chosen: tuple[str, ...]) -> dict[str, Any]:
-    """One task: every method of `chosen` that applies, tuned, over the runs, in turns."""
+def recorded(name: str) -> dict[str, Any]:
+    """Return the methods that the record has of a task."""
+    record = read(Path(__file__).parent) or {"tasks": {}}
+    return record["tasks"].get(name, {"methods": {}})["methods"]
+
+
+def race(name: str, task: Task, runs: int, chosen: tuple[str, ...], known: dict[str, Any]) -> dict[str, Any]:
+    """One task: every method of `chosen` that applies, tuned or as it is `known`, over the runs, in turns."""
     problem = task.problem()
     applies = {m for m in METHODS if (name, m) not in LEFT_OUT} | ({"Mitsuba"} if name in MITSUBA else set())
     applies |= {"auto"} if name in AUTO else set()
     applies |= set(published.METHODS) if name in published.SETTINGS else set()
     found: dict[str, Any] = {}
     for method in (method for method in ALL_METHODS if method in applies and method in chosen):
-        config, tried = tune(name, task, method, problem)
+        config, tried = known[method] if method in known else tune(name, task, method, problem)
         found[method] = {"config": config, "tried": tried, "runs": []}
         print(f"{name} {method}: {config}", flush=True)
-    for number in range(first, first + runs):
+    for number in range(runs):
         for method, entry in found.items():
             entry["runs"].append(numbers(descend_by(name, task, method, problem, entry["config"], number)))
     for method, entry in found.items():
-        entry["summary"], entry["curves"] = summarise(entry["runs"]), medians(entry["runs"])
-        entry["seconds"], entry["command"] = task.seconds, command()
-        print(f"{name} {method}: {entry['summary']}", flush=True)
+        entry["curves"], entry["seconds"], entry["command"] = medians(entry["runs"]), task.seconds, command()
+        print(f"{name} {method}: {median_times(_times(entry, 'squared')).round(4)}", flush=True)
     return {"sigma": task.widths, "spp": task.spp, "options": task.options, "methods": found}
-
-
-def summarise(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians of the times (None where half of the runs or more never got there), and how many runs did."""
-    found: dict[str, Any] = {}
-    for which in ("parameter", "image"):
-        times = np.array([run[which] for run in runs], float)
-        medians = np.median(times, axis=0)
-        found[which] = [float(t) if math.isfinite(t) else None for t in medians]
-        found[f"{which}_count"] = np.isfinite(times).sum(axis=0).tolist()
-    return found
 
 
 def medians(runs: list[dict[str, Any]]) -> dict[str, list[list[float]]]:
@@ -135,134 +137,135 @@ def run(
     task: tuple[str, ...] = tuple(TASKS),
     method: tuple[str, ...] = ALL_METHODS,
     runs: int = 20,
-    seed: int = 0,
     resolution: int = 32,
     seconds: float = 1.0,
-    threads: int = 1,
+    tuned: bool = False,
 ) -> Iterator[dict[str, Any]]:
     """A part per task.
 
     Args:
         method: those to race; the others' figures stay
-        seed: number of the first run: of its start and its draws
         seconds: factor of every task's budget
-        threads: of Dr.Jit: one is best for images as small as these
+        tuned: takes the configurations of the record, where it has them
     """
-    dr.set_thread_count(threads)
+    dr.set_thread_count(1)  # best for images as small as these
     for name in task:
         usual = TASKS[name]
         sized = {**usual.options, "resolution": resolution} if name != "QUAD" else usual.options
         chosen = replace(usual, options=sized, seconds=seconds * usual.seconds)
-        yield {"tasks": {name: race(name, chosen, runs, seed, method)}}
+        known = {m: (entry["config"], entry["tried"]) for m, entry in recorded(name).items()} if tuned else {}
+        yield {"tasks": {name: race(name, chosen, runs, method, known)}}
 
 
 OURS = ("OurHVPA", "OurJoint")
 """Tuned as widely as FR22, and measured with it."""
-GOALS = "image 90 % | 99 % | 99.9 % | parameters 90 % | 99 % | 99.9 %"
+RIVALS = ("FR22", "CMA-ES", "L-BFGS", "Mitsuba")
+_HEAD = "image 90 % | 99 % | 99.9 % | parameters 90 % | 99 % | 99.9 %"
+_PAIRS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    **{f"{rival} / {method}": ((rival,), (method,)) for method in OURS for rival in RIVALS},
+    "FR22 / OurHVPA, both published": (("FR22, published",), ("OurHVPA, published",)),
+    "best of others / best of ours": (RIVALS, (*OURS, "OurGN", "auto")),
+}
 
 
 def table(record: Record) -> str:
     """Seconds to each reduction of the error, and ratios of times by our goals and by the paper's."""
     entries = list(markdown.named(record["tasks"], "task", "methods", "method"))
-    rows = []
+    rows, papers = [], []
     for entry in entries:
-        times = [*entry["summary"]["image"], *entry["summary"]["parameter"]]
-        there = " / ".join(map(str, entry["summary"]["parameter_count"])) + f" of {len(entry['runs'])}"
-        cells = ("—" if time is None else f"{time:.3g}" for time in times)
+        found = _times(entry, "parameter")
+        there = " / ".join(map(str, np.isfinite(found)[:, 3:].sum(axis=0))) + f" of {len(found)}"
+        cells = (f"{time:.3g}" if math.isfinite(time) else "—" for time in median_times(found))
         rows.append([entry["task"], entry["method"], *cells, there])
+        if _applies(entry, "squared", mean_times):
+            found = _times(entry, "squared")
+            pairs = zip(mean_times(found), np.isfinite(found).sum(axis=0), strict=True)
+            cells = (f"{time:.3g} ({count})" if count else "—" for time, count in pairs)
+            papers.append([entry["task"], entry["method"], *cells, len(found)])
     commands = dict.fromkeys(entry["command"] for entry in entries if "command" in entry)
-    parts = [
-        f"Random starts, {record['settings']['resolution']}²; median seconds of the processor, — where half the runs or more "
-        "never got there.",
-        markdown.table(f"task | method | {GOALS} | runs that got there", rows),
-        "Made by\n\n" + "\n".join(f"- `{command}`" for command in commands),
-    ]
     text = (
-        "Times over those of one method alone, OurHVPA, the paper's, and OurJoint: means over the goals that both reached, with standard "
-        "errors by a bootstrap over runs."
+        "Random starts, {resolution}²; median seconds of the processor, — where half the runs or more never got there."
     )
-    papers = (
-        "By the paper's goals: squared errors of the parameters of .1, .01 and .001, that is RMSE of .316, .1 and .032, of single steps. "
-        "Times at which the median curve of the runs reaches them; each cell is the mean ratio over the goals that both reached, with "
-        "their number. Best of ours: OurHVPA, OurJoint, OurGN and auto; of others: FR22, CMA-ES, L-BFGS and Mitsuba."
+    return markdown.blocks(
+        text.format(**record["settings"]),
+        markdown.table(f"task | method | {_HEAD} | runs that got there", rows),
+        "By the paper's goals, squared errors of .1, .01 and .001 in single steps, and by its convention: mean seconds over all runs, "
+        "where a goal that a run never reached counts as 0 s, and the number of runs that got there.",
+        markdown.table(f"task | method | {_HEAD} | runs", papers),
+        "Made by\n\n" + "\n".join(f"- `{command}`" for command in commands),
+        "Ratios of times: means over the goals that both reached, with standard errors by a bootstrap over runs. Best of ours: OurHVPA, "
+        f"OurJoint, OurGN and auto; of others: {', '.join(RIVALS)}.",
+        "By our goals, median times:",
+        _ratio_table(record["tasks"], "parameter", median_times),
+        "By the paper's goals, median times:",
+        _ratio_table(record["tasks"], "squared", median_times),
+        "By the paper's goals and convention, 0 s where a goal was not reached:",
+        _ratio_table(record["tasks"], "squared", mean_times),
     )
-    return markdown.blocks(*parts, text, _apart(record["tasks"]), papers, _at_the_papers_goals(record["tasks"]))
 
 
-_PAIRS = (
-    ("FR22 / OurHVPA", ("FR22",), ("OurHVPA",)),
-    ("FR22 / OurJoint", ("FR22",), ("OurJoint",)),
-    ("CMA-ES / OurHVPA", ("CMA-ES",), ("OurHVPA",)),
-    ("FR22 / OurHVPA, both published", ("FR22, published",), ("OurHVPA, published",)),
-    ("best of others / best of ours", ("FR22", "CMA-ES", "L-BFGS", "Mitsuba"), (*OURS, "OurGN", "auto")),
-)
-_PAPERS_GOALS = {"image": (0.1, 0.01, 0.001), "parameter": tuple(math.sqrt(goal) for goal in (0.1, 0.01, 0.001))}
+def _times(entry: dict[str, Any], which: str) -> np.ndarray:
+    """Return the seconds of each run to the goals of the image and of the parameters, (runs, 6), inf where they were not reached; of
+    runs without the paper's goals those of their median curves, (1, 6)."""
+    if which not in entry["runs"][0]:
+        roots = {"image": GOALS, "parameter": np.sqrt(GOALS)}
+        return np.array([[first_at(entry["curves"][kind], goal) for kind, goals in roots.items() for goal in goals]])
+    return np.array([[*run["image"], *run[which]] for run in entry["runs"]], float)
 
 
-def _at_the_papers_goals(tasks: dict[str, Any]) -> str:
-    """Return a row per pair of methods: ratios by task, and of all."""
+def median_times(times: np.ndarray) -> np.ndarray:
+    """Return the medians over runs, the last axis but one, inf where half of the runs or more never got there."""
+    return np.median(times, axis=-2)
+
+
+def mean_times(times: np.ndarray) -> np.ndarray:
+    """Return the means over runs of times that are 0 where a goal was not reached, as the paper has them; inf where none reached it."""
+    there = np.isfinite(times)
+    return np.where(there.any(axis=-2), np.where(there, times, 0.0).mean(axis=-2), math.inf)
+
+
+Statistic = Callable[[np.ndarray], np.ndarray]
+
+
+def _ratio_table(tasks: dict[str, Any], which: str, statistic: Statistic, resamples: int = 1000) -> str:
+    """Return a row per pair of methods: the mean ratio on each task and of all, with standard errors by a bootstrap over runs."""
     rows = []
-    for name, theirs, ours in _PAIRS:
-        ratios = {task: _ratios(entry["methods"], theirs, ours) for task, entry in tasks.items()}
-        every = [ratio for values in ratios.values() for ratio in values]
-        cells = [f"{statistics.fmean(values):.2f} ({len(values)})" if values else "—" for values in ratios.values()]
-        middle = f"{statistics.fmean(every):.2f} ({statistics.geometric_mean(every):.2f})" if every else "—"
-        rows.append([name, *cells, middle, len(every)])
+    for name, sides in _PAIRS.items():
+        cells, every, errors = [], [], []
+        for methods in (task["methods"] for task in tasks.values()):
+            known = ([m for n, m in methods.items() if n in side and _applies(m, which, statistic)] for side in sides)
+            times = [[_times(method, which) for method in side] for side in known]
+            ratios = _ratios(times, statistic).compressed().tolist() if all(times) else []
+            if not ratios:
+                cells.append("—")
+                continue
+            rng = np.random.default_rng(0)
+            again = [[each[rng.integers(len(each), size=(resamples, len(each)))] for each in side] for side in times]
+            every += ratios
+            errors.append(_ratios(again, statistic))
+            cells.append(f"{statistics.fmean(ratios):.2f}{_spread(errors[-1])} ({len(ratios)})")
+        if every:
+            spread = _spread(np.ma.concatenate(errors, axis=-1))
+            middle = f"{statistics.fmean(every):.2f}{spread} ({statistics.geometric_mean(every):.2f})"
+            rows.append([name, *cells, middle, len(every)])
     return markdown.table(" | ".join(["", *tasks, "all (geometric)", "goals"]), rows)
 
 
-def _ratios(methods: dict[str, Any], theirs: tuple[str, ...], ours: tuple[str, ...]) -> list[float]:
-    """Return the ratios of the least times of both sides, over the goals that both reached."""
-    ratios = []
-    for which, goals in _PAPERS_GOALS.items():
-        for goal in goals:
-            them, us = (
-                [first_at(methods[name]["curves"][which], goal) for name in side if name in methods]
-                for side in (theirs, ours)
-            )
-            if them and us and math.isfinite(min(them)) and math.isfinite(min(us)):
-                ratios.append(min(them) / min(us))
-    return ratios
+def _spread(ratios: Any) -> str:
+    """Write the standard error of the mean ratio from resamples (B, n); nothing where all are alike, those of median curves."""
+    error = ratios.mean(axis=-1).std()
+    return f" ± {error:.2f}" if error > 1e-9 else ""
 
 
-def _apart(tasks: dict[str, Any]) -> str:
-    """A row per rival and method: the mean of their ratios on each task, and of all, with the geometric mean."""
-    rows = []
-    for method, rival in itertools.product(OURS, ("FR22", "CMA-ES", "L-BFGS", "Mitsuba")):
-        ratios = {name: _both(task["methods"], rival, method) for name, task in tasks.items()}
-        every = [ratio for found in ratios.values() for ratio in found]
-        cells = [
-            f"{statistics.fmean(found):.2f} ± {_spread(tasks[name]['methods'], rival, method):.2f}" if found else "—"
-            for name, found in ratios.items()
-        ]
-        middle = f"{statistics.fmean(every):.2f} ({statistics.geometric_mean(every):.2f})" if every else "—"
-        rows.append([f"{rival} / {method}", *cells, middle, len(every)])
-    return markdown.table(" | ".join(["", *tasks, "all (geometric)", "goals"]), rows)
+def _applies(method: dict[str, Any], which: str, statistic: Statistic) -> bool:
+    """Return whether a method has times of single runs, or a median curve will do."""
+    return which in method["runs"][0] or statistic is median_times
 
 
-def _both(methods: dict[str, Any], rival: str, method: str) -> list[float]:
-    """The rival's times over the method's, of the goals that both reached in more than half of their runs."""
-    if rival not in methods or method not in methods:
-        return []
-    theirs, ours = (
-        [*entry["image"], *entry["parameter"]] for entry in (methods[m]["summary"] for m in (rival, method))
-    )
-    return [a / b for a, b in zip(theirs, ours, strict=True) if a is not None and b is not None]
-
-
-def _spread(methods: dict[str, Any], rival: str, method: str, resamples: int = 1000) -> float:
-    """Return the standard error of the mean of `_both`, by a bootstrap over the runs of both methods."""
-    rng, found = np.random.default_rng(0), []
-    times = [
-        np.array([[*run["image"], *run["parameter"]] for run in methods[name]["runs"]], float)
-        for name in (rival, method)
-    ]
-    for _ in range(resamples):
-        theirs, ours = (np.median(each[rng.integers(len(each), size=len(each))], axis=0) for each in times)
-        both = np.isfinite(theirs) & np.isfinite(ours)
-        if both.any():
-            found.append(float(np.mean(theirs[both] / ours[both])))
-    return float(np.std(found))
+def _ratios(times: list[list[np.ndarray]], statistic: Statistic) -> Any:
+    """Return the ratios of the least times of two sides, (..., 6), masked where one has not reached the goal."""
+    theirs, ours = (np.ma.masked_invalid(np.min([statistic(each) for each in side], axis=0)) for side in times)
+    return theirs / ours
 
 
 def plot(record: Record) -> figures.Figure:

@@ -56,14 +56,9 @@ def efficiency(
     direction = np.random.default_rng(3).standard_normal(theta.size)
     rows = []
     for run in range(runs):
-        if order == "gradient":
-            found, _ = ur.smoothed.gradient(losses, theta, sigma, share, run, **options)
-        elif order == "hessian":
-            found, _ = ur.smoothed.hessian(losses, theta, sigma, share, run, **options)
-        else:
-            own = {name: on for name, on in options.items() if name != "baseline"}
-            found, _ = ur.smoothed.hvp(losses, theta, direction, sigma, share, run, **own)
-        rows.append(np.ravel(found))
+        own = {name: on for name, on in options.items() if order != "hvp" or name != "baseline"}
+        points = (theta, direction) if order == "hvp" else (theta,)
+        rows.append(np.ravel(getattr(ur.smoothed, order)(losses, *points, sigma, share, run, **own)[0]))
     return float(np.var(rows, axis=0, ddof=1).sum()) * counted[0] / runs
 
 

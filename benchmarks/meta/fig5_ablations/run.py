@@ -9,11 +9,12 @@ diverged where it ends further from the truth than half of its start.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.races import Entrant, follow, median_and_range, race
+from benchmarks.races import Entrant, race
 from benchmarks.runner.records import Record
 
 RATES = (0.0003, 0.001)
@@ -39,26 +40,11 @@ def entrants() -> list[Entrant]:
     ]
 
 
-def descents(problem: ur.Problem, entrant: Entrant, rate: float, seeds: int, steps: int) -> dict[str, Any]:
-    """One form at a rate that is not tuned, so that a part left out is all that differs."""
-    runs = []
-    for seed in range(seeds):
-        runs.append(follow(problem, entrant, rate, seed, steps=steps).points[""])
-        print(f"{problem.name} {entrant.name} seed {seed}: final {runs[-1][-1][2]:.4f}", flush=True)
-    highest = [max(point[2] for point in run) for run in runs]
-    return {
-        "group": entrant.group, "rate": rate, "tried": [], "runs": runs, "final": median_and_range([r[-1][2] for r in runs]),
-        "highest": median_and_range(highest), "diverged": sum(run[-1][2] > DIVERGED for run in runs),
-    }  # fmt: skip
-
-
 def run(
     seconds: float = 5.0,
     seeds: int = 2,
     resolution: int = 48,
     part: tuple[str, ...] = ("tuned", "at length"),
-    form: tuple[str, ...] = tuple(FORMS),
-    left_out: tuple[str, ...] = tuple(ABLATIONS),
     steps: int = 1500,
     long_seeds: int = 5,
     long_resolution: int = 16,
@@ -69,8 +55,6 @@ def run(
     Args:
         seconds: budget of every run of the race
         part: measured; the other's figures stay
-        form: of the descents at length; the other's figures stay
-        left_out: of the descents at length, "whole" for nothing; the others' figures stay
         steps: of every descent at length
         long_seeds: of the descents at length
         long_resolution: of the descents at length
@@ -82,10 +66,10 @@ def run(
     if "at length" in part:
         size = {"resolution": long_resolution, "texture_resolution": 8}
         problem = ur.gallery.problem("indirect-room", loss="RelativeL2", **size)
-        for entrant in (e for e in entrants() if e.name.partition(",")[0] in form and e.group in left_out):
-            found = descents(problem, entrant, rate, long_seeds, steps)
-            conditions = {**size, "steps": steps, "seeds": long_seeds, "rate": rate}
-            yield {"at length": {**conditions, "methods": {entrant.name: found}}}
+        conditions = {**size, "steps": steps, "seeds": long_seeds, "rate": rate}
+        for entrant in entrants():
+            found = race(problem, [replace(entrant, rates=(rate,))], long_seeds, steps=steps)
+            yield {"at length": {**conditions, "methods": found}}
 
 
 def table(record: Record) -> str:
@@ -102,8 +86,12 @@ def table(record: Record) -> str:
         head = (
             "form, and what is left out | final error: median (range) | highest along a run: median (range) | diverged"
         )
-        row = "{name} | {final!m} | {highest!m} | {diverged} of "
-        rows = ([markdown.fill(row, f) + str(len(f["runs"]))] for f in markdown.named(long["methods"], "name"))
+        rows = []
+        for found in markdown.named(long["methods"], "name"):
+            highest = [max(point[2] for point in run) for run in found["runs"]]
+            diverged = sum(run[-1][2] > DIVERGED for run in found["runs"])
+            row = markdown.fill("{name} | {final!m} | {highest!v}", found, {"highest": highest})
+            rows.append([row, f"{diverged} of {len(highest)}"])
         text = "`indirect-room`, {resolution}², {steps} steps at the rate {rate:g}, {seeds} seeds.".format(**long)
         blocks += [text, markdown.table(head, rows)]
     return markdown.blocks(*blocks)
