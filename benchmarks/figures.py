@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -122,9 +122,22 @@ def error_panels(entries: Mapping[str, Any], seconds: str = "seconds") -> dict[s
     }
 
 
+def race_curves(methods: Mapping[str, Any], error: str, column: int = 0) -> dict[str, Curves]:
+    """Return an error of each method of a race over the seconds (column 0) or samples (1), its final median in the label."""
+    return {
+        f"{name}: {found['final'][error][0]:.3f}": points(found["runs"][error], column)
+        for name, found in methods.items()
+    }
+
+
 def run_curves(methods: Mapping[str, Any]) -> dict[str, Curves]:
     """Return the curves of each method's runs, whose "curve" is (x values, y values)."""
     return {name: [run["curve"] for run in found["runs"]] for name, found in methods.items() if "runs" in found}
+
+
+def from_start(runs: Iterable[Sequence[tuple[float, float]]], start: float = 1.0) -> Curves:
+    """Return curves of runs of (seconds, error), each from the start's error at 0 seconds on."""
+    return [tuple(zip((0.0, start), *run, strict=True)) for run in runs]
 
 
 def over_steps(*runs: Values) -> Curves:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from benchmarks.gpu.execute import run_slice
 from benchmarks.gpu.plan import SLICES, Slice
-from benchmarks.gpu.states import Folder, device, full, toy
+from benchmarks.gpu.states import FULL, TOY, Folder, device
 from unrender.backend import variant
 
 
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--copy", type=Path, help="copy states and records there after each slice")
     parser.add_argument("--list", action="store_true", help="only list; with --toy, what became of the toy plan")
     given = parser.parse_args(arguments)
-    folder = toy() if given.toy else full()
+    folder = TOY if given.toy else FULL
     chosen = [] if given.list else _chosen(given, folder)
     if not chosen:
         print(*lines(folder), sep="\n")
@@ -49,8 +49,7 @@ def main(arguments: Sequence[str]) -> int:
                 folder.forget(part)
             ends.append(run_slice(part, folder, where, given.minutes))
             if given.copy:
-                for kept in {folder.states, folder.records}:
-                    shutil.copytree(kept, given.copy, dirs_exist_ok=True)
+                shutil.copytree(folder.path, given.copy, dirs_exist_ok=True)
     finally:
         signal.signal(signal.SIGTERM, before)
     for part, end in zip(chosen, ends, strict=True):

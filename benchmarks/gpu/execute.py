@@ -24,7 +24,7 @@ _PYTEST_ENDS = (0, 5)
 
 def words(part: Slice, command: Command, folder: Folder) -> list[str]:
     """The command line."""
-    where = folder.records / part.name
+    where = folder.path / part.name
     arguments = command.arguments(folder.is_toy)
     match command.name:
         case "doctor":
@@ -57,7 +57,7 @@ def run_slice(part: Slice, folder: Folder, where: State, minutes: float) -> str:
         log = ROOT / "out" / "benchmarks" / ("gpu-toy" if folder.is_toy else "gpu") / f"{part.name}-{number}.log"
         print(f"{part.name}: {command.words}", flush=True)
         entry = _run(words(part, command, folder), log, seconds, where)
-        tests = folder.records / part.name / "tests.jsonl"
+        tests = folder.path / part.name / "tests.jsonl"
         if command.name == "tests" and tests.is_file():
             found = outcomes.counts(tests)
             if entry["ended"] != "cut short" and entry.get("status", 0) in _PYTEST_ENDS:

@@ -36,32 +36,30 @@ class Folder:
     """Where states and records are.
 
     Attributes:
-        states: `<slice>.json` each.
-        records: `<slice>/<benchmark>/results.json`; what tests gave is `<slice>/tests.jsonl`.
+        path: with `<slice>.json`, `<slice>/<benchmark>/results.json`, and, of tests, `<slice>/tests.jsonl`.
         is_toy: of toy sizes.
     """
 
-    states: Path
-    records: Path
+    path: Path
     is_toy: bool = False
 
     def read(self, part: Slice) -> State:
         """The slice's state; empty where it never ran."""
-        file = self.states / f"{part.name}.json"
+        file = self.path / f"{part.name}.json"
         return json.loads(file.read_text()) if file.is_file() else {}
 
     def forget(self, part: Slice) -> None:
         """Make the slice one that never ran. Records of benchmarks stay until they are written anew; those of tests are removed."""
-        (self.states / f"{part.name}.json").unlink(missing_ok=True)
-        (self.records / part.name / "tests.jsonl").unlink(missing_ok=True)
+        (self.path / f"{part.name}.json").unlink(missing_ok=True)
+        (self.path / part.name / "tests.jsonl").unlink(missing_ok=True)
 
     def note(self, part: Slice, command: Command, where: State, entry: State) -> None:
         """Write what became of a command."""
         state = self.read(part)
         commands = {**state.get("commands", {}), command.words: entry}
-        self.states.mkdir(parents=True, exist_ok=True)
+        self.path.mkdir(parents=True, exist_ok=True)
         new = {"slice": part.name, "date": time.strftime("%Y-%m-%d %H:%M"), "device": where, "commands": commands}
-        file = self.states / f"{part.name}.json"
+        file = self.path / f"{part.name}.json"
         beside = file.with_suffix(".part")
         beside.write_text(json.dumps(new, indent=1, ensure_ascii=False) + "\n")
         os.replace(beside, file)
@@ -86,13 +84,5 @@ class Folder:
         return any(self.ended(part, command) in ("", "cut short") for command in part.commands)
 
 
-def full() -> Folder:
-    """Of a GPU."""
-    folder = PACKAGE / "gpu" / "records"
-    return Folder(folder, folder)
-
-
-def toy() -> Folder:
-    """Return the folder of toy sizes, below out/."""
-    folder = ROOT / "out" / "benchmarks" / "gpu-toy"
-    return Folder(folder, folder, is_toy=True)
+FULL = Folder(PACKAGE / "gpu" / "records")
+TOY = Folder(ROOT / "out" / "benchmarks" / "gpu-toy", is_toy=True)

@@ -136,9 +136,6 @@ def run(
 
     Args:
         problem: of the gallery, or of others, such as "cbox, L2"
-        assets: folder of the scenes of others
-        steps: of a run
-        seeds: runs
         paths: of all differences of pictures for J
     """
     for name in problem:

@@ -74,9 +74,6 @@ def run(
         loss: the loop's
         seconds: of a run: processor time over the number of threads
         tuning_seconds: of a run on the tuning seed
-        seeds: runs of each loop
-        spp: samples per pixel to try
-        rates: learning rates to try
     """
     task = task_of(resolution, texture_resolution, reference_spp)
     found: dict[str, Any] = {"start": task.error(mi.TensorXf(task.start)), "losses": {}}
@@ -126,9 +123,7 @@ def plot(record: Record) -> figures.Figure:
     """Error over seconds, a panel for each loss."""
     panels = {
         f"{loss.upper()} loss": {
-            f"{name}, {entry['spp']} spp": [
-                tuple(zip((0.0, record["start"]), *run, strict=True)) for run in entry["runs"]
-            ]
+            f"{name}, {entry['spp']} spp": figures.from_start(entry["runs"], record["start"])
             for name, entry in entries.items()
         }
         for loss, entries in record["losses"].items()

@@ -220,9 +220,6 @@ def run(
         svbrdf_python: interpreter of its environment, with Mitsuba 3.5.0
         assets: folder with spot/ and textures/, for the problem spot
         seconds: budget of a run, of the processor
-        seeds: runs of each side
-        resolution: of pictures
-        texture: side of the textures
         reference_spp: of the pictures that are given, and held out
         weier_rate: their tuned rate, where it is known; none to look for it
         svbrdf_rate: likewise
@@ -294,10 +291,7 @@ def _row(side: str, entry: Record, ours: Sequence[Record], several: bool) -> lis
 def plot(record: Record) -> figures.Figure:
     """Error of the textures over processor seconds."""
     panels = {
-        name: {
-            side: [tuple(zip((0.0, 1.0), *run["curve"][1:], strict=True)) for run in entry["runs"]]
-            for side, entry in sides.items()
-        }
+        name: {side: figures.from_start(run["curve"][1:] for run in entry["runs"]) for side, entry in sides.items()}
         for name, sides in record["problems"].items()
     }
     return figures.curves(panels, "processor seconds", "error where seen / at the start", log="")

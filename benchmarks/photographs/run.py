@@ -1,10 +1,10 @@
-"""Photographs: held-out ones against the hull with photographs projected on it, a stock loop and each method, at equal time.
+"""Photographs: held-out ones against the hull with photographs projected on it, a stock loop, stages and `auto`, at equal time.
 
 The folder holds posed photographs with masks, such as an LLFF capture. One import makes the hull, the atlas and the unknowns, a normal map
 among them; all start from it.
 "projection": each texel has the mean of the training photographs that see it, weighted by the square of the cosine. "stages": the file that
-the import writes, as `unrender run stages.toml` has it; "stages-flat": that of an import without normals, with roughness from 0.02; methods
-by name are one run of all unknowns. "stock": `mi.render` of a few views a step, `dr.backward`, `mi.ad.Adam`, values clipped, with the
+the import writes, as `unrender run stages.toml` has it; "stages-flat": that of an import without normals, with roughness from 0.02; "auto":
+one run of all unknowns. "stock": `mi.render` of a few views a step, `dr.backward`, `mi.ad.Adam`, values clipped, with the
 unknowns of "stages-flat"; "stock-normals": with those of "stages". Both are tuned over samples and rates; the best by held-out photographs
 is kept, which is in its favour. Seconds are of one thread of the processor, so that others on the machine cost nobody steps; what compiles
 before the first step does not count. PSNR is as displayed, inside the masks, the mean of the held-out photographs.
@@ -33,13 +33,7 @@ from benchmarks.timed_runs import Kept
 from unrender.app.capture import importing
 from unrender.app.evaluation.measures import measure
 
-METHODS: dict[str, dict[str, Any]] = {
-    "auto": {},
-    "adaptive": {"pixels": 16384, "spp": 8, "learning_rate": 0.02},
-    "plain": {"spp": 2, "learning_rate": 0.02},
-    "rcv": {"spp": 2, "learning_rate": 0.02},
-}
-ENTRANTS = ("start", "projection", "stages", "stages-flat", *METHODS, "stock", "stock-normals")
+ENTRANTS = ("start", "projection", "stages", "stages-flat", "auto", "stock", "stock-normals")
 FLAT = ("colour", "roughness", "metallic", "light")
 LAST_RATE = 1 / 20
 """Of the stock loop's falling rates, as a share of the first."""
@@ -169,13 +163,12 @@ def run(
                     values, steps = in_stages(judge.folder, seconds, 100 * seed)
                 else:
                     clock = Kept(seconds, points=1)
-                    plan = method(who).plan(problem, METHODS[who])
+                    plan = method("auto").plan(problem)
                     result = ur.optimize(problem, plan, steps=1_000_000, seed=seed, callbacks=[clock])
                     values, steps = result.parameters, clock.steps
                 found["psnr"].append(judge.of(values))
                 found["steps"].append(steps)
                 print(who, seed, steps, np.mean(found["psnr"][-1]), flush=True)
-            found["settings"] = METHODS.get(who, {})
         print(who, np.mean(found["psnr"]), flush=True)
         race = f"{name}, {resolution}, {seconds:g}"
         conditions = {"views": len(problem.views), "held_out": len(judge.problem.views)}

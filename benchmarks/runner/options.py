@@ -11,9 +11,29 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+COMMON = {
+    "assets": "folder of the scenes of others",
+    "count": "pixels a step",
+    "grid": "voxels along a side",
+    "only": "methods to run; the others' figures stay",
+    "part": "what to measure; the others' figures stay",
+    "problem": "problems to run",
+    "rates": "learning rates to try",
+    "reference_spp": "samples per pixel of the references",
+    "resolution": "pixels along a side of a picture",
+    "runs": "independent runs of each",
+    "seconds": "budget of a run",
+    "seeds": "runs of each method",
+    "spp": "samples per pixel",
+    "steps": "number of steps of a run",
+    "texture": "texels along a side",
+    "views": "number of pictures",
+}
+"""Help of options that several benchmarks have; the "Args:" of a benchmark come first."""
+
 
 def add_options(parser: argparse.ArgumentParser, function: Callable[..., Any]) -> list[str]:
-    """An option for each parameter, helped by the "Args:" of its docstring; the parameters' names.
+    """An option for each parameter, helped by the "Args:" of its docstring, or `COMMON`; the parameters' names.
 
     Types: int, float, str, bool, Path, any of these or None, and tuples of one of them. A tuple's default that is not empty lists its
     choices. A parameter without a default is an argument by position.
@@ -22,7 +42,7 @@ def add_options(parser: argparse.ArgumentParser, function: Callable[..., Any]) -
     names = list(inspect.signature(function).parameters)
     for name, parameter in inspect.signature(function).parameters.items():
         kind, many = _kind(hints[name])
-        default, text = parameter.default, helps.get(name, "").replace("%", "%%")
+        default, text = parameter.default, helps.get(name, COMMON.get(name, "")).replace("%", "%%")
         if default is inspect.Parameter.empty:
             parser.add_argument(name, type=kind, help=text)
             continue

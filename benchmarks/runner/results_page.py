@@ -7,7 +7,7 @@ from pathlib import Path
 
 from benchmarks import markdown
 from benchmarks.gpu.plan import SLICES
-from benchmarks.gpu.states import Folder, full
+from benchmarks.gpu.states import FULL, Folder
 from benchmarks.runner import records
 from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 
@@ -68,13 +68,12 @@ def section(benchmark: Benchmark) -> str | None:
     return "\n\n".join(filter(None, [*parts, *on_a_gpu(benchmark)]))
 
 
-def on_a_gpu(benchmark: Benchmark, folder: Folder | None = None) -> list[str]:
+def on_a_gpu(benchmark: Benchmark, folder: Folder = FULL) -> list[str]:
     """Return what a GPU gave for a benchmark, a paragraph for each slice that has ended it, with the device."""
-    folder = folder or full()
     found = []
     for part in SLICES:
         own = [command for command in part.commands if command.name == benchmark.name]
-        record = records.read(folder.records / part.name / benchmark.name)
+        record = records.read(folder.path / part.name / benchmark.name)
         if record is not None and any(folder.ended(part, command) == "done" for command in own):
             name = folder.read(part)["device"]["name"]
             title = f"**On a GPU: {name}**, `{record['command']}`, {record['date']}."

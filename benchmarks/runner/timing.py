@@ -49,8 +49,3 @@ def medians(times: Times) -> dict[str, float]:
 def percentiles(values: Any) -> list[float]:
     """Median, 10th and 90th percentile."""
     return [float(q) for q in np.percentile(values, [50, 10, 90])]
-
-
-def ratio(times: Times, one: str, other: str) -> list[float]:
-    """10th percentile, median and 90th percentile of the ratio, turn by turn."""
-    return [float(q) for q in np.quantile(np.array(times[one]) / np.array(times[other]), [0.1, 0.5, 0.9])]

@@ -115,7 +115,6 @@ def run(problem: tuple[str, ...] = PROBLEMS, resolution: int = 128, spp: int = 1
 
 
 def table(record: Record) -> str:
-    """Costs as ratios."""
     primal, steps, ratios = record["primal_ms"], record["step_ms"], record["step_ratios"]
     over_plain, over_prb = primal["pair/plain"], primal["pair/prb"]
     images = [

@@ -146,7 +146,8 @@ def compare(theirs: list[Points], found: list[Points], seconds: float) -> dict[s
     best = float(loop_curve.min())
     when = (int(np.argmin(loop_curve)) + 1) / len(loop_curve) * seconds
     first = _reached(our_curve, best, seconds)
-    curves = {"loop": tenths(loop_curve), "auto": tenths(our_curve), "best_of_loop": best}
+    curves: dict[str, Any] = {"loop": tenths(loop_curve), "auto": tenths(our_curve), "best_of_loop": best}
+    curves["final"] = {"loop": [run[-1][1] for run in theirs], "auto": [run[-1][1] for run in found]}
     return curves | {"seconds_of_loop": when, "seconds_of_auto": first, "speed": when / first if first else None}
 
 
@@ -181,11 +182,6 @@ def run(
     Args:
         problem: of the gallery
         foreign: of others, such as "cbox, L2"; none for all of them where assets are given
-        assets: folder of the scenes of others
-        seconds: budget of a run
-        seeds: runs of each side
-        spp: of the loop, to try
-        rates: of the loop, to try
         gallery_reference_spp: of the gallery's references, none for its own
         gallery_resolution: film size of the gallery's problems, none for its own
         every: steps of the loop between errors
@@ -237,7 +233,6 @@ def run(
         if applies(opened):
             hands = [fixed_point(opened, FIXED_POINT_SPP, seconds, seed, error) for seed in range(seeds)]
             entry["fixed_point"] = tenths(middle(hands, seconds))
-        entry["final"] = {"loop": [p[-1][1] for p in theirs], "auto": [p[-1][1] for p in mine]}
         found["problems"][name] = entry
         print(f"{name}: speed {entry['speed']}", flush=True)
         del opened, error

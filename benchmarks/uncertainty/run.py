@@ -60,10 +60,7 @@ def run(
     """Scores of every problem.
 
     Args:
-        assets: folder of the suite's assets
-        problems: names
         seeds: references and runs of each
-        steps: numbers of steps of the runs
     """
     found: dict[str, Any] = {}
     for name, count in itertools.product(problems, steps):

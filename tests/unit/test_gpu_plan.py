@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.gpu import cli, execute, outcomes
 from benchmarks.gpu.plan import SLICES, Command, Slice
-from benchmarks.gpu.states import Folder, device, full
+from benchmarks.gpu.states import FULL, Folder, device
 from benchmarks.runner.catalogue import ROOT, benchmarks
 from benchmarks.runner.options import add_options
 from benchmarks.runner.results_page import on_a_gpu
@@ -35,7 +35,7 @@ def made(*names: str) -> Slice:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Folder:
-    return Folder(tmp_path / "states", tmp_path / "records", is_toy=True)
+    return Folder(tmp_path / "records", is_toy=True)
 
 
 def test_slices_have_names_of_their_own_and_ten_minutes_at_most() -> None:
@@ -124,12 +124,12 @@ def test_children_are_told_the_variant(folder: Folder, monkeypatch: pytest.Monke
 def test_without_a_gpu_it_refuses_in_one_line(
     folder: Folder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(cli, "full", lambda: folder)
+    monkeypatch.setattr(cli, "FULL", folder)
     monkeypatch.setattr(variant, "gpu_problem", lambda: "it is on holiday")
     assert cli.main(["--next"]) == 2
     told = capsys.readouterr().err
     assert told == "no GPU works here: it is on holiday; --toy runs the plan on the processor\n"
-    assert not folder.states.exists()
+    assert not folder.path.exists()
 
 
 def test_the_list_has_a_line_for_each_slice(capsys: pytest.CaptureFixture[str]) -> None:
@@ -139,11 +139,11 @@ def test_the_list_has_a_line_for_each_slice(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_next_goes_through_the_plan(folder: Folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "full", lambda: folder)
+    monkeypatch.setattr(cli, "FULL", folder)
     monkeypatch.setattr(variant, "gpu_problem", lambda: None)
     monkeypatch.setattr(cli, "device", lambda on_gpu: NOWHERE)
     monkeypatch.setattr(execute, "words", lambda part, command, folder: [sys.executable, "-c", ""])
-    folder.records.mkdir()
+    folder.path.mkdir()
     for number in range(1, 3):
         assert cli.main(["--next", "--copy", str(tmp_path / "copy")]) == 0
         assert len(list((tmp_path / "copy").glob("*.json"))) == number
@@ -193,7 +193,7 @@ def test_figures_of_a_gpu_stand_beside_those_of_the_processor(folder: Folder) ->
     part = next(part for part in SLICES if part.name == "speed")
     measured = json.loads((ALL["speed"].folder / "results.json").read_text())
     measured["step_ms"]["rcv"][0] = 7.3
-    file = folder.records / "speed" / "speed" / "results.json"
+    file = folder.path / "speed" / "speed" / "results.json"
     file.parent.mkdir(parents=True)
     file.write_text(json.dumps(measured))
     assert on_a_gpu(ALL["speed"], folder) == []  # not ended
@@ -207,5 +207,5 @@ def test_figures_of_a_gpu_stand_beside_those_of_the_processor(folder: Folder) ->
 
 def test_a_record_of_a_gpu_is_of_a_gpu() -> None:
     for part in SLICES:
-        state = full().read(part)
+        state = FULL.read(part)
         assert not state or state["device"]["variant"] == variant.CUDA

@@ -56,13 +56,10 @@ def run(
     """A part per entrant.
 
     Args:
-        resolution: film size
         grid: voxels along a side in the end, 8 times a power of two; 256 in the paper
         views: that the descent sees
         every: steps between doublings
         after: steps at the finest resolution
-        count: pixels a step
-        only: entrants to run; the others' figures stay
     """
     changes = resolutions(grid, every)
     steps = every * len(changes) + after

@@ -151,13 +151,8 @@ def run(
     """A part per task.
 
     Args:
-        seconds: budget of every run
-        resolution: film size, for GPUs
-        count: pixels a step
         steps: of every run, in place of its seconds, with falling rates
         texture_resolution: texels a side, for GPUs
-        only: methods to run and to time; the others' figures stay
-        part: measured; the other's figures stay
         rounds: of turns of the cost
         levels: race one level against five, by steps; the rest of the record stays
     """
@@ -230,7 +225,6 @@ def all_races(record: Record) -> str:
 
 
 def plot(record: Record) -> figures.Figure:
-    """Error over seconds."""
     panels = {
         name: {
             f"{method}: {entry['errors'][method][-1]:.3f}": figures.points(runs)

@@ -93,7 +93,6 @@ def run(
     """Variances, their ratios, and probabilities as maps; the other cases' figures stay.
 
     Args:
-        count: pixels a step
         samples: paths that probabilities are estimated from
         roughness: of the mirror, where the gradient is taken
         differential: whether derivatives by roughness are sampled apart
@@ -117,13 +116,9 @@ def table(record: Record) -> str:
     blocks = []
     for entry in markdown.named(record["cases"], "case"):
         text = "`mirror-trio`, {case}: {resolution}², {count} pixels with two paths each, {runs} runs."
-        rows = [
-            [
-                markdown.fill("{name} | {variance:.3g} ± {error:.1g}", scheme),
-                f"{scheme['z']:.1f}" if "z" in scheme else "",
-            ]
-            for scheme in markdown.named(entry["schemes"], "name")
-        ]
+        row = "{name} | {variance:.3g} ± {error:.1g} | "
+        schemes = markdown.named(entry["schemes"], "name")
+        rows = [[markdown.fill(row + ("{z:.1f}" if "z" in scheme else ""), scheme)] for scheme in schemes]
         ratios = ", ".join("{} {:.2f} ± {:.2f}".format(name, *ratio) for name, ratio in entry["ratios"].items())
         head = "scheme | variance at equal paths | mean against all pixels, z"
         blocks += [markdown.fill(text, entry), markdown.table(head, rows), f"Ratios: {ratios}."]

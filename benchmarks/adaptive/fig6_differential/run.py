@@ -161,16 +161,9 @@ def run(
     """A part per scene.
 
     Args:
-        scene: which
         alphas: where the variance is measured
-        runs: gradients of each variance
-        resolution: of the films
         count: pixels a step of the descents, two paths each
         rate: of Adam
-        steps: of the descents
-        seeds: of the descents
-        reference_spp: of the references
-        part: measured; the other's figures stay
         kinds: of derivatives of the descents; the other's figures stay
         falling: whether rates fall as half a cosine; these descents have an entry of their own
     """

@@ -64,7 +64,6 @@ def run(
     Args:
         many: paths per pixel of the map to compare with
         repeats: estimates of the probabilities
-        runs: gradients of each
     """
     correlations: dict[str, Any] = {}
     variance: dict[str, Any] = {}

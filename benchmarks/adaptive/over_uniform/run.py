@@ -174,10 +174,8 @@ def run(
 
     Args:
         problem: of the gallery, and "rough-box"
-        assets: folder of the scenes of others
         sampler: that descend
         count: pixels a step, two paths each
-        runs: gradients of each variance
         paths: of each measurement by paths, about
         gallery_reference_spp: of the gallery's references, none for its own
     """
@@ -200,7 +198,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Per problem, then the summary."""
     settings = record["settings"]
     parts = [
         f"{settings['count']} pixels a step; plain / relative, by paths; ± is of the relative one. Steps are those done before; λ, the "

@@ -48,8 +48,6 @@ def run(
     Args:
         renders: that tell the bias of Eq. 14
         train_steps: of the network
-        steps: of a descent
-        seeds: of each method's descents
     """
     importlib.import_module("torch").set_num_threads(1)  # on pictures this small several only wait for each other
     with tempfile.TemporaryDirectory() as folder:

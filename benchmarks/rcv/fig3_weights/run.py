@@ -58,7 +58,6 @@ def run(resolution: int = 48, spp: int = 8, steps: int = 50, runs: int = 24) -> 
 
 
 def table(record: Record) -> str:
-    """Fig. 3."""
     text = "{resolution}², {spp} spp, {steps} steps, {runs} runs; at the last step but where it says otherwise, variance relative to one "
     text += "render's."
     return markdown.blocks(

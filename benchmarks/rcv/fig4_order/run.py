@@ -124,7 +124,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Fig. 4."""
     names = {"plain": "plain render", "before": "updated before use (biased)", "after": "updated after use"}
     rows = []
     for path, entry in record["paths"].items():

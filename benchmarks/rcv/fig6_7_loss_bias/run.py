@@ -38,7 +38,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Fig. 7."""
     losses = {name: {method: entry[method] for method in METHODS} for name, entry in record["fig7"]["losses"].items()}
     text = "{resolution}², {spp} spp, {runs} runs, step {step}; relative to the derivative's mean."
     return markdown.blocks(

@@ -125,7 +125,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Fig. 8."""
     text = "{resolution}², {spp} spp, {steps} steps, {runs} runs; relative to a plain render."
     fields = ("weight", "variance_ratio", "error_ratio_at_last", "image_cost", "step_cost")
     return markdown.blocks(

@@ -183,13 +183,11 @@ def run(
     Args:
         problem: by the clock some of indirect-room, glossy-room, sunlit-vase, lamp, by processor time of indirect-room, tea; left out, all
         seconds: budget of every run (15 for indirect-room, else 4; by processor time 8)
-        resolution: film size, for GPUs
         grid: METHOD=SPP:RATE,..., in place of the method's grid; a single one is taken as it is
         processor: whether seconds are of the processor; then with denoised images, too, and smaller films
         steps: of every run, in place of its seconds
         spp: samples per pixel of the image and of the adjoint, with steps
         rates: of a race by steps, to try; a single one is taken as it is
-        only: methods of a race by steps; the others' figures stay
     """
     sizes = SMALL if processor or steps else OPTIONS
     for name in problem:
@@ -257,9 +255,7 @@ def plot(record: Record) -> figures.Figure:
         return figures.curves(races, "share of the steps", log="")
     panels = {
         name: {
-            f"{method}, {found['spp']} spp, rate {found['rate']:g}": [
-                tuple(zip((0.0, 1.0), *run, strict=True)) for run in found["runs"]
-            ]
+            f"{method}, {found['spp']} spp, rate {found['rate']:g}": figures.from_start(found["runs"])
             for method, found in entry["methods"].items()
         }
         for name, entry in record["entries"].items()

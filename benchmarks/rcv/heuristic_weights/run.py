@@ -69,7 +69,6 @@ def measure(problem: ur.Problem, path: Sequence[Tree], spp: int, runs: int, refe
 def run(
     resolution: int = 24, spp: int = 4, steps: int = 129, runs: int = 16, reference_spp: int = 4096
 ) -> dict[str, Any]:
-    """Both paths."""
     problem = ur.gallery.problem("three-bodies", resolution=resolution, reference_spp=1024)
     paths = {
         "descent": descent(problem, ur.PathGradient(spp=16), RATE, steps),
@@ -79,7 +78,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Errors by rule and path."""
     text = "`three-bodies`, {resolution}², {spp} spp, {runs} runs; squared error of the image over a plain render's."
     parts = [text.format(**record["settings"])]
     for name, found in record["paths"].items():

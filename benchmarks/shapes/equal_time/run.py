@@ -164,11 +164,8 @@ def run(
 
     Args:
         seconds: of a run, of the processor
-        seeds: of the runs that count
         problems: of the gallery, whose surfaces are known
-        resolution: of the views
         subdivisions: of the sphere
-        views: how many
         rates: of the stock loops, tried on a seed of its own
         indirect: samples per pixel of the stock loops' boundary of shadows and indirect light, likewise, beside 0
         spp: samples per pixel of the stock loops, beside 2

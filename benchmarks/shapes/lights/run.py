@@ -111,9 +111,7 @@ def run(
 
     Args:
         cases: lights
-        views: numbers of pictures
         seeds: starts, and random numbers of the runs
-        steps: of `auto`
     """
     found: dict[str, Any] = {}
     for name in cases:

@@ -84,13 +84,10 @@ def run(
 
     Args:
         seconds: of a run, of the processor
-        seeds: of the runs that count
-        problems: of the gallery
         views: how many, of problems that let it be chosen
         pixels: of a mini-batch
         rates: tried on a seed of its own
         repetitions: gradients that a variance is of
-        only: ways of choosing pixels; left out, all
     """
     found: dict[str, Any] = {}
     for name in problems:

@@ -50,9 +50,6 @@ def run(
     Args:
         problem: of the gallery
         foreign: of others, such as "cbox, L2"
-        assets: folder of the scenes of others
-        seconds: budgets
-        seeds: runs of each side
         settings: of the loop, that were best in the suite's record
         gallery_reference_spp: of the gallery's references, none for its own
         every: steps of the loop between errors
@@ -68,7 +65,6 @@ def run(
             mine = [ours(opened, error, budget, seed)[0] for seed in range(seeds)]
             found = compare(theirs[best], mine, budget)
             found |= {"problem": name, "seconds": budget, "setting": chosen[best], "seeds": seeds}
-            found["final"] = {"loop": [points[-1][1] for points in theirs[best]], "auto": [p[-1][1] for p in mine]}
             print(f"{name}, {budget:g} s: loop {found['loop'][-1]:.4f}, auto {found['auto'][-1]:.4f}", flush=True)
             yield {"entries": {f"{name}, {budget:g} s": found}}
         del opened, error

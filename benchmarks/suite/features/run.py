@@ -131,15 +131,6 @@ def run(
     spp: tuple[int, ...] = (4, 16),
     rates: tuple[float, ...] = (0.005, 0.02, 0.05),
 ) -> Iterator[dict[str, Any]]:
-    """Every problem.
-
-    Args:
-        problem: names
-        seconds: of the processor, of a run
-        seeds: runs of each side
-        spp: of the loop, to try
-        rates: of the loop, to try
-    """
     for name in problem:
         made = PROBLEMS[name]()
         start = made.parameter_error(made.initial())
@@ -162,7 +153,6 @@ def run(
         found = compare(theirs, mine, seconds)
         found |= {"setting": [samples, tuned[samples][0]], "tried": sum(len(tried) for _, tried in tuned.values())}
         found["settings"] = {"seconds": seconds, "seeds": seeds, "spp": list(spp), "rates": list(rates)}
-        found["final"] = {"loop": [run[-1][1] for run in theirs], "auto": [run[-1][1] for run in mine]}
         print(name, found, flush=True)
         yield {"problems": {name: found}}
         del made
@@ -183,7 +173,6 @@ def table(record: Record) -> str:
 
 
 def plot(record: Record) -> figures.Figure:
-    """Error over time."""
     panels = {}
     for name, entry in record["problems"].items():
         tenths = ((np.arange(10) + 1) / 10 * entry["settings"]["seconds"]).tolist()

@@ -16,7 +16,7 @@ from benchmarks import figures, markdown
 from benchmarks.internals import parts
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
-from benchmarks.uncertainty.run import LEVELS, quantiles
+from benchmarks.uncertainty.run import LEVELS, quantiles, with_own_references
 
 MERGE = ("problems",)
 QUICK: dict[str, Any] = {"problems": ("lamp",), "seeds": 2, "folder_seeds": 1, "steps": 10}
@@ -114,19 +114,16 @@ def run(
     """Coverage of each problem.
 
     Args:
-        problems: names
         seeds: runs of each without a run folder
         folder_seeds: runs of each with one
-        steps: of a run
     """
     for name in problems:
         made, found = problem(name), {}
         for kind, number in (("without a folder", seeds), ("with a folder", folder_seeds)):
             scores = []
             for seed in range(number):
-                reference = ur.render(made, made.truth, spp=_REFERENCE_SPP, seed=1000 + seed)
                 folder = records.scratch("uncertainty.numbers") if kind == "with a folder" else None
-                of = made.replaced(views=[ur.View(reference)])
+                of = with_own_references(made, _REFERENCE_SPP, seed)
                 result = ur.optimize(of, steps=steps, seed=seed, run_directory=folder, progress=False)
                 scores.append(_scores(result))
             if known := [z for z in scores if z is not None]:
@@ -136,7 +133,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Coverage."""
     rows = []
     for name, kinds in record["problems"].items():
         for kind, entry in kinds.items():

@@ -23,13 +23,7 @@ QUICK = {"seconds": 0.5, "seeds": 2, "count": 32, "resolution": 8, "grid": 8}
 def run(
     seconds: float = 8.0, seeds: int = 3, count: int = 1024, resolution: int = 64, grid: int = 32
 ) -> dict[str, Any]:
-    """The race of the three schemes.
-
-    Args:
-        seconds: budget of every run
-        count: pixels a step
-        grid: voxels along a side
-    """
+    """The race of the three schemes."""
     size = {"resolution": resolution, "grid_resolution": grid}
     problem = ur.gallery.problem("smoke", **size, loss="L2", reference_spp=1024)
     adam, entrants = scaled(ur.optimizers.Adam), []
@@ -58,10 +52,7 @@ def table(record: Record) -> str:
 def plot(record: Record) -> figures.Figure:
     """Error over seconds and over paths."""
     panels = {
-        f"over {unit}": {
-            f"{name}: {entry['final']['both'][0]:.3f}": figures.points(entry["runs"]["both"], column)
-            for name, entry in record["methods"].items()
-        }
+        f"over {unit}": figures.race_curves(record["methods"], "both", column)
         for column, unit in enumerate(("seconds", "paths"))
     }
     return figures.curves(panels, "")

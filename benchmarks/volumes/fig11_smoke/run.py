@@ -107,8 +107,6 @@ def run(
         budget: those to race, steps and time of smoke, or another volume at equal steps; the others' figures stay
         seconds: of every run at equal time
         steps: of every run at equal steps
-        only: methods to run; the others' figures stay
-        grid: voxels along a side
         assets: folder with tutorials/volume.vol
     """
     for by in budget:
@@ -167,8 +165,6 @@ def plot(record: Record) -> figures.Figure:
     panels = {}
     for budget, entry in record["budgets"].items():
         by_paths = budget not in ("steps", "time")
-        panels[f"{budget}, over {'paths' if by_paths else 'seconds'}"] = {
-            f"{name}: {found['final']['both'][0]:.3f}": figures.points(found["runs"]["both"], int(by_paths))
-            for name, found in entry["methods"].items()
-        }
+        title = f"{budget}, over {'paths' if by_paths else 'seconds'}"
+        panels[title] = figures.race_curves(entry["methods"], "both", int(by_paths))
     return figures.curves(panels, "", log="")

@@ -70,8 +70,5 @@ def problem(name: str, resolution: int, grid: int, reference_spp: int, assets: P
 
 def smoothed(made: ur.Problem) -> ur.Problem:
     """The same problem, its grids preconditioned by `Sobolev`."""
-    preconditioner = ur.preconditioners.Sobolev()
-    parameters = tuple(replace(parameter, preconditioner=preconditioner) for parameter in made.parameters)
-    return ur.Problem(
-        made.renderer, parameters, made.original_views, made.loss, made.max_depth, truth=made.truth, name=made.name
-    )
+    sobolev = ur.preconditioners.Sobolev()
+    return made.replaced(parameters=[replace(parameter, preconditioner=sobolev) for parameter in made.parameters])

@@ -71,7 +71,6 @@ def run(steps: int = 250, spp: int = 4, runs: int = 16, seeds: int = 3, resoluti
 
 
 def table(record: Record) -> str:
-    """Along one descent."""
     last = len(record["weight"]) - 1
     row = "{0} | {{weight[{0}]:.3f}} | {{weight_10_50_90[1][{0}]:.3f}} | {{variance_ratio[{0}]:.3f}} ± {{variance_ratio_error[{0}]:.3f}}"
     rows = [

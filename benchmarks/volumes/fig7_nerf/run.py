@@ -99,9 +99,7 @@ def run(
     """A part per method.
 
     Args:
-        seconds: budget of every run
         grid: voxels along a side; the others' figures stay
-        only: methods to run; the others' figures stay
         balls: in place of the toy, so that the volume is sparse (Fig. 8); 0: the toy. The other's figures stay
         processor: whether seconds are those of one thread of the processor, which tell the steps of a run
     """
@@ -143,10 +141,9 @@ def table(record: Record) -> str:
 def plot(record: Record) -> figures.Figure:
     """Error of views seen and unseen over seconds, or over paths where runs are told by the processor's time."""
     panels = {
-        f"{kind}, {views}, over {'paths' if entry['processor'] else 'seconds'}": {
-            f"{name}: {found['final'][views][0]:.3f}": figures.points(found["runs"][views], int(entry["processor"]))
-            for name, found in entry["methods"].items()
-        }
+        f"{kind}, {views}, over {'paths' if entry['processor'] else 'seconds'}": figures.race_curves(
+            entry["methods"], views, int(entry["processor"])
+        )
         for kind, entry in record["schedules"].items()
         for views in ("seen", "unseen")
     }
