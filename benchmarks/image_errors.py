@@ -21,6 +21,16 @@ def picture_error(pairs: Iterable[Pair]) -> float:
     return debiased.rmse(one, two, reference)[0]
 
 
+def views_error(problem: ur.Problem, values: Mapping[str, np.ndarray], spp: int) -> float:
+    """Return the `picture_error` of all views with these values of the unknowns, from two renderings of `spp` samples per pixel."""
+
+    def pair(index: int) -> Pair:
+        one, two = (ur.render(problem, values, index, spp=spp, seed=seed) for seed in (1, 2))
+        return one, two, np.asarray(problem.views[index].reference)
+
+    return picture_error(map(pair, range(len(problem.views))))
+
+
 class ImageErrors:
     """How far renders of groups of views are from their references, relative to the start.
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks.image_errors import Pair, picture_error
+from benchmarks.image_errors import views_error
 from benchmarks.peers.drivers.recorder import BudgetSpentError, Recorder
 from benchmarks.runner.timing import work_time
 
@@ -65,18 +65,10 @@ def blind(problem: ur.Problem) -> ur.Problem:
 
 def measured(problem: ur.Problem, found: Sequence[tuple[float, Mapping[str, np.ndarray]]]) -> dict[str, Any]:
     """What was reached in the end, and the curve of the surface's error over seconds; pictures alone where no surface is known."""
-    first, last = _picture_error(problem, problem.initial_values()), _picture_error(problem, found[-1][1])
+    first, last = (views_error(problem, at, _PICTURE_SPP) for at in (problem.initial_values(), found[-1][1]))
     if all(unknown.surface is None for unknown in problem.unknowns.values()):
         return {"pictures": last / first}
     (key,) = problem.faces
     start = problem.parameter_error(problem.initial())[key]
     curve = [(0.0, 1.0), *((seconds, problem.parameter_error(values)[key] / start) for seconds, values in found)]
     return {"curve": [list(x) for x in zip(*curve, strict=True)], "surface": curve[-1][1], "pictures": last / first}
-
-
-def _picture_error(problem: ur.Problem, values: Mapping[str, np.ndarray]) -> float:
-    def pair(index: int) -> Pair:
-        one, two = (ur.render(problem, values, index, spp=_PICTURE_SPP, seed=seed) for seed in (1, 2))
-        return one, two, np.asarray(problem.views[index].reference)
-
-    return picture_error(map(pair, range(len(problem.views))))

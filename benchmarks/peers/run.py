@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
+import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.image_errors import picture_error
-from benchmarks.internals import mi
+from benchmarks.image_errors import views_error
 from benchmarks.peers import scenes
 from benchmarks.races import TUNING_SEED, first_at, search
 from benchmarks.runner.records import Record, scratch
@@ -73,15 +73,12 @@ class Judge:
     """
 
     def __init__(self, case: scenes.Case):
-        self.case, self._truth = case, case.problem.truth
-        self._errors = errors_of(case.problem)
+        self.case, self._errors = case, errors_of(case.problem)
         with np.load(case.folder / "others.npz") as found:
-            self._pictures = [found[f"arr_{n}"] for n in range(len(found.files))]
-        self._scene = mi.load_file(str(case.folder / "others.xml"))
-        self._parameters = mi.traverse(self._scene)
-        self._path = mi.load_dict({"type": "path", "max_depth": scenes.DEPTH})
-        begin = {key: np.full(truth.shape, 0.5, np.float32) for key, truth in self._truth.items()}
-        self._begin = self._others(begin)
+            views = [ur.View(found[f"arr_{n}"].astype(np.float32), n) for n in range(len(found.files))]
+        unknown = [ur.Parameter(key, initial=0.5) for key in case.keys]
+        self._others = ur.Problem(case.folder / "others.xml", unknown, views, max_depth=scenes.DEPTH)
+        self._begin = views_error(self._others, self._others.initial_values(), _PICTURE_SPP)
 
     def each(self, values: dict[str, np.ndarray]) -> dict[str, float]:
         """The error of each texture where seen, by its channel."""
@@ -91,27 +88,12 @@ class Judge:
         """The mean over textures."""
         return float(np.mean(list(self.each(values).values())))
 
-    def _others(self, values: dict[str, np.ndarray]) -> float:
-        for key, value in values.items():
-            self._parameters[key] = mi.TensorXf(np.ascontiguousarray(value.reshape(self._truth[key].shape)))
-        self._parameters.update()
-
-        def rendered(view: int, seed: int) -> np.ndarray:
-            return np.array(
-                mi.render(self._scene, sensor=view, integrator=self._path, spp=_PICTURE_SPP, seed=seed), np.float32
-            )
-
-        return picture_error((rendered(n, 1), rendered(n, 2), picture) for n, picture in enumerate(self._pictures))
-
     def run(self, found: Points, steps: int) -> dict[str, Any]:
         """The record of a run."""
-        last = {key: found[-1][1][key] for key in self.case.keys}
+        last = {key: found[-1][1][key].reshape(truth.shape) for key, truth in self.case.problem.truth.items()}
         curve = [[seconds, self.textures(values)] for seconds, values in found]
-        errors = {
-            "textures": self.textures(last),
-            "each": self.each(last),
-            "pictures": self._others(last) / self._begin,
-        }
+        pictures = views_error(self._others, last, _PICTURE_SPP) / self._begin
+        errors = {"textures": self.textures(last), "each": self.each(last), "pictures": pictures}
         return {"curve": curve, **errors, "steps": steps}
 
 
