@@ -10,7 +10,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks.internals import mi
-from benchmarks.suite.scenes import photograph, references
+from benchmarks.suite.scenes import photograph, references, sensors
 
 DEPTH = 5
 MATERIAL = "mat-object"
@@ -31,15 +31,8 @@ class Cameras:
     target: tuple[float, float, float]
 
     def xml(self, resolution: int) -> str:
-        """Sensors with pixels whose samples are their own."""
-        target = ", ".join(map(str, self.target))
-        return "".join(
-            f'<sensor type="perspective" id="camera_{n}"><float name="fov" value="{_FOV}"/><transform name="to_world">'
-            f'<lookat origin="{", ".join(f"{x:.5f}" for x in place)}" target="{target}" up="0, 1, 0"/></transform>'
-            f'<film type="hdrfilm"><integer name="width" value="{resolution}"/><integer name="height" value="{resolution}"/>'
-            '<string name="pixel_format" value="rgb"/><rfilter type="box"/></film></sensor>'
-            for n, place in enumerate(self.places)
-        )
+        """The sensors."""
+        return sensors(self.places, self.target, _FOV, resolution)
 
 
 @dataclass(frozen=True)

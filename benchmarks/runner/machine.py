@@ -11,11 +11,6 @@ LOADED = 0.15
 """Share of the processors that others take, from which on a warning is printed."""
 
 
-def cores() -> int:
-    """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def busy_seconds() -> float | None:
     """Processor seconds of all processes since the machine began; None where it does not tell (other systems than Linux)."""
     try:

@@ -57,16 +57,24 @@ def cbox(assets: Path, folder: Path, resolution: int, texture: int = TEXTURE) ->
     return "back.bsdf.reflectance.data", 1
 
 
+def sensors(places: Any, target: tuple[float, ...], fov: float, resolution: int) -> str:
+    """Cameras at places (N, 3) that look at a target, with pixels whose samples are their own."""
+    at = ", ".join(map(str, target))
+    return "".join(
+        f'<sensor type="perspective" id="camera_{n}"><float name="fov" value="{fov}"/><transform name="to_world">'
+        f'<lookat origin="{", ".join(f"{x:.5f}" for x in place)}" target="{at}" up="0, 1, 0"/></transform>'
+        f'<film type="hdrfilm"><integer name="width" value="{resolution}"/><integer name="height" value="{resolution}"/>'
+        '<string name="pixel_format" value="rgb"/><rfilter type="box"/></film></sensor>'
+        for n, place in enumerate(places)
+    )
+
+
 def spot(assets: Path, folder: Path, resolution: int, texture: int = TEXTURE) -> tuple[str, int]:
     """Spot under an environment map, four cameras around it."""
     mi.Bitmap(photograph(assets / "spot/spot_texture.png", texture)).write(str(folder / "truth.exr"))
-    cameras = "".join(
-        f'<sensor type="perspective"><float name="fov" value="40"/><transform name="to_world">'
-        f'<lookat origin="{3 * np.sin(a):.4f}, 0.7, {3 * np.cos(a):.4f}" target="0, 0.1, 0" up="0, 1, 0"/></transform>'
-        f'<film type="hdrfilm"><integer name="width" value="{resolution}"/><integer name="height" value="{resolution}"/>'
-        f'<rfilter type="box"/></film></sensor>'
-        for a in np.radians([30, 120, 210, 300])
-    )
+    angles = np.radians([30, 120, 210, 300])
+    places = np.stack([3 * np.sin(angles), np.full(4, 0.7), 3 * np.cos(angles)], -1)
+    cameras = sensors(places, (0, 0.1, 0), 40, resolution)
     (folder / "scene.xml").write_text(
         f'<scene version="3.0.0">{cameras}<emitter type="envmap"><string name="filename" '
         f'value="{assets / "textures/museum.exr"}"/></emitter><shape type="obj" id="spot"><string name="filename" '

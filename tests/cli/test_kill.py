@@ -95,7 +95,7 @@ def states(folder: Path) -> dict[str, bytes]:
 def check_readable(folder: Path) -> None:
     """A run that has begun can be read, whatever it died of; one that has not can be begun."""
     if (folder / "run.json").exists():
-        checkpoint.latest(folder)
+        next(checkpoint.candidates(folder))
         report_folder.read(folder)
 
 

@@ -17,7 +17,7 @@ import pytest
 import unrender as package
 from tiers import quick
 from unrender.app.cli.signals import WAITING
-from unrender.runs.final_images import render_pictures
+from unrender.runs.final_images import render_final_images
 
 KEY = "wall.bsdf.reflectance.value"
 FILES = ["checkpoints", "history.jsonl", "initial.npz", "method.toml", "parameters.npz", "pictures.npz", "problem.toml"]
@@ -257,7 +257,7 @@ def test_a_reader_that_leaves_gets_no_traceback():
 def test_final_pictures_are_of_the_result(problem: Path, spp):
     made = package.Problem.from_file(problem)
     result = package.optimize(made, package.PathGradient(spp=2), package.optimizers.Adam(0.3), steps=1)
-    shown = render_pictures(made, result, spp)
+    shown = render_final_images(made, result, spp).pictures
     assert sorted(shown) == ["view0/initial", "view0/reference", "view0/result"]
     np.testing.assert_allclose(shown["view0/initial"].mean((0, 1)), result.initial[KEY], atol=0.02)
     np.testing.assert_allclose(shown["view0/result"].mean((0, 1)), result.parameters[KEY], atol=0.05)

@@ -43,7 +43,7 @@ def leftovers(folder: Path) -> list[Path]:
 def go_on(folder: Path) -> ur.Result:
     """What a user does after a death: resume, or begin again what had not begun."""
     if (folder / "run.json").exists():
-        checkpoint.latest(folder)
+        next(checkpoint.candidates(folder))
         reader.read(folder)
         if json.loads((folder / "run.json").read_text())["status"] != "finished":
             return ur.resume(folder)

@@ -15,8 +15,8 @@ from benchmarks import figures, markdown
 from benchmarks.derivative_bias import METHODS, derivatives
 from benchmarks.paths import converged, descent
 from benchmarks.runner.records import Record
+from benchmarks.suite.scenes import LOSSES
 
-LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 KEY = "back.bsdf.reflectance.data"
 QUICK = {"resolution": 8, "runs": 3, "step": 3, "renders": 4, "reference_spp": 256}
 

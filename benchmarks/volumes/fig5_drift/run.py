@@ -19,6 +19,7 @@ from benchmarks.debiasing import DebiasedGradient
 from benchmarks.internals import Estimator
 from benchmarks.paths import descent
 from benchmarks.runner.records import Record
+from benchmarks.suite.scenes import LOSSES
 
 RATE = 0.005
 INDEPENDENT = 512
@@ -31,7 +32,6 @@ METHODS: dict[str, dict[str, Estimator]] = {
     }
     for loss in ("L1", "L2")
 }
-LOSSES = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 MERGE = ("descents.*.methods",)
 QUICK = {"steps": 6, "seeds": 2, "resolution": 8}
 

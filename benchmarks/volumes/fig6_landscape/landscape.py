@@ -9,9 +9,8 @@ import numpy as np
 import unrender as ur
 from benchmarks.internals import Key, SampleRequest, Tree, arrays, prepare
 from benchmarks.moments import Moments
-from unrender.losses import Loss
+from benchmarks.suite.scenes import LOSSES
 
-LOSSES: dict[str, Loss] = {"L1": ur.losses.L1(), "L2": ur.losses.L2()}
 SPP = (1, 4, 16, 64)
 
 State = Callable[[float], Tree]

@@ -28,11 +28,6 @@ def subtract(a: Tree, b: Tree) -> Tree:
     return map(lambda x, y: x - y, a, b)
 
 
-def scale(a: Tree, factor: Any) -> Tree:
-    """Return factor * a."""
-    return map(lambda x: x * factor, a)
-
-
 def zeros_like(a: Tree) -> Tree:
     """Return zeros of the same shapes."""
     return map(arrays.zeros_like, a)
@@ -41,11 +36,6 @@ def zeros_like(a: Tree) -> Tree:
 def shapes(a: Tree) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array."""
     return map(arrays.shape, a)
-
-
-def all_finite(a: Tree) -> bool:
-    """Return whether every element of every array is finite. Waits for the device."""
-    return all(arrays.all_finite(x) for x in a.values())
 
 
 def numpy(a: Tree) -> Tree:

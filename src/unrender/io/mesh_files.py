@@ -22,8 +22,6 @@ from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.io import bounded_files
 
-LARGEST = 1 << 32
-"""Largest file in bytes."""
 _LARGEST_HEADER = 1 << 16
 _MOST_ELEMENTS = 1 << 30
 _BLOCK = 1 << 20

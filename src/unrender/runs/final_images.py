@@ -74,11 +74,6 @@ class FinalImages:
     without_errors: tuple[str, ...] = ()
 
 
-def render_pictures(problem: Problem, result: Result, spp: int | None = None) -> dict[str, np.ndarray]:
-    """Return the images of `render_final_images`."""
-    return render_final_images(problem, result, spp).pictures
-
-
 def warm_up(problem: Problem, values: Mapping[str, np.ndarray], tested: bool = True) -> None:
     """Compile the kernels of `render_final_images` with an image of one pass per view and, if `tested`, one pass of each test."""
     pass_spp, count = _pass_spp(problem), len(problem.views)

@@ -62,12 +62,12 @@ class Upsampler:
             if old != self._shapes[key]:
                 self.shares[key] = math.prod(old) / math.prod(self._shapes[key])
 
-    def tree(self, tree: Tree, power: float = 0.0, factor: float = 1.0) -> Tree:
-        """Interpolate {key: array} to the finer shapes, and multiply by `factor` and (1/n)^`power`."""
-        return {key: self.array(key, value, power, factor) for key, value in tree.items()}
+    def tree(self, tree: Tree, power: float = 0.0) -> Tree:
+        """Interpolate {key: array} to the finer shapes, and multiply by (1/n)^`power`."""
+        return {key: self.array(key, value, power) for key, value in tree.items()}
 
     def array(self, key: str, value: Array, power: float = 0.0, factor: float = 1.0) -> Array:
-        """Interpolate the array of one parameter as `tree` does."""
+        """Interpolate the array of one parameter as `tree` does, and multiply it by `factor`."""
         if key not in self.shares:
             return value if factor == 1.0 else value * arrays.scalar(factor, value)
         resolutions = self.problem.coarse_to_fine[key]

@@ -123,11 +123,6 @@ def candidates(
         yield None, []
 
 
-def latest(folder: Path, reject: Callable[[Checkpoint], str] = lambda _: "") -> tuple[Checkpoint | None, list[str]]:
-    """Return the first of the `candidates`. Raises `InputError` if none of the existing ones is readable."""
-    return next(candidates(folder, reject))
-
-
 def read(path: Path) -> Checkpoint:
     """Read the checkpoint in a folder. Raises `InputError` with the file and the fault."""
     if path.is_symlink() or any((path / name).is_symlink() for name in (STATE, MANIFEST)):
