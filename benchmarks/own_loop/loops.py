@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -26,7 +25,6 @@ class Task:
         key: of the texture.
         start: (H, W, 3).
         reference: (H, W, 3).
-        error: of a texture, against the truth.
         max_depth: of paths.
     """
 
@@ -34,45 +32,14 @@ class Task:
     key: str
     start: np.ndarray
     reference: np.ndarray
-    error: Callable[[Any], float]
     max_depth: int
 
 
-def _now() -> float:
-    return time.process_time() / dr.thread_count()
+Step = Callable[[Any], None]
+"""Takes the texture after each step, and ends the loop by an exception."""
 
 
-class Clock:
-    """Seconds of the steps of a loop, and the error at some of them, which is not counted.
-
-    Seconds of processor time of this process, over the number of its threads: what others do on the machine does not count.
-
-    Args:
-        seconds: of the loop.
-        error: of a texture.
-        warm: first steps that are not counted.
-    """
-
-    def __init__(self, seconds: float, error: Callable[[Any], float], warm: int = 3):
-        self.history: list[tuple[float, float]] = []
-        self._seconds, self._error, self._warm = seconds, error, warm
-        self._spent, self._began, self._next, self.steps = 0.0, _now(), 0.0, -warm
-
-    def goes_on(self, texture: Any) -> bool:
-        """At the end of each step: whether there is another."""
-        dr.sync_thread()
-        self.steps += 1
-        if self.steps > 0:
-            self._spent += _now() - self._began
-        over = self._spent >= self._seconds
-        if self.steps > 0 and (over or self._spent >= self._next):
-            self.history.append((self._spent, self._error(texture)))
-            self._next = self._spent + self._seconds / 40
-        self._began = _now()
-        return not over
-
-
-def drjit(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock, changed: bool) -> None:
+def drjit(task: Task, spp: int, rate: float, loss: Loss, seed: int, done: Step, changed: bool) -> None:
     """`mi.render`, `dr.backward`, `mi.ad.Adam`; changed: the scene's line, the render's, and no `params.update`."""
     reference, optimizer = mi.TensorXf(task.reference), mi.ad.Adam(lr=rate)
     optimizer[task.key] = mi.TensorXf(task.start)
@@ -82,11 +49,10 @@ def drjit(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock
         dr.backward(dr.mean(dr.abs(difference) if loss == "l1" else dr.square(difference)))
         optimizer.step()
         optimizer[task.key] = dr.clip(optimizer[task.key], 0, 1)
-        if not clock.goes_on(optimizer[task.key]):
-            return
+        done(dr.detach(optimizer[task.key]))
 
 
-def torch(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock, changed: bool) -> None:
+def torch(task: Task, spp: int, rate: float, loss: Loss, seed: int, done: Step, changed: bool) -> None:
     """`dr.wrap` around `mi.render`, PyTorch's Adam; changed: `renderer(texture)` in place of the wrapped function."""
     import torch  # pyright: ignore[reportMissingImports]
 
@@ -101,8 +67,7 @@ def torch(task: Task, spp: int, rate: float, loss: Loss, seed: int, clock: Clock
         optimizer.step()
         with torch.no_grad():
             texture.clamp_(0, 1)
-        if not clock.goes_on(texture):
-            return
+        done(texture.detach())
 
 
 def _ours(task: Task, spp: int, seed: int) -> ur.Renderer:

@@ -7,8 +7,10 @@ learning rate of each are tuned in Dr.Jit, on a seed of their own, and taken ove
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,9 +18,10 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.internals import dr, mi, scene_description
+from benchmarks.internals import dr, scene_description
 from benchmarks.own_loop import loops
-from benchmarks.own_loop.loops import Clock, Task
+from benchmarks.own_loop.loops import Task
+from benchmarks.peers.drivers.recorder import BudgetSpentError, Recorder
 from benchmarks.races import TUNING_SEED, Setting, grid, median_and_range, tune
 from benchmarks.runner.records import Record
 
@@ -27,22 +30,33 @@ QUICK = {
     "reference_spp": 16, "spp": (4,), "rates": (0.02,),
 }  # fmt: skip
 KEY = "back.bsdf.reflectance.data"
+_WARM = 3
+"""First steps that do not count."""
 
 
-def task_of(resolution: int, texture_resolution: int, reference_spp: int) -> Task:
-    """`indirect-room` as people have it: a dictionary, a start, a reference."""
-    problem = ur.gallery.problem(
-        "indirect-room", resolution=resolution, texture_resolution=texture_resolution, reference_spp=reference_spp
-    )
-    truth = problem.truth[KEY]
-
-    def error(texture: Any) -> float:
-        found = texture.detach().numpy() if hasattr(texture, "detach") else dr.detach(texture).numpy()
-        return float(np.sqrt(np.mean((found.reshape(truth.shape) - truth) ** 2)))
-
+def task_of(problem: ur.Problem) -> Task:
+    """The problem as people have it: a dictionary, a start, a reference."""
     start = np.array(problem.initial()[KEY]).astype(np.float32)
     reference = np.array(problem.views[0].reference, np.float32)
-    return Task(lambda: scene_description(problem), KEY, start, reference, error, problem.max_depth)
+    return Task(lambda: scene_description(problem), KEY, start, reference, problem.max_depth)
+
+
+def now() -> float:
+    """Seconds of processor time of this process over the number of its threads: what others do on the machine does not count."""
+    dr.sync_thread()
+    return time.process_time() / dr.thread_count()
+
+
+def follow(
+    problem: ur.Problem, loop: Callable[..., None], setting: Setting, loss: str, seconds: float, seed: int
+) -> tuple[list[tuple[float, float]], int]:
+    """(seconds, error) along a run of a loop, and its number of steps, both without the first ones."""
+    recorder = Recorder(seconds, 40, timer=now, warm=_WARM)
+    with contextlib.suppress(BudgetSpentError):
+        done = lambda texture: recorder.step(lambda: {KEY: np.array(texture)})  # noqa: E731
+        loop(task_of(problem), setting["spp"], setting["rate"], loss, seed, done)
+    history = [(at, problem.parameter_error(values)[KEY]) for at, _, values in recorder.kept if at > 0]
+    return history, recorder.steps - _WARM
 
 
 def contenders() -> dict[str, Callable[..., None]]:
@@ -75,27 +89,24 @@ def run(
         seconds: of a run: processor time over the number of threads
         tuning_seconds: of a run on the tuning seed
     """
-    task = task_of(resolution, texture_resolution, reference_spp)
-    found: dict[str, Any] = {"start": task.error(mi.TensorXf(task.start)), "losses": {}}
+    sizes = {"resolution": resolution, "texture_resolution": texture_resolution, "reference_spp": reference_spp}
+    problem = ur.gallery.problem("indirect-room", **sizes)
+    found: dict[str, Any] = {"start": problem.parameter_error(problem.initial())[KEY], "losses": {}}
     every = contenders()
     for kind in loss:
         tuned = {}
         for name in ("drjit", "drjit, changed"):
 
             def end(setting: Setting, loop: Callable[..., None] = every[name], kind: str = kind) -> float:
-                clock = Clock(tuning_seconds, task.error)
-                loop(task, setting["spp"], setting["rate"], kind, TUNING_SEED, clock)
-                return clock.history[-1][1]
+                return follow(problem, loop, setting, kind, tuning_seconds, TUNING_SEED)[0][-1][1]
 
             tuned[name], _ = tune(f"{kind} {name}", grid(spp=spp, rate=rates), end)
         entries: dict[str, Any] = {name: {**tuned[name.replace("torch", "drjit")], "runs": []} for name in every}
         for seed in range(seeds):
             for name, loop in every.items():
-                clock = Clock(seconds, task.error)
-                loop(task, entries[name]["spp"], entries[name]["rate"], kind, seed, clock)
-                entries[name]["runs"].append(clock.history)
-                entries[name]["steps"] = clock.steps
-                print(f"{kind} {name} seed {seed}: {clock.history[-1][1]:.4f} in {clock.steps} steps", flush=True)
+                history, entries[name]["steps"] = follow(problem, loop, entries[name], kind, seconds, seed)
+                entries[name]["runs"].append(history)
+                print(f"{kind} {name} seed {seed}: {history[-1][1]:.4f} in {entries[name]['steps']} steps", flush=True)
         for entry in entries.values():
             entry["final"] = median_and_range([history[-1][1] for history in entry["runs"]])
         found["losses"][kind] = entries

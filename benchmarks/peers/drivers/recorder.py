@@ -20,23 +20,29 @@ class BudgetSpentError(Exception):
 
 
 class Recorder:
-    """Parameters along a descent, over the processor time of its steps, of all threads; the first step is not counted.
+    """Parameters along a descent, over the processor time of its steps, of all threads; the first ones are not counted.
 
     Args:
         seconds: of the processor.
         points: how many times parameters are kept.
         steps: raise after so many steps at the latest; None for no limit.
         timer: counts the seconds.
+        warm: number of first steps that are not counted.
     """
 
     def __init__(
-        self, seconds: float, points: int, steps: int | None = None, timer: Callable[[], float] = time.process_time
+        self,
+        seconds: float,
+        points: int,
+        steps: int | None = None,
+        timer: Callable[[], float] = time.process_time,
+        warm: int = 1,
     ):
         self.clock, self.steps = 0.0, 0
         self.kept: list[tuple[float, int, dict[str, np.ndarray]]] = []
         self._seconds, self._every, self._next, self._limit = seconds, seconds / points, 0.0, steps
         self._since: float | None = None
-        self._timer = timer
+        self._timer, self._warm = timer, warm
 
     def step(self, values: Callable[[], dict[str, np.ndarray]]) -> None:
         """After each step: `values` makes {key: array}, which is no part of the time."""
@@ -49,7 +55,7 @@ class Recorder:
             self.kept.append((self.clock, self.steps, values()))
         if done:
             raise BudgetSpentError
-        self._since = self._timer()
+        self._since = self._timer() if self.steps >= self._warm else None
 
     def write(self, path: Path, **others: Any) -> None:
         """All that was kept, and `others`, as an .npz file."""
