@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -109,6 +110,26 @@ def test_a_parameter_of_the_file_hides_emitters(tmp_path: Path) -> None:
         nested = f'<integrator type="aov"><string name="aovs" value="d:depth"/>{path}</integrator>'
         hidden = f'<default name="hide" value="{value}"/>{nested}'
         assert ur.render(problem(xml(tmp_path, hidden)), spp=4).any() == (value == "false")
+
+
+@pytest.mark.parametrize("kind", ["aov", "moment"])
+def test_a_loaded_scene_hides_emitters_by_a_nested_integrator(kind: str) -> None:
+    """Its description, in which the setting was looked for, is not known; they were rendered."""
+    aov = {"type": "aov", "aovs": "d:depth", "path": {"type": "path", "max_depth": 3, "hide_emitters": True}}
+    loaded = mi.load_dict(
+        {
+            "type": "scene",
+            "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+            "integrator": {"type": "moment", "inner": aov} if kind == "moment" else aov,
+            "wall": {"type": "rectangle"},
+            "sky": {"type": "constant"},
+        }
+    )
+    key = "wall.bsdf.reflectance.value"
+    made = ur.Problem(loaded, [ur.Parameter(key)], [ur.View(np.zeros((4, 4, 3)))])
+    assert made.max_depth == 3
+    assert made.notices == []
+    assert not ur.render(made, spp=4).any()
 
 
 def test_hidden_emitters_beside_what_moves_are_refused() -> None:

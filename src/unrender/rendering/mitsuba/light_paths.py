@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba.description import parse
+from unrender.rendering.mitsuba.scene_graph import children, class_name
 
 DEFAULT_DEPTH = 6
 """Default maximum path length in segments, if neither the user nor the scene gives one."""
@@ -56,12 +55,11 @@ class LightPaths:
     notices: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, scene: mi.Scene, source: Path | dict, volumetric: bool, max_depth: int | None) -> LightPaths:
+    def of(cls, scene: mi.Scene, volumetric: bool, max_depth: int | None) -> LightPaths:
         """Return the settings of a scene.
 
         Args:
             scene: the loaded scene.
-            source: what the scene was loaded from.
             volumetric: whether it has participating media.
             max_depth: in segments; None for the value of the scene's integrator.
 
@@ -70,11 +68,12 @@ class LightPaths:
         integrator = scene.integrator()
         if integrator is None:
             return cls(max_depth or DEFAULT_DEPTH)
-        kind, text = _light_transport(integrator)
+        integrator = _light_transport(integrator)
+        kind, text = _kind(integrator), str(integrator)
         requested, own = max_depth, _depth(kind, text)
         if max_depth is None:
             max_depth = min(own or DEFAULT_DEPTH, LONGEST_DEPTH if own == _UNLIMITED else _UNLIMITED)
-        hidden = bool(getattr(integrator, "hide_emitters", False)) or any(_hidden(source))
+        hidden = bool(getattr(integrator, "hide_emitters", False))
         if hidden and volumetric:
             raise InputError("hide_emitters is not supported with participating media; leave it out")
         notices = _notices(kind, own, requested, max_depth, volumetric)
@@ -111,7 +110,7 @@ def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -
         keys: the unknown parameters.
     """
     integrator = scene.integrator()
-    if integrator is not None and _light_transport(integrator)[0] != "PathIntegrator":
+    if integrator is not None and _kind(_light_transport(integrator)) != "PathIntegrator":
         return []
     masks = [mi.traverse(bsdf) for bsdf in bsdfs if bsdf.class_name() == "MaskBSDF"]
     opacities = [np.array(mask[key]) for mask in masks for key in ("opacity.value", "opacity.data") if key in mask]
@@ -124,13 +123,17 @@ def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -
     ]
 
 
-def _light_transport(integrator: Any) -> tuple[str, str]:
-    """Return the class name and the description of the integrator that traces paths, unwrapped from a nesting integrator."""
-    text = str(integrator)
-    if type(integrator).__name__ in _NESTING or integrator.class_name() in _NESTING:
-        _, _, inner = text.partition("integrators = [")
-        text = inner.strip() or text
-    return text.partition("[")[0].strip(), text
+def _light_transport(integrator: Any) -> Any:
+    """Return the integrator that traces paths: the innermost first one of nesting integrators."""
+    while _kind(integrator) in _NESTING and (inner := children(integrator)):
+        integrator = inner[0][1]
+    return integrator
+
+
+def _kind(integrator: Any) -> str:
+    """Return the name of the class. Those of Mitsuba's own integrators in Python are in the description alone."""
+    name = class_name(integrator)
+    return name if name in _NESTING else str(integrator).partition("[")[0].strip()
 
 
 def _depth(kind: str, text: str) -> int | None:
@@ -144,17 +147,3 @@ def _depth(kind: str, text: str) -> int | None:
 def _number(name: str, text: str) -> int | None:
     match = re.search(rf"\b{name}\s*=\s*(-?\d+)", text)
     return int(match[1]) if match else None
-
-
-def _hidden(source: Path | dict) -> Iterator[Any]:
-    """Yield the values of `hide_emitters` in a description: an integrator does not expose that of one nested in it."""
-    if isinstance(source, Mapping):
-        for key, value in source.items():
-            if key == "hide_emitters":
-                yield value
-            elif isinstance(value, Mapping):
-                yield from _hidden(dict(value))
-        return
-    for node in parse(source).state.nodes:  # with the values of the file's parameters
-        if "hide_emitters" in node.props:
-            yield node.props["hide_emitters"]

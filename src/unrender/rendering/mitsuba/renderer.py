@@ -67,8 +67,7 @@ class MitsubaRenderer:
     ):
         self._requested_depth, keys = max_depth, tuple(keys)
         self.pair = ScenePair(description, moving_targets(keys), replaced)
-        source, volumetric = self.pair.loaded().source, self.pair.volumetric
-        self.light_paths = LightPaths.of(self.pair.current, source, volumetric, max_depth)
+        self.light_paths = LightPaths.of(self.pair.current, self.pair.volumetric, max_depth)
         self.max_depth = self.light_paths.max_depth
         self.notices = (
             *self.light_paths.notices,
