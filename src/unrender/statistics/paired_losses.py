@@ -12,8 +12,9 @@ _TILES, _ROBUST = 48, 1.8
 """Maximum number of tiles of an image; maximum ratio of the sharp score to the robust one."""
 DISTANCE = 2
 """Distance of the pixels of a pair; a reconstruction filter correlates the references' noise in adjacent pixels."""
-_OF_FILTER = 0.03
-"""Correlation at a distance of 2 pixels that counts as noise. Mitsuba's default filter, a Gaussian, leaves exp(-4) = 0.018."""
+_OF_FILTER, _OF_PRODUCTS = 0.03, 1.25
+"""Correlation at a distance of 2 pixels that counts as noise, and the standard deviation of the sum of products of such pixels relative to
+that of independent products. Mitsuba's default filter, a Gaussian, leaves exp(-4) = 0.018 and 1.23 to 1.31."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,8 @@ def nearby(
     """Estimate the part of the differences that pixels at a distance of 2 share, such as differences along edges.
 
     Noise of references with a reconstruction filter has a correlation at a distance of 2. The score is therefore that of the products of
-    two pixels minus 3 % of the product at the first one: their sum divided by the root of the sum of their squares.
+    two pixels minus 3 % of the product at the first one: their sum divided by its standard deviation, which correlations of adjacent pixels
+    increase.
 
     Args:
         values, weights, earlier: see `systematic`.
@@ -214,7 +216,7 @@ def nearby(
         beyond = products - _OF_FILTER * (here * same).sum(axis=-1)
         total, squares = total + float(beyond.sum()), squares + float(np.square(beyond).sum())
         shared, counted = shared + float(products.sum()), counted + float((weight * partner).sum())
-    deviation, channels = math.sqrt(squares), values.shape[1]
+    deviation, channels = _OF_PRODUCTS * math.sqrt(squares), values.shape[1]
     return SystematicDifference(shared / max(counted * channels, 1e-300), total / deviation if deviation > 0 else 0.0)
 
 
