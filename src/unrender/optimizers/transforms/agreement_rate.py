@@ -36,6 +36,8 @@ _MOST_GROWTH = 3.0
 """Largest rate relative to the first one, and relative to the growth of the parameters."""
 _FALL = 0.75
 """Ratio of successive rates below which the averaged iterate restarts."""
+_INFLATION = 0.25
+"""Power of the inflation by which rates fall. With 1/2, weakly observed elements recover too slowly from early noise."""
 _REFINED = 0.3
 """Largest rate, relative to the first one, at a step that reduces smoothing."""
 
@@ -46,9 +48,10 @@ class Agreement(TransformState):
 
     Attributes:
         correlation: {key: ρ, the mean correlation of successive gradients}.
-        log_rate: {key: logarithm of the factor of the rate}.
+        log_rate: {key: logarithm of the factor of the rate without the inflation of the noise}.
         log_most: {key: the same, if all agreement lasts}.
         log_least: {key: the same, as if gradients had not agreed since the last change of smoothing}.
+        factors: {key: factor of the rate}.
         sizes: {key: root mean square of the first parameters, 1 where that is 0, and at least the first rate}.
     """
 
@@ -56,6 +59,7 @@ class Agreement(TransformState):
     log_rate: dict[str, float]
     log_most: dict[str, float]
     log_least: dict[str, float]
+    factors: dict[str, float]
     sizes: dict[str, float]
 
 
@@ -74,8 +78,11 @@ class AgreementRate(StepTransform):
     Agreement that does not last comes from steps back and forth around the minimum, and what it added to the rate is taken back: the factor
     of the rate is f η + (1 − f) η', where f is the lasting fraction plus two standard errors, 2/√n, and η' follows the same rule with
     min(ρ, 0) in place of ρ since the last change of smoothing. Directions that no pixel determines would otherwise follow a random walk
-    with long steps. Where the rate thereby falls by more than a quarter at once, the averaged iterate restarts: with shorter steps it would
-    keep the displacement that noise has given it with the longer ones, and the average would move there.
+    with long steps. The rate is also multiplied by f + (1 − f) I^(-1/4) for the inflation I of the noise (`SmoothingChange.inflation`),
+    since gradients are scaled by the noise of single steps, and reused noise adds up.
+
+    Where the rate falls by more than a quarter from one step to the next, the averaged iterate restarts. With shorter steps it would keep
+    the displacement that noise has given it with the longer ones, and the average would move there.
 
     The rate is at most 3 times the first, times the growth of the parameter. At a step that reduces smoothing it is at most 0.3 times the
     first. Needs a `FittedSobolev` before it, which stores the last gradient.
@@ -100,15 +107,14 @@ class AgreementRate(StepTransform):
             key: max(_root_mean_square(x, arrays.number(arrays.total(x * x))) or 1.0, learning_rates[key])
             for key, x in parameters.items()
         }
-        zeros = dict.fromkeys(parameters, 0.0)
-        return Agreement(dict.fromkeys(parameters, 1.0), zeros, zeros, zeros, sizes)
+        zeros, ones = dict.fromkeys(parameters, 0.0), dict.fromkeys(parameters, 1.0)
+        return Agreement(ones, zeros, zeros, zeros, ones, sizes)
 
     def update(self, update: StepUpdate, state: Agreement) -> tuple[StepUpdate, Agreement]:
         """Adapt the learning rates. Waits for the device, because correlations and sizes of the parameters are read."""
         previous = update.require_previous("AgreementRate")
         if update.made > 0:
-            correlation, log_rate, log_most, log_least = {}, {}, {}, {}
-            fallen = set[str]()
+            correlation, log_rate, log_most, log_least, factors = {}, {}, {}, {}, {}
             for key, (cosine, size) in _measured(update.gradient, previous, update.parameters).items():
                 rho = correlation[key] = _MEMORY * state.correlation[key] + (1.0 - _MEMORY) * cosine
                 fit, shape = update.smoothing.get(key, SMOOTHING_UNCHANGED), arrays.shape(update.gradient[key])
@@ -119,17 +125,19 @@ class AgreementRate(StepTransform):
                 most = log_most[key] = min(before[key] + change, limit)
                 least = state.log_least[key] + self._change(min(rho, 0.0), shape, update.made)
                 least = log_least[key] = min(least, most) if fit.gain == 1.0 else most
-                log_rate[key] = _between(least, most, fit.lasting, math.prod(shape))
-                if fit.gain == 1.0 and log_rate[key] < state.log_rate[key] + math.log(_FALL):
-                    fallen.add(key)
-            update = replace(update, restarted=update.restarted | fallen)
-            state = replace(state, correlation=correlation, log_rate=log_rate, log_most=log_most, log_least=log_least)
-        factors = {key: update.factors.get(key, 1.0) * math.exp(state.log_rate[key]) for key in update.gradient}
+                share = min(1.0, fit.lasting + _LASTING_ERRORS / math.sqrt(max(1, math.prod(shape))))
+                log_rate[key] = math.log((1.0 - share) * math.exp(least) + share * math.exp(most))
+                factors[key] = math.exp(log_rate[key]) * (share + (1.0 - share) * fit.inflation**-_INFLATION)
+            falls = {key for key, q in factors.items() if q < _FALL * state.factors[key]}
+            falls = {key for key in falls if update.smoothing.get(key, SMOOTHING_UNCHANGED).gain == 1.0}
+            update = replace(update, restarted=update.restarted | falls)
+            state = Agreement(correlation, log_rate, log_most, log_least, factors, state.sizes)
+        factors = {key: update.factors.get(key, 1.0) * q for key, q in state.factors.items()}
         return replace(update, factors=factors), state
 
     def choices(self, state: Agreement, made: int) -> tuple[str, ...]:
         """Return the current rates relative to the first."""
-        changed = [f"{key} {math.exp(log):.2g}" for key, log in state.log_rate.items()] if made > 0 else []
+        changed = [f"{key} {factor:.2g}" for key, factor in state.factors.items()] if made > 0 else []
         return (f"learning rate, over the first: {listed(changed)}",) if changed else ()
 
     def _change(self, correlation: float, shape: tuple[int, ...], made: int) -> float:
@@ -139,12 +147,6 @@ class AgreementRate(StepTransform):
         rise = max(0.0, 2.0 * (correlation - error) - 1.0) * min(1.0, _EARLY / made)
         change = self.growth * (rise - 2.0 * max(0.0, -correlation - error))
         return change - power / (made + _DELAY)
-
-
-def _between(least: float, most: float, lasting: float, count: int) -> float:
-    """Return the logarithm of f η + (1 − f) η', for the logarithms of η' and η, the lasting fraction and the number of elements."""
-    share = min(1.0, lasting + _LASTING_ERRORS / math.sqrt(max(1, count)))
-    return math.log((1.0 - share) * math.exp(least) + share * math.exp(most))
 
 
 def _root_mean_square(x: Array, square: float) -> float:

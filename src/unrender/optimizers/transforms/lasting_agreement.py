@@ -35,17 +35,21 @@ class GradientBlocks(TransformState):
         last: Mean gradient of the last complete block.
         earlier: Mean gradient of the block before that.
         agreement: {key: Σ g_t · g_{t-1} over the current block, a scalar}.
+        squares: {key: Σ |g_t|² over the current block, a scalar}.
         blocks: Number of complete blocks.
         fractions: {key: lasting fraction, unclamped; 1 before it is known}.
+        inflations: {key: inflation of the noise; 1 before it is known}.
     """
 
     total: Tree = field(metadata=GRADIENTS)
     last: Tree = field(metadata=GRADIENTS)
     earlier: Tree = field(metadata=GRADIENTS)
     agreement: dict[str, Array]
+    squares: dict[str, Array]
     count: int
     blocks: int
     fractions: dict[str, float]
+    inflations: dict[str, float]
 
     def upsampled(self, upsampler: Upsampler) -> GradientBlocks:
         """Interpolate the gradients, and restart the blocks, whose products have another unit."""
@@ -65,13 +69,21 @@ class LastingAgreement(StepTransform):
 
     where the mean ⟨·⟩ is over block k. The average over blocks, with decay 1/2, becomes `SmoothingChange.lasting`, by which
     `AgreementRate` multiplies the agreement. It is 1 in the first three blocks. Blocks restart when the smoothing of a gradient changes.
+
+    Reused noise also adds up over steps. Relative to independent noise of the same size, the variance of its mean over the n steps of a
+    block is larger by
+
+        n (|m_k|² - m_k · m_{k-2}) / (⟨|g_t|²⟩ - m_k · m_{k-2}),
+
+    whose average over blocks, at least 1, becomes `SmoothingChange.inflation`.
+
     Gradients are unchanged. Needs a `FittedSobolev` before it, which stores the last gradient.
 
     Args:
         shortest: Number of steps of the shortest block, >= 1.
     """
 
-    shortest: int = 96
+    shortest: int = 48
 
     def __post_init__(self):
         checks.integer("LastingAgreement", "shortest", self.shortest, at_least=1)
@@ -79,25 +91,27 @@ class LastingAgreement(StepTransform):
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> GradientBlocks:
         del learning_rates
         total, last, earlier = (trees.zeros_like(parameters) for _ in range(3))
-        agreement = {key: arrays.total(x) for key, x in total.items()}
-        return GradientBlocks(total, last, earlier, agreement, 0, 0, dict.fromkeys(parameters, 1.0))
+        zeros, ones = {key: arrays.total(x) for key, x in total.items()}, dict.fromkeys(parameters, 1.0)
+        return GradientBlocks(total, last, earlier, zeros, dict(zeros), 0, 0, ones, dict(ones))
 
     def update(self, update: StepUpdate, state: GradientBlocks) -> tuple[StepUpdate, GradientBlocks]:
-        """Set the lasting fractions. Waits for the device at the end of a block."""
+        """Set the lasting fractions and inflations. Waits for the device at the end of a block."""
         gradient, previous = update.gradient, update.require_previous("LastingAgreement")
         if any(change.gain != 1.0 for change in update.smoothing.values()):
             state = replace(state, count=0, blocks=0)
         if update.made > 0:
-            products = inner_products([(g, previous[key]) for key, g in gradient.items()])
-            agreement = dict(zip(gradient, products, strict=True))
+            products = inner_products([pair for key, g in gradient.items() for pair in ((g, previous[key]), (g, g))])
+            agreement, squares = (dict(zip(gradient, products[part::2], strict=True)) for part in (0, 1))
             if state.count:
                 gradient, agreement = trees.add(state.total, gradient), trees.add(state.agreement, agreement)
-            state = replace(state, total=gradient, agreement=agreement, count=state.count + 1)
+                squares = trees.add(state.squares, squares)
+            state = replace(state, total=gradient, agreement=agreement, squares=squares, count=state.count + 1)
         if state.count >= max(self.shortest, update.made // _PARTS):
             state = _completed(state)
         smoothing = dict(update.smoothing)
         for key, fraction in state.fractions.items():
-            smoothing[key] = replace(smoothing.get(key, SMOOTHING_UNCHANGED), lasting=max(fraction, _LEAST))
+            change, inflation = smoothing.get(key, SMOOTHING_UNCHANGED), state.inflations[key]
+            smoothing[key] = replace(change, lasting=max(fraction, _LEAST), inflation=inflation)
         return replace(update, smoothing=smoothing), state
 
     def choices(self, state: GradientBlocks, made: int) -> tuple[str, ...]:
@@ -110,18 +124,29 @@ class LastingAgreement(StepTransform):
 def _completed(state: GradientBlocks) -> GradientBlocks:
     """Return the state after the end of a block."""
     mean = trees.map(lambda x: x * arrays.scalar(1.0 / state.count, x), state.total)
-    arrays.evaluate(mean, state.agreement)
-    fractions = state.fractions
+    arrays.evaluate(mean, state.agreement, state.squares)
+    fractions, inflations = state.fractions, state.inflations
     if state.blocks >= 2:
-        products = inner_products([(m, state.earlier[key]) for key, m in mean.items()])
+        products = inner_products([pair for key, m in mean.items() for pair in ((m, state.earlier[key]), (m, m))])
         arrays.evaluate(products)
-        fractions = {}
-        for (key, old), product in zip(state.fractions.items(), products, strict=True):
-            new = _fraction(arrays.number(product), arrays.number(state.agreement[key]) / state.count)
-            fractions[key] = new if state.blocks == 2 else 0.5 * (old + new)
-    return replace(state, last=mean, earlier=state.last, count=0, blocks=state.blocks + 1, fractions=fractions)
+        numbers = [arrays.number(product) for product in products]
+        kept = 0.0 if state.blocks == 2 else 0.5
+        fractions, inflations = {}, {}
+        for key, lasting, square in zip(mean, numbers[::2], numbers[1::2], strict=True):
+            new = _fraction(lasting, arrays.number(state.agreement[key]) / state.count)
+            fractions[key] = kept * state.fractions[key] + (1.0 - kept) * new
+            new = _inflation(lasting, square, arrays.number(state.squares[key]) / state.count, state.count)
+            inflations[key] = kept * state.inflations[key] + (1.0 - kept) * new
+    fields = {"count": 0, "blocks": state.blocks + 1, "fractions": fractions, "inflations": inflations}
+    return replace(state, last=mean, earlier=state.last, **fields)
 
 
 def _fraction(lasting: float, agreement: float) -> float:
     """Return their ratio within [-1, 1]; 1 if successive gradients do not agree, because nothing can last."""
     return min(max(lasting / agreement, -1.0), 1.0) if agreement > 0.0 else 1.0
+
+
+def _inflation(lasting: float, square: float, mean_square: float, count: int) -> float:
+    """Return the inflation from m_k · m_{k-2}, |m_k|², ⟨|g_t|²⟩ and n."""
+    noise = mean_square - max(lasting, 0.0)
+    return max(1.0, count * (square - max(lasting, 0.0)) / noise) if noise > 0.0 else 1.0
