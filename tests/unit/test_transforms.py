@@ -24,6 +24,7 @@ from unrender.optimizers.transforms import (
     GradientMean,
     LastingAgreement,
     PerParameter,
+    PullToStart,
     ScaleByDeviation,
     ScaleByRms,
     ScheduleFreeAverage,
@@ -49,6 +50,7 @@ CHAINS: dict[str, Callable[[], tuple[Any, ...]]] = {
     "PerParameter": lambda: (
         PerParameter(("map",), (GradientMean(), ScaleByRms()), (ScaleByRms(), ScheduleFreeAverage())),
     ),
+    "PullToStart": lambda: (PullToStart({"map": 0.1}), ScaleByRms()),
     "ScaleByDeviation": lambda: (ScaleByDeviation(rule="walk"),),
     "ScaleByRms": lambda: (ScaleByRms(long_memory=True),),
     "ScheduleFreeAverage": lambda: (ScaleByRms(), ScheduleFreeAverage()),
