@@ -487,24 +487,28 @@ def test_a_run_that_stopped_on_its_way_is_told(steps: int, rate: float, stopped:
 
 
 @pytest.mark.parametrize(("last", "told"), [(1.0, "no longer improves"), (0.5, NOT_CONVERGED)])
-def test_averages_over_steps_are_no_progress(last: float, told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_averages_over_steps_are_no_progress(last: float, told: str) -> None:
     """The loss of the averages is half of that of an earlier step in both runs; the second one has come as far without them."""
     problem = made()
     run = ur.optimize(problem, ur.PathGradient(), ur.optimizers.Adam(0.01), steps=2)
     averages = replace(run, parameters={"x": np.zeros(SIZE)}, history=[{"step": step} for step in range(128)])
     check, pictures = verify.Verify(), FreshPictures(problem, 0, 0)
-    residuals = np.full((4, SIDE * SIDE, 3), 1.0)
+    spread = 1.0 + np.array([[-0.02], [-0.01], [0.01], [0.02]])
 
-    def of(step: int, _: Any, picture: Any) -> verify.EarlierImage:
-        loss = 1.0 if step == 64 else 0.5 if picture is end else last
-        losses = loss * (1.0 + np.array([[-0.02], [-0.01], [0.01], [0.02]]))
-        return verify.EarlierImage(step, fresh_pictures.Picture((), losses), residuals, False)
+    def picture(loss: float) -> fresh_pictures.Picture:
+        return fresh_pictures.Picture((1.0 + pictures.references + np.zeros((4, 1, 1)),), loss * spread)
 
-    end = pictures.picture(averages.parameters)
-    check._small, check._earlier = pictures, [of(64, pictures, None)]
-    monkeypatch.setattr(verify.EarlierImage, "of", of)
-    (line,) = check._residual(problem, averages, pictures, end, pictures.picture(run.parameters))
+    check._small, check._earlier = pictures, [verify.EarlierImage(64, picture(1.0), pictures)]
+    (line,) = check._residual(problem, averages, pictures, picture(0.5), picture(last))
     assert told in line
+
+
+@pytest.mark.parametrize(("ratio", "still"), [(0.95, True), (0.5, False), (0.3, False)])
+def test_a_loss_of_one_view_has_no_standard_error_and_is_compared_as_it_is(ratio: float, still: bool) -> None:
+    pictures = FreshPictures(made(), 0, 0)
+    pictures.sampled = True
+    one, last = (fresh_pictures.Picture((), np.full((4, 1), loss)) for loss in (1.0, ratio))
+    assert verify.EarlierImage(200, last, pictures).is_still(verify.EarlierImage(64, one, pictures)) is still
 
 
 def test_a_difference_below_the_noise_of_a_pixel_is_not_compared_with_it() -> None:

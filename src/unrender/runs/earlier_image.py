@@ -31,14 +31,17 @@ class EarlierImage:
     Attributes:
         step: number of completed steps.
         picture: its picture, with the random numbers of other steps' ones.
-        residuals: independent images minus the references, (K, N, 3).
-        sampled: whether its pixels are a sample.
+        pictures: renderer of the pictures of all steps.
     """
 
     step: int
     picture: Picture
-    residuals: np.ndarray
-    sampled: bool
+    pictures: FreshPictures
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """Return the independent images minus the references, (K, N, 3)."""
+        return self.pictures.differences(self.picture.images)
 
     @property
     def is_short(self) -> bool:
@@ -57,32 +60,30 @@ class EarlierImage:
     def change(self, earlier: EarlierImage, factor: float) -> tuple[float, float]:
         """Return the loss minus `factor` times that of an earlier step, and its standard error; infinite for images that are not finite."""
         first, second = factor * earlier.picture.losses, self.picture.losses
-        of = difference(first, second, self.sampled)
+        of = difference(first, second, self.pictures.sampled)
         return (of.value, of.standard_error) if math.isfinite(of.value) else (math.inf, math.inf)
 
     def is_still(self, earlier: EarlierImage) -> bool:
         """Return whether the loss has hardly fallen since an earlier step: surely for a short run, as far as noise tells for others."""
-        value, error = self.change(earlier, _STILL_SHORT if earlier.is_short else _STILL)
-        return (_SURE if earlier.is_short else -1.0) * error < value < math.inf
-
-    @classmethod
-    def of(cls, step: int, pictures: FreshPictures, picture: Picture) -> EarlierImage:
-        """Return the image of a step that `pictures` has rendered."""
-        return cls(step, picture, pictures.differences(picture.images), pictures.sampled)
+        if earlier.is_short:
+            value, error = self.change(earlier, _STILL_SHORT)
+            return _SURE * error < value < math.inf
+        value, error = self.change(earlier, _STILL)
+        return -(error if math.isfinite(error) else 0.0) < value < math.inf
 
 
-def not_converged(last: EarlierImage, earlier: EarlierImage, pictures: FreshPictures) -> list[str]:
+def not_converged(last: EarlierImage, earlier: EarlierImage) -> list[str]:
     """Return a warning if the loss still falls, and the image differs from the references by a tenth beyond noise.
 
     Args:
         last, earlier: images of the last and of an earlier step, with the same random numbers. Averages over steps would lower the loss
             without progress, so neither is of averages.
-        pictures: renderer of both images.
     """
     value, error = last.change(earlier, _FALLS)
     if not value + _SURE * error < 0.0:
         return []
-    of = last.residuals, last.residuals, pictures.references, pictures.weights, pictures.sizes
+    residuals, pictures = last.residuals, last.pictures
+    of = residuals, residuals, pictures.references, pictures.weights, pictures.sizes
     differs = misfit(*of, _OF_PICTURE_FALLING)
     if differs is None:
         return []

@@ -113,7 +113,7 @@ class Verify(Callback):
             return
         values = run.full()
         picture = pictures.picture(values)
-        self._earlier = [*self._earlier[-1:], EarlierImage.of(run.step, pictures, picture)]
+        self._earlier = [*self._earlier[-1:], EarlierImage(run.step, picture, pictures)]
         known, loss = run.state.candidate, picture.loss[0]
         if not short and (known is None or loss < known.loss):
             run.state.candidate, self._candidate = Candidate(run.step, loss, values), (run.step, picture)
@@ -238,11 +238,11 @@ class Verify(Callback):
         if small is not pictures:
             unaveraged = small.picture(result.last)
         # Averages over steps lower the loss without progress, so the comparison with an earlier step is of the last step itself.
-        last = EarlierImage.of(result.steps, small, unaveraged)
+        last = EarlierImage(result.steps, unaveraged, small)
         if not last.is_still(earlier):
-            return not_converged(last, earlier, small)
+            return not_converged(last, earlier)
         if averages:
-            last = EarlierImage.of(result.steps, small, end if small is pictures else small.picture(result.parameters))
+            last = replace(last, picture=end if small is pictures else small.picture(result.parameters))
         own = small.references, small.weights, small.sizes
         differences = pictures.differences(end.images)
         # A sample of pixels has others than the images of earlier steps.
