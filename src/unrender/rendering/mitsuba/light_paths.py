@@ -31,6 +31,8 @@ _SAME = (
     "PRBVolpathIntegrator",
 )
 """Integrators whose light paths equal those of this package."""
+_VOLUMETRIC = _SAME[-4:]
+"""Integrators for participating media. They do not count segments that end on masks and null surfaces."""
 _DIRECT = ("DirectIntegrator", "DirectProjectiveIntegrator")
 _NESTING = ("AOVIntegrator", "MomentIntegrator")
 _UNLIMITED = 2**31
@@ -118,8 +120,26 @@ def mask_notices(scene: mi.Scene, bsdfs: Iterable[Any], keys: Collection[str]) -
     unknown = masks and any(key.split(".")[-2:][0] == "opacity" for key in keys)
     if not unknown and not any(((value > 0) & (value < 1)).any() for value in values):
         return []
+    return ["Mitsuba's path integrator squares the opacity of masks that emitters light; render references with prb"]
+
+
+def null_notices(scene: mi.Scene, bsdfs: Iterable[Any], volumetric: bool, max_depth: int) -> list[str]:
+    """Return one notice if the scene's integrator counts fewer segments than the kernel for scenes without participating media.
+
+    Args:
+        scene: the loaded scene.
+        bsdfs: BSDFs of the scene.
+        volumetric: whether it has participating media.
+        max_depth: maximum path length in segments.
+    """
+    integrator = scene.integrator()
+    kind = "" if integrator is None else _kind(_light_transport(integrator))
+    passed = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+    if volumetric or kind not in _VOLUMETRIC or not passed or max_depth >= LONGEST_DEPTH:
+        return []
     return [
-        "Mitsuba's path integrator squares the opacity of masks that emitters light; render references with prb or volpath"
+        f"the scene's integrator ({kind}) does not count segments that end on masks and null surfaces, which count here; "
+        "render references with prb, or give a larger max_depth"
     ]
 
 

@@ -20,7 +20,7 @@ from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
 from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle, translation_obstacle
 from unrender.rendering.mitsuba.equal_objects import merge_notices
 from unrender.rendering.mitsuba.film_response import is_spectral
-from unrender.rendering.mitsuba.light_paths import LightPaths, mask_notices
+from unrender.rendering.mitsuba.light_paths import LightPaths, mask_notices, null_notices
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
@@ -74,6 +74,7 @@ class MitsubaRenderer:
             *self.pair.loaded().graph.missing_attributes(),
             *merge_notices(keys, self.pair.loaded().equal),
             *mask_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), keys),
+            *null_notices(self.pair.current, self.pair.loaded().graph.of("bsdf"), self.pair.volumetric, self.max_depth),
             *(f"{name}: the moving sphere is rendered as a mesh" for name in self.pair.loaded().meshed),
         )
         self._formats = formats(self.pair.current.sensors())
