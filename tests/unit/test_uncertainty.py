@@ -84,6 +84,23 @@ def test_errors_have_the_stated_spread(converged: float) -> None:
     assert scores(converged).std() == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9])
+def test_the_followed_fraction_is_that_of_the_solution(monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    """Measured from the differences from the solution. Their opposite sign would give f / (2 f - 1), between 0 and 1: 0, 1 and 1."""
+    found: list[float] = []
+    followed = module._Cells._followed
+
+    def recorded(*given: object) -> float:
+        found.append(followed(*given))  # type: ignore[arg-type]
+        return found[-1]
+
+    monkeypatch.setattr(module._Cells, "_followed", recorded)
+    for seed in range(4):
+        made = problem(seed)
+        uncertainty(made, estimate(made, share))
+    assert np.mean(found) == pytest.approx(share, abs=0.05)
+
+
 def test_what_smoothing_left_out_of_the_references_noise_is_no_error() -> None:
     """Smoothed least squares of a smooth wall: a ninth of the noise's variance is left. With the residual as the error z has 0.35."""
     found = []

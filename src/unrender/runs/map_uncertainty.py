@@ -43,6 +43,8 @@ _ELEMENTS, _LEAST = 9.0, 0.1
 _CORNERS = tuple(np.s_[a, b] for a in (slice(1, None), slice(-1)) for b in (slice(1, None), slice(-1)))
 _SIGNS = ((1.0, -1.0, -1.0, 1.0), (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0))
 """Cells of all blocks of 2 × 2, and signs of their three details (Haar wavelets)."""
+_BLOCK = 16
+"""Number of cells of the blocks whose means have followed the references' noise, also after strong smoothing."""
 _NEARBY, _LEAST_NOISE = 5, 0.02
 """Side of the squares of pixels that share a variance, and least variance relative to the mean."""
 
@@ -77,17 +79,17 @@ def uncertainty(
     the references by more than noise, in up to four views.
 
     For textures, r is the pictures' residual, J their derivative with respect to the parameters, and H a diagonal element of the
-    Gauss-Newton matrix JᵀJ. The variance of an element is that of a posterior with independent elements:
+    Gauss-Newton matrix JᵀJ. Elements are independent, and their values are not shrunk towards the start:
 
-        1 / se² = H / c + 1 / τ² + p        share of the data = (H / c) se²
-        c = max(m + (2 f − 1) σ², f σ²)        m = ⟨H d²⟩        σ² = (JᵀΣJ) / H        κ = Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²
+        se² = min(c / H, 1 / (1 / τ² + p))        share of the data = (H / c) / (H / c + 1 / τ² + p)
+        c = max(m + (2 f − 1) σ², q σ²)        m = ⟨H d²⟩        σ² = (JᵀΣJ) / H        κ = Σ_ij (JᵀJ)_ij² / Σ_i (JᵀJ)_ii²
 
-    d is the distance from the least-squares solution, (JᵀJ)⁻¹ Jᵀr, with two eigenvalues of JᵀJ / H: one of changes that neighbours
+    d is the difference from the least-squares solution, (JᵀJ)⁻¹ Jᵀr, with two eigenvalues of JᵀJ / H: one of changes that neighbours
     share, and 1 of all others. So m, a mean over neighbours, contains what has not converged, and the run's noise. σ² is the variance of
     the solution by the references' noise, and f in [0, 1] the fraction of the solution's fine detail that the parameters have. For the
-    solution times a filter f, m contains (1 − f)² σ² of that noise, and the error f² σ², which is f σ² where f is 0 or 1. The variance
-    Σ of a pixel is that of the residual that neighbouring pixels do not share. τ² is the mean square change from the start plus the mean
-    variance, and p the curvature of the parameter's prior.
+    solution times a filter of mean f, m contains ⟨(1 − f)²⟩ σ² of that noise, and the error ⟨f²⟩ σ², at least f² σ². With q = f² +
+    (1 − f²) / 16, the means of 4 × 4 texels count as followed. The variance Σ of a pixel is that of the residual that neighbouring
+    pixels do not share. τ² is the mean square change from the start plus the mean variance, and p the curvature of the parameter's prior.
 
     Errors of what is not unknown, such as a lamp of another colour, are not included. Volumes have no map, since rays pass many voxels,
     and a diagonal does not bound their errors; nor have textures with κ ≥ 1.3, such as those with more texels than pixels that see them,
@@ -257,7 +259,7 @@ class _Cells:
             prior: curvature of the prior, (..., C).
         """
         counted, channels = self.counted, self.change.shape[-1]
-        one, other = (self._distance(gradient, smooth) for gradient in gradients)
+        one, other = (self._difference(gradient, smooth) for gradient in gradients)
         explained = self.curvature * (one * other).mean(axis=-1)
         m = _Mean.of(explained[counted])
         if not (m.is_known or noise_is_known):
@@ -267,16 +269,17 @@ class _Cells:
         pooled = (elements * local + _ELEMENTS * m.value) / (elements + _ELEMENTS)
         pooled = np.maximum(pooled, max(_LEAST * m.value, 0.0))
         f = self._followed(one, other)
-        c = np.maximum(np.maximum(pooled + (2.0 * f - 1.0) * self.noise, f * self.noise), 1e-12)
+        least = f**2 + (1.0 - f**2) / _BLOCK
+        c = np.maximum(np.maximum(pooled + (2.0 * f - 1.0) * self.noise, least * self.noise), 1e-12)
         before = float(np.square(self.change)[counted].mean()) + float(c[counted].mean()) / float(
             self.curvature[counted].mean()
         )
         precision = (self.curvature / c)[..., None] * np.ones(channels)
-        variance = 1.0 / (precision + 1.0 / max(before, 1e-12) + prior)
-        return variance, precision * variance
+        others = 1.0 / max(before, 1e-12) + prior
+        return 1.0 / np.maximum(precision, others), precision / (precision + others)
 
-    def _distance(self, gradient: np.ndarray, smooth: float) -> np.ndarray:
-        """Return the distance from the least-squares solution, (..., C), from Jᵀr; 0 at cells that do not count."""
+    def _difference(self, gradient: np.ndarray, smooth: float) -> np.ndarray:
+        """Return the parameters minus the least-squares solution, (..., C), from Jᵀr; 0 at cells that do not count."""
         roots = np.where(self.counted, np.sqrt(self.curvature), np.inf)[..., None]
         shared = neighbour_means(gradient / roots, channels=True)
         return (gradient / roots - (1.0 - 1.0 / smooth) * shared) / roots
@@ -285,17 +288,12 @@ class _Cells:
         """Return the fraction in [0, 1] of the solution's differences of neighbours that the parameters have; 1 if noise hides it.
 
         Args:
-            one, other: two independent distances from the solution, (..., C).
+            one, other: two independent differences from the solution, (..., C).
         """
-        solutions = self.change + one, self.change + other
-        products, squares = (self._details(a, b) for a, b in ((self.change, one + other), solutions))
-        own = self._details(self.change, self.change)
-        total = _Mean.of(squares)
-        return (
-            min(max((float(own.mean()) + 0.5 * float(products.mean())) / total.value, 0.0), 1.0)
-            if total.is_known
-            else 1.0
-        )
+        solutions = self.change - one, self.change - other
+        total = _Mean.of(self._details(*solutions))
+        own = float(self._details(self.change, 0.5 * (solutions[0] + solutions[1])).mean())
+        return min(max(own / total.value, 0.0), 1.0) if total.is_known else 1.0
 
     def _details(self, one: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return products of two maps' details in the blocks of 2 × 2 cells that all count, weighted by the inverse of their variance."""
