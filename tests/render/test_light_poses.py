@@ -106,6 +106,33 @@ def test_auto_leaves_a_start_at_which_the_sun_lights_other_faces(
     assert not any(reason.startswith("starts at another place") for reason in planted.reasons)
 
 
+def test_auto_takes_path_gradients_of_many_aims_and_perturbed_renders_of_few() -> None:
+    """Two renders for each of 32 numbers cost more than one adjoint; the loss smoothed over all of them rose."""
+    many, few = (lights.problem(name, views=1, seed=0, resolution=8, spp=4) for name in ("spots", "spot"))
+    assert isinstance(method("auto").plan(many).estimator, ur.PathGradient)
+    assert isinstance(method("auto").plan(few).estimator, ur.GaussNewton)
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "key"),
+    [
+        ("spot", {"beam_width": 20.0, "cutoff_angle": 20.0}, "lamp.rotation.x"),
+        ("spot", {"texture": {"type": "bitmap", "bitmap": mi.Bitmap(PICTURE), "raw": True}}, "lamp.rotation.x"),
+        ("spot", {}, "lamp.translation"),
+        ("projector", {}, "lamp.rotation"),
+        ("directional", {}, "lamp.rotation"),
+        ("sunsky", {}, "lamp.rotation"),
+    ],
+)
+def test_poses_that_move_edges_of_light_or_shadow_have_no_path_gradient(kind: str, more: Any, key: str) -> None:
+    """A beam without a falloff, a texture that may end at an edge, a place, from which shadows depend, and directions of sharp shadows."""
+    smooth = MitsubaRenderer(scene(light("spot")), 3).parameters()["lamp.rotation.x"]
+    assert smooth.differentiable
+    info = MitsubaRenderer(scene(light(kind) | more), 3).parameters()[key]
+    assert not info.differentiable
+    assert "path gradients do not support it" in info.reason
+
+
 VALUES = {"translation": SHIFT, "rotation": TURN, "scale": SCALE}
 
 

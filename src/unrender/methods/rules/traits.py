@@ -83,11 +83,16 @@ class Traits:
     @cached_property
     def unreachable(self) -> str:
         """Reason why path gradients of the unknowns are unsuitable; "" if they are suitable."""
-        if rigid := next(iter(self.poses), ""):
+        if rigid := next((key for key in self.poses if not self._turns_by_paths(key)), ""):
             other = "; --method plain has path gradients" if self.infos[rigid].differentiable else ""
             what = "a light" if self.infos[rigid].light else "a shape or sensor"
             return f"parameter {rigid} moves {what} as a whole, with plateaus of the loss{other}"
         return refusal(self.problem)
+
+    def _turns_by_paths(self, key: str) -> bool:
+        """Return whether a pose is a rotation of one of many lights, whose path gradient costs as much as that of one."""
+        info = self.infos[key]
+        return info.light and info.differentiable and self.elements > self.constants.few_numbers
 
 
 def refusal(problem: Problem) -> str:

@@ -58,6 +58,7 @@ class ParameterTraits:
         medium: whether extinction or scattering of a participating medium depends on it.
         phase: whether it belongs to a phase function.
         light: whether it moves an emitter without a shape, which needs no acceleration structure.
+        turns: whether it turns an emitter without a shape, whose radiance changes continuously.
     """
 
     geometric: bool
@@ -67,6 +68,7 @@ class ParameterTraits:
     medium: bool = False
     phase: bool = False
     light: bool = False
+    turns: bool = False
 
     @property
     def shares_paths(self) -> bool:

@@ -53,12 +53,14 @@ class PoseKey:
         part: "translation", "rotation" or "scale".
         axis: 0 to 2, or None for all.
         light: whether the target emits light.
+        smooth: whether it changes the radiance of a light continuously, and no path, so that path replay gives its derivative.
     """
 
     target: str
     part: str
     axis: int | None
     light: bool = False
+    smooth: bool = False
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -79,16 +81,31 @@ def keys(scene: Any) -> dict[str, PoseKey]:
     targets += [(lamp.id(), _LIGHTS.get(lamp.class_name(), ()), True) for lamp in lamps]
     targets += [(sensor.id(), _MOTIONS, False) for sensor in scene.sensors() if sensor.get_shape() is None]
     counts = Counter(target for target, _, _ in targets)
+    turning = {lamp.id() for lamp in lamps if _turns_smoothly(lamp)}
     result: dict[str, PoseKey] = {}
     for target, parts, light in targets:
         if _NAMELESS.fullmatch(target) or counts[target] > 1:
             continue
         for part in parts:
-            key = f"{target}.{part}"
-            result[key] = PoseKey(target, part, None, light)
+            key, smooth = f"{target}.{part}", part == "rotation" and target in turning
+            result[key] = PoseKey(target, part, None, light, smooth)
             if part != "scale":
-                result |= {f"{key}.{name}": PoseKey(target, part, axis, light) for axis, name in enumerate(_AXES)}
+                for axis, name in enumerate(_AXES):
+                    result[f"{key}.{name}"] = PoseKey(target, part, axis, light, smooth)
     return result
+
+
+def _turns_smoothly(lamp: Any) -> bool:
+    """Return whether the radiance of an emitter in a fixed direction is a continuous function of the emitter's rotation.
+
+    It is for an environment map and for a spotlight with a falloff and no texture. The disk of a sun has an edge, and Mitsuba's
+    derivative of a projector does not contain the cosine at its plane.
+    """
+    if lamp.class_name() != "SpotLight":
+        return lamp.class_name() == "EnvironmentMapEmitter"
+    known: Any = mi.traverse(lamp)
+    ramp = float(known["cutoff_angle"][0]) - float(known["beam_width"][0])
+    return ramp > 0.0 and "texture.data" not in known
 
 
 def is_posable(emitter: Any) -> bool:

@@ -313,8 +313,9 @@ class ScenePair:
 
     def _traits(self, key: str) -> ParameterTraits:
         if key in self._current.poses:
-            bare = is_bare(self.current, self._current.poses.key(key).target)
-            return ParameterTraits(True, "it moves an object rigidly", light=bare)
+            pose = self._current.poses.key(key)
+            bare = is_bare(self.current, pose.target)
+            return ParameterTraits(not pose.smooth, "it moves an object rigidly", light=bare, turns=pose.smooth)
         return parameter_traits(self.current_parameters, key, self.loaded().graph)
 
     def physical_range(self, key: str) -> Range:

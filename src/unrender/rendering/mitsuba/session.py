@@ -141,9 +141,9 @@ class MitsubaSession:
             return AovKernel(self._light.aov)
         delta = any(traits.changes_delta for traits in self._traits)
         if not self._pair.volumetric:
-            return PathPair(
-                self._light.max_depth, self._light.rr_depth, changing_delta=delta, differential=self._rough.differential
-            )
+            turning = any(traits.turns for traits in self._traits)
+            depths, differential = (self._light.max_depth, self._light.rr_depth), self._rough.differential
+            return PathPair(*depths, changing_delta=delta, differential=differential, turning_emitters=turning)
         media = any(traits.medium for traits in self._traits)
         emission, field = self._pair.emissive, self._pair.radiance_field
         return VolumePair(

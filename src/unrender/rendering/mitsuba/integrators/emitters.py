@@ -91,13 +91,19 @@ def direct_emission(
 class EmitterConnection:
     """A point sampled on an emitter for next-event estimation at a vertex.
 
+    Args:
+        context, vertex, sample, active: the path, where the connection begins, random numbers, lanes.
+        turning: whether the radiance of an environment has derivatives with respect to its rotation.
+
     Attributes:
         ds: `mi.DirectionSample3f`.
         active: lanes with a sampled emitter; the caller removes occluded ones.
     """
 
-    def __init__(self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool):
-        self._context, self._vertex = context, vertex
+    def __init__(
+        self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool, turning: bool = False
+    ):
+        self._context, self._vertex, self._turning = context, vertex, turning and not context.primal
         self.ds = _sample_direction(context, vertex, sample, active)
         self.active = active & (self.ds.pdf > 0)  # also false for NaN
 
@@ -124,6 +130,17 @@ class EmitterConnection:
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
         result = []
         for throughput, value, emitter in zip(β, values, self._context.states.emitters(ds.emitter), strict=True):
-            radiance = emitter.eval_direction(self._vertex, ds, self.active) * inv_pdf
-            result.append(dr.select(self.active, throughput * mis * value * radiance, 0))
+            radiance = emitter.eval_direction(self._vertex, ds, self.active)
+            if self._turning:
+                radiance = self._turned(emitter, radiance)
+            result.append(dr.select(self.active, throughput * mis * value * (radiance * inv_pdf), 0))
         return result
+
+    def _turned(self, emitter: mi.EmitterPtr, radiance: Spectrum) -> Spectrum:
+        """Return the radiance of `emitter.eval_direction`, with the derivative of an environment's radiance in the fixed direction. Mitsuba
+        looks it up at the texture coordinates of the sample, which have none."""
+        distant = self.active & ~self.ds.delta & mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+        beyond = dr.zeros(mi.SurfaceInteraction3f, dr.width(self.ds))
+        beyond.wi, beyond.wavelengths = -self.ds.d, self._vertex.wavelengths
+        there = emitter.eval(beyond, distant)
+        return dr.select(distant, dr.replace_grad(radiance, there), radiance)

@@ -87,6 +87,7 @@ class PathPair:
         changing_delta: whether a BSDF with an unknown parameter has perfectly specular lobes, which need further evaluations per bounce.
         differential: differential sampling of roughness in replays of one state; None for standard sampling. It needs the entry "rough" of
             `tables`.
+        turning_emitters: whether the rotation of an environment is an unknown with derivatives.
 
     Differences from Mitsuba's `path`, which do not change expected values: a sampled direction is weighted by the BSDF's total density
     and value, not by those of the sampled lobe, so that both states share one density; and the visibility of an emitter is tested
@@ -99,12 +100,14 @@ class PathPair:
         rr_depth: int = 5,
         changing_delta: bool = False,
         differential: DifferentialBsdf | None = None,
+        turning_emitters: bool = False,
     ):
         # This is not a dataclass, since Dr.Jit would treat a dataclass as state of the loop below.
         self.max_depth = max_depth
         self.rr_depth = rr_depth
         self.changing_delta = changing_delta
         self.differential = differential
+        self.turning_emitters = turning_emitters
 
     def sample(
         self,
@@ -226,7 +229,7 @@ class PathPair:
         """Return Ld of each state, by next-event estimation."""
         si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em)
+        connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em, self.turning_emitters)
         ds = connection.ds
         connection.active &= ~context.geometry.ray_test(si.spawn_ray_to(ds.p), connection.active)
         wo = si.to_local(ds.d)
