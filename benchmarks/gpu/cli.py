@@ -14,8 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmarks.gpu.execute import run_slice
-from benchmarks.gpu.plan import SLICES, Slice
-from benchmarks.gpu.states import FULL, TOY, Folder, device
+from benchmarks.gpu.plan import FULL, SLICES, TOY, Folder, Slice, device
 from unrender.backend import variant
 
 

@@ -11,8 +11,7 @@ import time
 from pathlib import Path
 
 from benchmarks.gpu import outcomes
-from benchmarks.gpu.plan import Command, Slice
-from benchmarks.gpu.states import Folder, State
+from benchmarks.gpu.plan import Command, Folder, Slice, State
 from benchmarks.runner.catalogue import ROOT
 
 _GRACE = 10.0

@@ -25,12 +25,11 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.image_errors import views_error
 from benchmarks.peers import scenes
 from benchmarks.races import TUNING_SEED, first_at, search
 from benchmarks.runner.records import Record, scratch
 from benchmarks.suite.run import errors_of
-from benchmarks.timed_runs import timed_run
+from benchmarks.timed_runs import timed_run, views_error
 
 _POINTS = 20
 _PICTURE_SPP = 256

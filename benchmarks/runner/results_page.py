@@ -6,8 +6,7 @@ import shutil
 from pathlib import Path
 
 from benchmarks import markdown
-from benchmarks.gpu.plan import SLICES
-from benchmarks.gpu.states import FULL, Folder
+from benchmarks.gpu.plan import FULL, SLICES, Folder
 from benchmarks.runner import records
 from benchmarks.runner.catalogue import ROOT, Benchmark, benchmarks
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.volumes.fig11_smoke import run as race
-from benchmarks.volumes.fig11_smoke.scenes import DENSEST, FILE, problem, smoothed
-from benchmarks.volumes.smoke_error import EXTINCTION, measure
+from benchmarks.volumes.fig11_smoke.scenes import DENSEST, EXTINCTION, FILE, measure, problem, smoothed
 
 SIZES = {"resolution": 8, "grid": 6, "reference_spp": 16}
 

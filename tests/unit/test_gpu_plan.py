@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.gpu import cli, execute, outcomes
-from benchmarks.gpu.plan import SLICES, Command, Slice
-from benchmarks.gpu.states import FULL, Folder, device
+from benchmarks.gpu.plan import FULL, SLICES, Command, Folder, Slice, device
 from benchmarks.runner.catalogue import ROOT, benchmarks
 from benchmarks.runner.options import add_options
 from benchmarks.runner.results_page import on_a_gpu

@@ -21,11 +21,11 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.image_errors import ImageErrors
 from benchmarks.pixel_schemes import pixels
 from benchmarks.races import Entrant, over, race, reached, scaled
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
+from benchmarks.timed_runs import ImageErrors
 
 UNSEEN = 4
 COARSEST = 8

@@ -146,10 +146,8 @@ def run(
     Args:
         seconds: processor time of a run
         steps: after which a run ends if its time has not; such runs have an entry of their own
-        views: pictures from around
         vertices: of BANANA's sphere, and the most of SUZANNE's
         meshes: folder of suzanne.ply
-        only: methods to run; the others' figures stay
         setting: of all of them, which are not tuned; they have an entry of their own
     """
     dr.set_thread_count(1)
@@ -180,9 +178,7 @@ def table(record: Record) -> str:
 def plot(record: Record) -> figures.Figure:
     """Loss over seconds."""
     panels = {
-        f"{name}: {task['numbers']} numbers": {
-            method: [run["curve"] for run in found["runs"]] for method, found in task["methods"].items()
-        }
+        f"{name}: {task['numbers']} numbers": figures.run_curves(task["methods"])
         for name, task in record["tasks"].items()
     }
     return figures.curves(panels, "seconds", "loss / at the start", log="")

@@ -79,15 +79,9 @@ def bent(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def stage(resolution: int, views: int) -> dict[str, Any]:
     """Cameras around, by turns lower and higher, and a sky."""
     angles = 2 * np.pi * np.arange(views) / views
-    heights = np.where(np.arange(views) % 2 == 0, 0.6, 2.2)
     return {
         "type": "scene",
-        **{
-            f"camera_{number}": parts.camera(
-                (3.8 * np.sin(angle), height, 3.8 * np.cos(angle)), (0, 0, 0), 36.0, resolution
-            )
-            for number, (angle, height) in enumerate(zip(angles, heights, strict=True))
-        },
+        **parts.cameras_around(angles, 3.8, (0.6, 2.2), (0, 0, 0), 36.0, resolution),
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}},
     }
 

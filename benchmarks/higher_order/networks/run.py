@@ -47,7 +47,6 @@ def run(
         seconds: processor time of a run
         images: that the network learns from
         size: of the rendered answers, pixels along a side
-        only: methods to train by; the others' figures stay
         steps: of runs with the published settings of CNN, whose code has 10 000; their time is not limited
         rate: of longer runs, which are not tuned; they have an entry of their own
     """
@@ -101,8 +100,5 @@ _PAPERS_GOALS = tuple(math.sqrt(goal) for goal in (0.1, 0.01, 0.001))
 
 def plot(record: Record) -> figures.Figure:
     """Error over seconds."""
-    panels = {
-        name: {method: [run["curve"] for run in entry["runs"]] for method, entry in task["methods"].items()}
-        for name, task in record["tasks"].items()
-    }
+    panels = {name: figures.run_curves(task["methods"]) for name, task in record["tasks"].items()}
     return figures.curves(panels, "seconds", "error of the poses / at the start")

@@ -1,6 +1,6 @@
 """Starts and outcomes of the tasks of HO Table 2 (supplement): pictures of one run of FR22 and of OurHVPA on each.
 
-The configurations are those that `higher_order.table2` has on record; the start is that of its run number --number. QUAD has
+The configurations are those that `higher_order.table2` has on record; the start is that of its first run. QUAD has
 no picture. Also kept: the error of the parameters at the end, over that at the start.
 """
 
@@ -34,14 +34,12 @@ def picture(problem: ur.Problem, point: np.ndarray) -> np.ndarray:
 
 def run(
     task: tuple[str, ...] = tuple(name for name in TASKS if name != "QUAD"),
-    number: int = 0,
     resolution: int = 32,
     seconds: float = 0.5,
 ) -> dict[str, Any]:
     """All tasks.
 
     Args:
-        number: of the run: of its start and its draws
         seconds: factor of every task's budget in Table 2
     """
     dr.set_thread_count(1)
@@ -55,8 +53,8 @@ def run(
         errors[name] = {}
         for method in METHOD_NAMES:
             config = recorded(name)[method]["config"]
-            started = begin(problem, sized, number, config.get("rate"))
-            found = descend_by(name, sized, method, problem, config, number)
+            started = begin(problem, sized, 0, config.get("rate"))
+            found = descend_by(name, sized, method, problem, config, 0)
             errors[name][method] = float(found.parameter[-WINDOW:].mean())
             maps[f"{name}|start"] = picture(problem, trees.ravel(started.initial()))
             maps[f"{name}|{method}"] = picture(problem, found.end)

@@ -98,13 +98,8 @@ def _kept(task: Task, c: Config, samples: int, joint: bool = False) -> ur.Smooth
     """Products of a Hessian that is kept between steps; with `adaptive`, σ shrinks by convergence in place of steps."""
     adaptive = bool(c.get("adaptive", 0.0))
     half_life = c.get("half_life", 3.0 if adaptive else 20.0)
-    more = {
-        "joint": joint,
-        "hessian_rate": c["memory"],
-        "adaptive_annealing": adaptive,
-        "epsilon": c.get("epsilon", 0.3),
-    }
-    more["hessian_form"] = "diagonal" if "diagonal" in c else "full"
+    more = {"joint": joint, "adaptive_annealing": adaptive, "epsilon": c.get("epsilon", 0.3)}
+    more |= {"hessian_rate": c["memory"], "hessian_form": "diagonal" if "diagonal" in c else "full"}
     return _smoothed(task, {**c, "half_life": half_life}, samples, order="hvp", **more)
 
 
@@ -123,14 +118,8 @@ def _many(task: Task, n: int, c: Config, joint: bool) -> tuple[Any, Any]:
     options: dict[str, Any] = {"order": "hvp", "joint": joint, "spp": _spp(task, c), "orthogonal": True}
     options |= {"hessian_form": "diagonal", "hessian_rate": 1.0, "schedule": ur.schedules.Constant(_SMOOTH)}
     share = min(1.0, samples / (2 if joint else 4) / n)
-    optimizer = ur.optimizers.NewtonCG(
-        trust_radius=_UNBOUNDED,
-        iterations=8,
-        tolerance=0.01,
-        damping=0.02,
-        step_scale=share,
-        schedule=ur.schedules.Inverse(c["steps"]),
-    )
+    falling = {"step_scale": share, "schedule": ur.schedules.Inverse(c["steps"])}
+    optimizer = ur.optimizers.NewtonCG(trust_radius=_UNBOUNDED, iterations=8, tolerance=0.01, damping=0.02, **falling)
     return ur.SmoothedDerivatives(task.widths, samples, **options), optimizer
 
 

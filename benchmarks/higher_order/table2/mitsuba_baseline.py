@@ -61,14 +61,8 @@ def mitsuba(name: str, problem: ur.Problem, rate: float, seconds: float) -> Desc
         while clock < seconds and step < (2 if warm else 100_000):
             began = work_time()
             place(optimizer["x"])
-            image = mi.render(
-                scene,
-                parameters,
-                integrator=integrator,
-                spp=_SPP[name],
-                seed=mi.UInt32(2 * step),
-                seed_grad=2 * step + 1,
-            )
+            seeds = {"seed": mi.UInt32(2 * step), "seed_grad": 2 * step + 1}
+            image = mi.render(scene, parameters, integrator=integrator, spp=_SPP[name], **seeds)
             dr.backward(problem.loss_value(0, image))
             optimizer.step()
             dr.eval(optimizer["x"])

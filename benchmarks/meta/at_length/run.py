@@ -152,8 +152,6 @@ def run(
 
     Args:
         steps: of the paper's form at 1 + 2 samples; the others have as much processor time
-        resolution: film size
-        only: methods to run; the others' figures stay
         tuning_share: of a run's steps, those of each run that a rate is chosen by
     """
     dr.set_thread_count(1)

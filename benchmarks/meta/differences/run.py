@@ -17,6 +17,7 @@ import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.internals import Key, arrays, coupled_gradients, trees
 from benchmarks.paths import truth
+from benchmarks.pixel_schemes import gradients, spread
 from benchmarks.runner.records import Record
 
 PROBLEMS = ("spiral", "indirect-room", "ajar", "chalice")
@@ -55,18 +56,9 @@ def noise(problem: ur.Problem, runs: int) -> list[float]:
     arrays.evaluate(parameters)
     found = []
     for spp in NOISE_SPP:
-        estimator, rows = ur.PathGradient(spp=spp), []
-        for seed in range(runs):
-            state = estimator.init(problem, parameters)
-            gradient = estimator.estimate(problem, parameters, state, Key(2, seed))[0].gradient
-            rows.append(trees.ravel(gradient))
-        found.append(float(np.stack(rows).var(0, ddof=1).sum()))
-    print(
-        problem.name,
-        "Var F of equal paths",
-        [f"{v * n:.3g}" for v, n in zip(found, NOISE_SPP, strict=True)],
-        flush=True,
-    )
+        rows, _, _ = gradients(problem, ur.PathGradient(spp=spp), runs, at=parameters)
+        found.append(spread(rows)[0])
+    print(problem.name, "Var F of equal paths", *(v * n for v, n in zip(found, NOISE_SPP, strict=True)), flush=True)
     return found
 
 
@@ -81,19 +73,13 @@ def run(
     """Variances of differences, then of gradients.
 
     Args:
-        part: measured; the other's figures stay
-        resolution: of the variances
-        spp: of the variances
-        runs: of the variances
         noise_runs: of the noise
     """
-    loss = "RelativeL2"
+    options = {"resolution": resolution, "texture_resolution": 16, "reference_spp": 512, "loss": "RelativeL2"}
     if "variance" in part:
-        options = {"resolution": resolution, "texture_resolution": 16, "reference_spp": 512, "loss": loss}
         found = {name: variances(ur.gallery.problem(name, **options), spp, runs) for name in problem}
         yield {"variance": {"resolution": resolution, "spp": spp, "runs": runs, "problems": found}}
     if "noise" in part:
-        options = {"resolution": resolution, "texture_resolution": 16, "reference_spp": 512, "loss": loss}
         found = {}
         for name in problem:
             size = {**options, "texture_resolution": 1} if name == "spiral" else options
@@ -102,7 +88,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Meta: variance and noise of differences."""
     variance, noise = record["variance"], record["noise"]
     first = next(iter(variance["problems"].values()))
     text = "{resolution}², {spp} spp, {runs} runs. Var ΔF / Var F by step, a share of the way to the truth:".format(

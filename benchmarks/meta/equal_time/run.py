@@ -79,11 +79,9 @@ def run(
     """A part per problem.
 
     Args:
-        seconds: budget of every run
         steps: budget of every run, in place of seconds
         resolution: film size, for GPUs
         texture_resolution: side of the unknown textures, for GPUs
-        only: methods to run; the others' figures stay
     """
     for name in problem:
         sizes = {"resolution": resolution, "texture_resolution": texture_resolution}
@@ -96,7 +94,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Meta, Figs 1, 6 and 9."""
     blocks = []
     for name, entry in record["entries"].items():
         methods, reach = entry["methods"], []

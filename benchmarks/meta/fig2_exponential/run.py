@@ -100,7 +100,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Meta, Fig. 2."""
     horizons = [str(steps) for steps in record["settings"]["steps"]]
     cells = (f"{{{n}[rmse]:.5f}} | {{{n}[of_adam]:.2f}} | {{{n}[rate]:g}}" for n in horizons)
     return markdown.blocks(

@@ -169,7 +169,6 @@ def run(runs: int = 400, steps: int = 100, resolution: int = 12) -> dict[str, An
 
 
 def table(record: Record) -> str:
-    """Meta, Figs 3 and 4."""
     names = {"adam": "Adam's mean", "meta": "meta", "independent": "meta, independent statistics"}
     row = "{error[half]:.3f} | {error[-1]:.3f} | {variance_over_plain[0]:.3f} | {variance_over_plain[1]:.3f} | {lag:.2f} | "
     row += "{predicted_over_actual[2]:.2f} | {predicted_over_actual[0]:.2f} to {predicted_over_actual[4]:.2f} | {within:.0f} %"

@@ -18,6 +18,8 @@ from benchmarks.races import Entrant, race
 from benchmarks.runner.records import Record
 
 RATES = (0.0003, 0.001)
+LONG_RATE = 0.001
+"""Of the descents at length."""
 ABLATIONS: dict[str, dict[str, Any]] = {
     "whole": {},
     "centred variances": {"centred": True},
@@ -48,17 +50,14 @@ def run(
     steps: int = 1500,
     long_seeds: int = 5,
     long_resolution: int = 16,
-    rate: float = 0.001,
 ) -> Iterator[dict[str, Any]]:
     """The race of all forms, and their descents at one rate.
 
     Args:
         seconds: budget of every run of the race
-        part: measured; the other's figures stay
         steps: of every descent at length
         long_seeds: of the descents at length
         long_resolution: of the descents at length
-        rate: of the descents at length
     """
     if "tuned" in part:
         problem = ur.gallery.problem("ajar", resolution=resolution)
@@ -66,14 +65,13 @@ def run(
     if "at length" in part:
         size = {"resolution": long_resolution, "texture_resolution": 8}
         problem = ur.gallery.problem("indirect-room", loss="RelativeL2", **size)
-        conditions = {**size, "steps": steps, "seeds": long_seeds, "rate": rate}
+        conditions = {**size, "steps": steps, "seeds": long_seeds, "rate": LONG_RATE}
         for entrant in entrants():
-            found = race(problem, [replace(entrant, rates=(rate,))], long_seeds, steps=steps)
+            found = race(problem, [replace(entrant, rates=(LONG_RATE,))], long_seeds, steps=steps)
             yield {"at length": {**conditions, "methods": found}}
 
 
 def table(record: Record) -> str:
-    """Meta, Fig. 5."""
     blocks = [
         "`ajar`, {resolution}², {seconds:g} s, {seeds} seeds, each tuned.".format(**record["settings"]),
         markdown.records(

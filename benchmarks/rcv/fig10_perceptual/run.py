@@ -8,28 +8,81 @@ Compared is the derivative by each pixel at a step of a descent, from a plain re
 14), and from a control variate that took the same steps; mean over runs less the derivative at a converged image.
 
 Descents on the same loss are of the textured back wall of a Cornell box, which a lamp at the ceiling lights directly, as in the paper's
-figure (`descents.py`): the image at 4 and 32 samples per pixel without a control variate and at 4 with one, the adjoint at 4; Adam with a
+figure: the image at 4 and 32 samples per pixel without a control variate and at 4 with one, the adjoint at 4; Adam with a
 falling rate, tuned per method, at equal steps. Error is the texture's RMSE relative to where it began.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.derivative_bias import METHODS, derivatives
+from benchmarks.internals import IndirectRoom, arrays, build_problem, parts
 from benchmarks.paths import converged, descent, truth
-from benchmarks.rcv.fig10_perceptual.descents import descents
+from benchmarks.races import Entrant, race
 from benchmarks.rcv.fig10_perceptual.train import LAYERS, train
 from benchmarks.runner.records import Record
+from unrender.losses import Loss
+from unrender.schedules import Cosine
 
 QUICK = {
     "resolution": 8, "runs": 3, "step": 2, "renders": 2, "reference_spp": 64, "train_steps": 2, "steps": 2, "seeds": 1,
 }  # fmt: skip
+WALL = "back.bsdf.reflectance.data"
+ADJOINT_SPP = 4
+RATES = (0.03, 0.06, 0.12)
+FLOOR = 0.02
+"""Of the falling rate, at the end."""
+
+
+@dataclass(frozen=True)
+class CornellBox(IndirectRoom):
+    """The specification of the problem: `indirect-room` with a square lamp at its ceiling in place of the one that lights that alone."""
+
+    def scene(self) -> dict[str, Any]:
+        """A new one at each call."""
+        room = {name: piece for name, piece in super().scene().items() if not name.startswith("lamp")}
+        lamp = parts.rectangle((0, 0.995, 0), (0.35, 0, 0), (0, 0, 0.35), parts.diffuse(0.0))
+        return room | {"lamp": lamp | {"emitter": parts.light(9.0, 8.0, 6.5)}}
+
+
+def entrants(steps: int) -> list[Entrant]:
+    """Adjoint paths are as many for all."""
+    adam = functools.partial(ur.optimizers.Adam, schedule=Cosine(steps, FLOOR))
+    estimators = {
+        "plain, 4": ur.PathGradient(spp=4, adjoint_spp=ADJOINT_SPP),
+        "plain, 32": ur.PathGradient(spp=32, adjoint_spp=ADJOINT_SPP),
+        "rcv, 4": ur.PathGradient(ur.images.RecursiveControlVariate(), spp=4, adjoint_spp=ADJOINT_SPP),
+    }
+    return [Entrant(name, name.split(",")[0], made, adam, RATES) for name, made in estimators.items()]
+
+
+def descents(loss: Loss, resolution: int, reference_spp: int, steps: int, seeds: int) -> tuple[dict[str, Any], Any]:
+    """Every method, tuned, at equal steps.
+
+    Returns:
+        {method: see `race`}, and {"wall/reference", "wall/plain, 4", ...: (N, N, 3)}, textures at the end of the first seed's runs.
+    """
+    made = CornellBox(resolution, resolution, reference_spp, loss=loss)
+    problem = build_problem("cornell-box", made)
+    assert problem.truth is not None
+    walls: dict[str, Any] = {"wall/reference": problem.truth[WALL]}
+
+    def ended(name: str, seed: int, result: ur.Result) -> None:
+        if seed == 0:
+            walls[f"wall/{name}"] = result.parameters[WALL]
+
+    found = race(problem, entrants(steps), seeds, ended=ended, points=30, steps=steps)
+    return found, {name: np.asarray(arrays.numpy(wall)) for name, wall in walls.items()}
 
 
 def run(

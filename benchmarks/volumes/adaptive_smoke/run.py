@@ -14,7 +14,7 @@ from benchmarks import figures, markdown
 from benchmarks.pixel_schemes import SCHEMES, pixels
 from benchmarks.races import Entrant, over, race, scaled
 from benchmarks.runner.records import Record
-from benchmarks.volumes.smoke_error import measure
+from benchmarks.volumes.fig11_smoke.scenes import measure
 
 RATES = (0.003, 0.01)
 QUICK = {"seconds": 0.5, "seeds": 2, "count": 32, "resolution": 8, "grid": 8}

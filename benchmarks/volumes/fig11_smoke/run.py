@@ -25,8 +25,7 @@ import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.races import Entrant, race, scaled
 from benchmarks.runner.records import Record
-from benchmarks.volumes.fig11_smoke.scenes import FILE, problem, smoothed
-from benchmarks.volumes.smoke_error import measure
+from benchmarks.volumes.fig11_smoke.scenes import FILE, measure, problem, smoothed
 
 PLAIN = {"steps": (1, 2, 4, 8, 16, 32), "time": (1, 4, 16), "lit inside": (1, 4, 16), "tutorial": (1, 4, 16)}
 WITH = {"steps": (1, 2), "time": (1, 2), "lit inside": (1,), "tutorial": (1,)}

@@ -1,4 +1,5 @@
-"""The volumes of the race: the gallery's smoke, the same with a lamp inside, and one that somebody else made."""
+"""The volumes of the race: the gallery's smoke, the same with a lamp inside, and one that somebody else made. Errors of their grids are as
+far as an image determines them: the albedo of empty voxels shows in none."""
 
 from __future__ import annotations
 
@@ -11,7 +12,8 @@ import numpy as np
 from skimage.transform import resize
 
 import unrender as ur
-from benchmarks.internals import Smoke, build_problem, mi, parts, volumes
+from benchmarks.internals import Smoke, Tree, arrays, build_problem, mi, parts, volumes
+from benchmarks.paths import truth as true_parameters
 
 FILE = "tutorials/volume.vol"
 """Of Mitsuba's tutorials, below the folder of assets."""
@@ -72,3 +74,27 @@ def smoothed(made: ur.Problem) -> ur.Problem:
     """The same problem, its grids preconditioned by `Sobolev`."""
     sobolev = ur.preconditioners.Sobolev()
     return made.replaced(parameters=[replace(parameter, preconditioner=sobolev) for parameter in made.parameters])
+
+
+EXTINCTION, ALBEDO = (f"smoke.interior_medium.{name}.data" for name in ("sigma_t", "albedo"))
+
+
+def measure(problem: ur.Problem) -> Callable[[Tree], dict[str, float]]:
+    """ "both", and for the record extinction, scattering, and albedo over all voxels."""
+
+    def fields(parameters: Any) -> dict[str, np.ndarray]:
+        extinction, albedo = (np.asarray(arrays.numpy(parameters[key]), np.float64) for key in (EXTINCTION, ALBEDO))
+        return {"extinction": extinction, "scattering": extinction * albedo, "albedo": albedo}
+
+    truth = fields(true_parameters(problem))
+
+    def errors(parameters: Tree) -> dict[str, float]:
+        return {name: float(np.sqrt(np.mean((x - truth[name]) ** 2))) for name, x in fields(parameters).items()}
+
+    start = errors(problem.initial())
+
+    def relative(parameters: Tree) -> dict[str, float]:
+        found = {name: error / start[name] for name, error in errors(parameters).items()}
+        return {"both": (found["extinction"] + found["scattering"]) / 2, **found}
+
+    return relative

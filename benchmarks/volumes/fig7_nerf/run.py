@@ -17,11 +17,11 @@ from typing import Any
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.image_errors import ImageErrors
 from benchmarks.internals import Estimator, dr
 from benchmarks.races import AT_END, TUNING_SEED, Entrant, follow, race, scaled
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
+from benchmarks.timed_runs import ImageErrors
 from unrender.schedules import Constant, Cosine, Schedule
 
 SPP = (2, 4, 8)
