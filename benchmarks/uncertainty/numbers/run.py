@@ -18,7 +18,7 @@ from benchmarks.runner import records
 from benchmarks.runner.records import Record
 from benchmarks.uncertainty.run import LEVELS, quantiles, with_own_references
 
-MERGE = ("problems",)
+MERGE = ("problems.*",)
 QUICK: dict[str, Any] = {"problems": ("lamp",), "seeds": 2, "folder_seeds": 1, "steps": 10}
 _SIZE, _DEPTH, _REFERENCE_SPP = 16, 4, 64
 _LIMITS = (1.0, 2.0)
