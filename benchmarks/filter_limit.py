@@ -14,8 +14,6 @@ from benchmarks import markdown
 from benchmarks.internals import mi
 from unrender.gallery.poster import Poster
 
-__all__ = ["amplification", "limits", "shares"]
-
 FILTERS = ("box", "gaussian", "tent", "mitchell", "catmullrom", "lanczos")
 _SIDE, _FINE, _PICTURES = 32, 200, 48
 

@@ -45,6 +45,11 @@ class Kept(ur.protocols.Callback):
         return self._recorder.steps
 
     @property
+    def seconds(self) -> float:
+        """Processor seconds so far, without the first step."""
+        return self._recorder.clock
+
+    @property
     def found(self) -> list[Point]:
         """(processor seconds, parameters) along the run."""
         return [(seconds, values) for seconds, _, values in self._recorder.kept]

@@ -185,6 +185,5 @@ def table(record: Record) -> str:
 
 
 def plot(record: Record) -> figures.Figure:
-    """Both curves over paths."""
     panels = {name: {side: [entry[side]] for side in ("auto", "limit")} for name, entry in record["problems"].items()}
     return figures.curves(panels, "paths in a pixel", log="xy")

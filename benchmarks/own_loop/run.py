@@ -10,17 +10,17 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
+import itertools
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.internals import dr, scene_description
-from benchmarks.own_loop import loops
-from benchmarks.own_loop.loops import Task
+from benchmarks.internals import dr, mi, scene_description
 from benchmarks.peers.drivers.recorder import BudgetSpentError, Recorder
 from benchmarks.races import TUNING_SEED, Setting, grid, median_and_range, tune
 from benchmarks.runner.records import Record
@@ -32,6 +32,96 @@ QUICK = {
 KEY = "back.bsdf.reflectance.data"
 _WARM = 3
 """First steps that do not count."""
+Loss = str
+"""Of the mean: "l1" or "l2"."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A texture to recover, on a scene of stock Mitsuba.
+
+    Attributes:
+        scene: makes the dictionary.
+        key: of the texture.
+        start: (H, W, 3).
+        reference: (H, W, 3).
+        max_depth: of paths.
+    """
+
+    scene: Callable[[], dict[str, Any]]
+    key: str
+    start: np.ndarray
+    reference: np.ndarray
+    max_depth: int
+
+
+Step = Callable[[Any], None]
+"""Takes the texture after each step, and ends the loop by an exception."""
+
+
+def drjit(task: Task, spp: int, rate: float, loss: Loss, seed: int, done: Step, changed: bool) -> None:
+    """`mi.render`, `dr.backward`, `mi.ad.Adam`; changed: the scene's line, the render's, and no `params.update`."""
+    reference, optimizer = mi.TensorXf(task.reference), mi.ad.Adam(lr=rate)
+    optimizer[task.key] = mi.TensorXf(task.start)
+    render = _ours(task, spp, seed) if changed else _stock(task, spp, seed)
+    while True:
+        difference = render(optimizer) - reference
+        dr.backward(dr.mean(dr.abs(difference) if loss == "l1" else dr.square(difference)))
+        optimizer.step()
+        optimizer[task.key] = dr.clip(optimizer[task.key], 0, 1)
+        done(dr.detach(optimizer[task.key]))
+
+
+def torch(task: Task, spp: int, rate: float, loss: Loss, seed: int, done: Step, changed: bool) -> None:
+    """`dr.wrap` around `mi.render`, PyTorch's Adam; changed: `renderer(texture)` in place of the wrapped function."""
+    import torch  # pyright: ignore[reportMissingImports]
+
+    reference = torch.from_numpy(task.reference)
+    texture = torch.from_numpy(task.start.copy()).requires_grad_()
+    optimizer = torch.optim.Adam([texture], lr=rate)
+    render = _ours(task, spp, seed) if changed else _wrapped(task, spp, seed)
+    while True:
+        optimizer.zero_grad()
+        difference = render(texture) - reference
+        (difference.abs() if loss == "l1" else difference**2).mean().backward()
+        optimizer.step()
+        with torch.no_grad():
+            texture.clamp_(0, 1)
+        done(texture.detach())
+
+
+def _ours(task: Task, spp: int, seed: int) -> ur.Renderer:
+    image = ur.images.RecursiveControlVariate()
+    return ur.Renderer(task.scene, [task.key], spp=spp, max_depth=task.max_depth, seed=seed, image=image, groups=2)
+
+
+def _loaded(task: Task) -> tuple[Any, Any]:
+    scene = mi.load_dict({**task.scene(), "integrator": {"type": "prb", "max_depth": task.max_depth}})
+    return scene, mi.traverse(scene)
+
+
+def _stock(task: Task, spp: int, seed: int) -> Callable[[Any], Any]:
+    scene, params = _loaded(task)
+    numbers = itertools.count(seed * 1_000_003)
+
+    def render(optimizer: Any) -> Any:
+        params.update(optimizer)
+        return mi.render(scene, params, spp=spp, seed=next(numbers))
+
+    return render
+
+
+def _wrapped(task: Task, spp: int, seed: int) -> Callable[[Any], Any]:
+    scene, params = _loaded(task)
+    numbers = itertools.count(seed * 1_000_003, 2)
+
+    @dr.wrap(source="torch", target="drjit")
+    def render(texture: Any, number: int) -> Any:
+        params[task.key] = texture
+        params.update()
+        return mi.render(scene, params, spp=spp, seed=number, seed_grad=number + 1)
+
+    return lambda texture: render(texture, next(numbers))
 
 
 def task_of(problem: ur.Problem) -> Task:
@@ -61,9 +151,9 @@ def follow(
 
 def contenders() -> dict[str, Callable[..., None]]:
     """Return the loops by name; those of PyTorch where that is installed."""
-    every = {"drjit": loops.drjit}
+    every = {"drjit": drjit}
     if importlib.util.find_spec("torch") is not None:
-        every["torch"] = loops.torch
+        every["torch"] = torch
     return {
         name + suffix: functools.partial(loop, changed=bool(suffix))
         for name, loop in every.items()
@@ -114,7 +204,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Error at equal time."""
     rows = []
     for entry in markdown.named(record["losses"], "loss", "", "name"):
         name, (middle, low, high) = entry["name"], entry["final"]

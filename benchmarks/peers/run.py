@@ -270,7 +270,6 @@ def _row(side: str, entry: Record, ours: Sequence[Record], several: bool) -> lis
 
 
 def plot(record: Record) -> figures.Figure:
-    """Error of the textures over processor seconds."""
     panels = {
         name: {side: figures.from_start(run["curve"][1:] for run in entry["runs"]) for side, entry in sides.items()}
         for name, sides in record["problems"].items()

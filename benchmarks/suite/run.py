@@ -7,7 +7,7 @@ then run on the other seeds. A parameter's own rate, where a gallery problem giv
 
 Errors are of the elements that the views see: those that change the images at the truth by at least a twentieth of the median
 (`unrender.sensitivity`). Beside both stands what somebody would do by hand where every unknown is a reflectance, reference over rendering
-(benchmarks/fixed_point.py). Compilation is left out of the time on both sides, and told apart. Problems of poses are in
+(`stock_loop.fixed_point`). Compilation is left out of the time on both sides, and told apart. Problems of poses are in
 higher_order.table2, since the loop has no gradients of them.
 """
 
@@ -23,12 +23,11 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.fixed_point import applies, fixed_point
 from benchmarks.internals import dr, insensitive
 from benchmarks.races import TUNING_SEED, Recorder, Setting, grid, tune
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
-from benchmarks.stock_loop import stock_loop
+from benchmarks.stock_loop import applies, fixed_point, stock_loop
 from benchmarks.suite import ablation, scenes
 
 GALLERY = (
@@ -320,7 +319,6 @@ def setting_text(setting: Mapping[str, Any]) -> str:
 
 
 def plot(record: Record) -> figures.Figure:
-    """Error of both sides over seconds."""
     seconds = record["settings"]["seconds"] * np.arange(11) / 10
     sides = {"loop": "stock loop, tuned", "auto": "auto, no option", "fixed_point": "reference / rendering"}
     panels = {

@@ -86,7 +86,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Spread of the scores."""
     rows = []
     for name, entry in record["problems"].items():
         if not entry["count"]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from benchmarks.debiasing import DebiasedGradient, bias_correction
+from benchmarks.derivative_bias import DebiasedGradient, bias_correction
 from tests.analytic import AnalyticRenderer
 from tiers import quick
 from unrender.core.random import Key

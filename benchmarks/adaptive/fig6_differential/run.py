@@ -214,7 +214,6 @@ def _ratio(entry: dict[str, Any]) -> str:
 
 
 def plot(record: Record) -> figures.Figure:
-    """Error along the descents."""
     panels = {
         name: {label: figures.over_steps(entry["along"]) for label, entry in entries.items()}
         for name, entries in record["descents"].items()

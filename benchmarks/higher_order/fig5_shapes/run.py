@@ -1,13 +1,13 @@
 """Spheres deformed into SUZANNE and BANANA (HO Fig. 5), at the paper's numbers of vertices.
 
-SUZANNE: 2562 vertices before pictures of `suzanne.ply` of Mitsuba's tutorials, which is looked for in --meshes. BANANA: 2737
-vertices and their colours, before pictures of a banana made by code. Every perturbation of vertices rebuilds the mesh for
-every view, so a step is dear and there are thousands of unknowns: a short run. All but CMA-ES perturb neighbours alike, and
-step so, by `LargeSteps`. σ, its schedule and the number of renders a step are chosen by
-hand and the same for all; each method's learning rate or trust radius is the best of three, and of more where it is at an
-end, on runs of a third of the time from a seed of their own. OurHVPA takes one product a step in the paper's form, OurJoint
-gradient and product from the same renders, OurG is the gradient alone. "OurJoint, Adam" passes Newton's step through Adam, as
-the paper does. The error is that of the images: the loss over that at the start. Seconds are the processor's.
+SUZANNE: 2562 vertices before pictures of `suzanne.ply` of Mitsuba's tutorials, which is looked for in --meshes. BANANA: 2737 vertices and
+their colours, before pictures of a banana made by code, since the paper's mesh is not public. Every perturbation of vertices rebuilds the
+mesh for every view, so a step is dear and there are thousands of unknowns: a short run. All but CMA-ES perturb neighbours alike, and step
+so, by `LargeSteps`. σ, its schedule and the number of renders a step are chosen by hand and the same for all; each method's learning rate
+or trust radius is the best of three, and of more where it is at an end, on runs of a third of the time from a seed of their own. OurHVPA
+takes one product a step in the paper's form, OurJoint gradient and product from the same renders, OurG is the gradient alone. "OurJoint,
+Adam" passes Newton's step through Adam, as the paper does. The error is that of the images: the loss over that at the start. Seconds are
+the processor's.
 """
 
 from __future__ import annotations
@@ -21,11 +21,96 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.higher_order.fig5_shapes import shapes
-from benchmarks.internals import Key, black_box, dr, trees, with_preconditioner
+from benchmarks.internals import Key, black_box, dr, mi, parts, trees, with_preconditioner
 from benchmarks.races import TUNING_SEED, search
 from benchmarks.runner.records import Record
 from benchmarks.timed_runs import Kept
+
+VERTICES = 2737
+"""Of BANANA, as in the paper."""
+_DEPTH = 2
+_GREY = 0.5
+
+
+def suzanne(resolution: int, views: int, vertices: int, meshes: Path) -> ur.Problem:
+    """A subdivided icosahedron of at most `vertices` vertices, 2562 for the paper's. Raises `InputError` where the file is missing."""
+    subdivisions = int(np.log2((vertices - 2) / 10) / 2)
+    options = {"subdivisions": subdivisions, "resolution": resolution, "views": views}
+    return ur.gallery.problem("sphere-to-mesh", **options, mesh=str(meshes / "suzanne.ply"))
+
+
+def banana(resolution: int, views: int, vertices: int) -> ur.Problem:
+    """`vertices` vertices and their colours, from a grey sphere at the body's middle."""
+    directions, faces = ball(vertices)
+    body, colours = bent(directions)
+
+    def scene(points: np.ndarray, paint: np.ndarray) -> dict[str, Any]:
+        return stage(resolution, views) | {"sphere": _coloured("sphere", points, faces, paint)}
+
+    true = mi.load_dict(scene(body, colours))
+    integrator = mi.load_dict({"type": "path", "max_depth": _DEPTH})
+    pictures = [
+        np.array(mi.render(true, sensor=view, spp=512, seed=view, integrator=integrator)) for view in range(views)
+    ]
+    return ur.Problem(
+        lambda: scene(0.6 * directions, np.full_like(colours, _GREY)),
+        [ur.Parameter("sphere.vertex_positions"), ur.Parameter("sphere.vertex_color", bounds=(0.0, 1.0))],
+        [ur.View(picture, sensor) for sensor, picture in enumerate(pictures)],
+        ur.losses.L2(),
+        _DEPTH,
+        name="banana",
+    )
+
+
+def ball(vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """The unit sphere as triangles of any number of vertices: positions (V, 3) on a spiral, and faces (2 V - 4, 3), facing outward."""
+    from scipy.spatial import ConvexHull
+
+    height = 1 - (2 * np.arange(vertices) + 1) / vertices
+    angle = np.pi * (1 + 5**0.5) * np.arange(vertices)
+    radius = np.sqrt(1 - height**2)
+    points = np.stack([radius * np.cos(angle), height, radius * np.sin(angle)], -1)
+    faces = ConvexHull(points).simplices
+    a, b, c = points[faces.T]
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return points, faces
+
+
+def bent(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A thick arc from the unit sphere: positions and colours, (V, 3) each."""
+    along, side, depth = directions[:, 1], directions[:, 0], directions[:, 2]
+    angle = 1.1 * along
+    thick = 0.34
+    arc = 1.0 + thick * side
+    points = np.stack([arc * np.cos(angle) - 0.8, arc * np.sin(angle), thick * depth], -1)
+    end = np.clip((np.abs(along) - 0.8) / 0.15, 0, 1)[:, None]
+    return points, (1 - end) * np.array([0.9, 0.75, 0.15]) + end * np.array([0.25, 0.15, 0.08])
+
+
+def stage(resolution: int, views: int) -> dict[str, Any]:
+    """Cameras around, by turns lower and higher, and a sky."""
+    angles = 2 * np.pi * np.arange(views) / views
+    return {
+        "type": "scene",
+        **parts.cameras_around(angles, 3.8, (0.6, 2.2), (0, 0, 0), 36.0, resolution),
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}},
+    }
+
+
+def _coloured(name: str, points: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> Any:
+    """A smooth mesh whose reflectance is its vertices' colour."""
+    paint = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": paint})
+    mesh = mi.Mesh(name, len(points), len(faces), properties, has_vertex_normals=True)
+    mesh.add_attribute("vertex_color", 3, colours.ravel().astype(np.float32))
+    parameters = mi.traverse(mesh)
+    parameters["faces"] = mi.UInt32(faces.ravel().astype(np.uint32))
+    parameters["vertex_positions"] = mi.Float(points.ravel().astype(np.float32))
+    parameters.update()
+    return mesh
+
 
 TASKS = ("SUZANNE", "BANANA")
 MERGE = ("tasks.*.methods",)
@@ -88,8 +173,8 @@ METHODS: dict[str, tuple[Make, tuple[float, ...]]] = {
 def problem(task: str, resolution: int, views: int, vertices: int, meshes: Path) -> ur.Problem:
     """One of `TASKS`."""
     if task == "SUZANNE":
-        return shapes.suzanne(resolution, views, vertices, meshes)
-    return shapes.banana(resolution, views, vertices)
+        return suzanne(resolution, views, vertices, meshes)
+    return banana(resolution, views, vertices)
 
 
 def one(
@@ -136,7 +221,7 @@ def run(
     runs: int = 1,
     resolution: int = 32,
     views: int = 2,
-    vertices: int = shapes.VERTICES,
+    vertices: int = VERTICES,
     meshes: Path = Path("../shared/assets/tutorials/meshes"),
     only: tuple[str, ...] = tuple(METHODS),
     setting: float | None = None,
@@ -176,7 +261,6 @@ def table(record: Record) -> str:
 
 
 def plot(record: Record) -> figures.Figure:
-    """Loss over seconds."""
     panels = {
         f"{name}: {task['numbers']} numbers": figures.run_curves(task["methods"])
         for name, task in record["tasks"].items()

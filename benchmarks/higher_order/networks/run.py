@@ -99,6 +99,5 @@ _PAPERS_GOALS = tuple(math.sqrt(goal) for goal in (0.1, 0.01, 0.001))
 
 
 def plot(record: Record) -> figures.Figure:
-    """Error over seconds."""
     panels = {name: figures.run_curves(task["methods"]) for name, task in record["tasks"].items()}
     return figures.curves(panels, "seconds", "error of the poses / at the start")

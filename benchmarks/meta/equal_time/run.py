@@ -63,7 +63,6 @@ def ratios(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def summarize(record: dict[str, Any]) -> dict[str, Any]:
-    """Each problem's ratios."""
     return {"entries": {n: {**entry, "summary": ratios(entry["methods"])} for n, entry in record["entries"].items()}}
 
 

@@ -196,6 +196,5 @@ def table(record: Record) -> str:
 
 
 def plot(record: Record) -> figures.Figure:
-    """Error of the surface over seconds."""
     panels = {name: figures.run_curves(found) for name, found in record["problems"].items()}
     return figures.curves(panels, "processor seconds", "surface error / at the start")

@@ -9,6 +9,7 @@ and the better of two rates by the median error of the seeds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,6 +21,7 @@ from benchmarks.internals import mi, parts
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import StockViews
+from benchmarks.timed_runs import Kept
 
 MERGE = ("cases.*",)
 QUICK: dict[str, Any] = {"cases": ("spot",), "views": (1,), "seeds": 1, "steps": 2, "reference_spp": 4}
@@ -117,25 +119,9 @@ def moved(lamp: str, adam: Any, first: Any) -> Any:
     return mi.Transform4f().translate(place) @ turn @ mi.Transform4f().translate(-place) @ first
 
 
-class Clock(ur.protocols.Callback):
-    """Processor seconds between the first step and the last."""
-
-    def __init__(self):
-        self._times: list[float] = []
-
-    def on_step(self, run: Any, record: dict[str, Any]) -> None:
-        del run, record
-        self._times = [*self._times[:1], work_time()]
-
-    @property
-    def seconds(self) -> float:
-        """The seconds."""
-        return self._times[-1] - self._times[0]
-
-
 def solved(made: ur.Problem, steps: int, seed: int) -> tuple[dict[str, float], float]:
     """The largest errors of `auto`, and its processor seconds."""
-    clock = Clock()
+    clock = Kept(math.inf)
     result = ur.optimize(made, steps=steps, seed=seed, callbacks=[clock], progress=False)
     return by_part(result.parameters), clock.seconds
 

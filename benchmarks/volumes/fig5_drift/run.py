@@ -15,7 +15,7 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import figures, markdown
-from benchmarks.debiasing import DebiasedGradient
+from benchmarks.derivative_bias import DebiasedGradient
 from benchmarks.internals import Estimator
 from benchmarks.paths import descent
 from benchmarks.runner.records import Record
@@ -43,7 +43,6 @@ def drift(problem: ur.Problem, estimator: Estimator, steps: int, seed: int) -> n
 
 
 def summarize(record: dict[str, Any]) -> dict[str, Any]:
-    """Methods in order."""
     entry = record["descents"]["three-bodies"]
     names = [f"{loss}, {name}" for loss, methods in METHODS.items() for name in methods]
     methods = {name: entry["methods"][name] for name in names if name in entry["methods"]}
@@ -75,7 +74,6 @@ def run(steps: int = 600, seeds: int = 3, resolution: int = 32, only: tuple[str,
 
 
 def table(record: Record) -> str:
-    """Distances from the truth."""
     entry = record["descents"]["three-bodies"]
     keys = list(next(iter(entry["methods"].values()))["distance"])
     rows = [

@@ -120,7 +120,6 @@ def run(
 
 
 def table(record: Record) -> str:
-    """Final errors at equal time."""
     parts = []
     for entry in record["schedules"].values():
         of = " of {balls} balls" if entry["balls"] else ""
