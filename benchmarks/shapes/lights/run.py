@@ -198,8 +198,9 @@ def table(record: Record) -> str:
     rows = []
     for name, counts in record["cases"].items():
         for count, entry in counts.items():
+            none = "not measured" if name in LOOPS else "wrong derivative"
             for key, errors in entry["errors"].items():
-                loop = "{:.2g} ({:.2g})".format(*_middle(entry["loop"][key])) if "loop" in entry else "wrong derivative"
+                loop = "{:.2g} ({:.2g})".format(*_middle(entry["loop"][key])) if "loop" in entry else none
                 cells = *(f"{x:.2g}" for x in _middle(errors)), f"{entry['seconds']:.2f}", loop
                 rows.append([name, count, key, *cells])
     head = "light | pictures | unknown | median error | largest | seconds of `auto` | Mitsuba's loop in three times these: median (largest)"
