@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from dataclasses import dataclass
@@ -379,3 +380,13 @@ def test_a_moved_folder_is_taken_up(tmp_path: Path) -> None:
     interrupted(ur.gallery.problem("exponential"), tmp_path / "run")
     shutil.move(tmp_path / "run", tmp_path / "there")
     assert ur.resume(tmp_path / "there").steps == 8
+
+
+def test_a_number_in_place_of_an_optional_state_is_told() -> None:
+    """A scene with one emitter has no state of emitters: a damaged checkpoint with a number there ended in an AttributeError."""
+    estimator, problem = ur.PathGradient(spp=2), ur.gallery.problem("exponential")
+    state = estimator.init(problem, problem.initial())
+    assert state.emitters is None
+    check_alike(state, [state])
+    with pytest.raises(InputError, match=r"emitters: expected EmitterState, got int"):
+        check_alike(dataclasses.replace(state, emitters=3), [state])

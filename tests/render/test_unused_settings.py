@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from unrender.core.errors import InputError
 
 XML = """<scene version="3.0.0">
     <sensor type="perspective"><film type="hdrfilm">
@@ -169,3 +170,29 @@ def test_mitsuba_s_own_optimizer_is_refused_in_one_line(tmp_path: Path) -> None:
     for given in (mi.ad.Adam(lr=0.1), mi.ad.Adam, mi.ad.SGD(lr=0.1)):
         with pytest.raises(ur.InputError, match=r"expected unrender.optimizers.\w+\(learning_rate=...\)"):
             ur.optimize(made, ur.PathGradient(), given, steps=1)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ('<bsdf type="diffuse"/>', '<bsdf type="roughconductor"><float name="alfa" value="0.3"/></bsdf>', 'float "alfa"'),
+        ('<bsdf type="diffuse"/>', '<bsdf type="diffuse"><rgb name="colour" value="1 0 0"/></bsdf>', '"colour"'),
+        ('<shape type="rectangle">', '<shape type="rectangle"><boolean name="flipnormals" value="true"/>', '"flipnormals"'),
+        ('<film type="hdrfilm">', '<film type="hdrfilm"><integer name="hight" value="4"/>', '"hight"'),
+        ("</scene>", '<integrator type="path"><integer name="maxdepth" value="3"/></integrator></scene>', '"maxdepth"'),
+    ],
+)  # fmt: skip
+def test_a_property_that_its_plugin_does_not_know_is_refused_as_by_mitsuba(
+    tmp_path: Path, old: str, new: str, named: str
+) -> None:
+    """The search for equal objects read all properties, and Mitsuba refuses only those that nobody has read."""
+    path = xml(tmp_path)
+    path.write_text(path.read_text().replace(old, new, 1))
+    for load in (mi.load_file, notices):
+        with pytest.raises(Exception, match=named):
+            load(str(path))
+
+
+def test_a_misspelt_property_of_a_dictionary_is_refused() -> None:
+    with pytest.raises(InputError, match=r'unreferenced property.*"max_dept"'):
+        notices(mi.cornell_box() | {"integrator": {"type": "path", "max_dept": 3}})

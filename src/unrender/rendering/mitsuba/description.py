@@ -48,6 +48,7 @@ class Parsed:
 
     config: Any
     state: Any
+    _unread: Sequence[Sequence[str]]
     _checks: scene_assets.AssetChecks = field(default_factory=scene_assets.AssetChecks)
 
     def instantiate(self) -> Any:
@@ -55,10 +56,15 @@ class Parsed:
 
         Raises:
             InputError: a file that it names is missing, malformed or too large, or an object lacks a property that Mitsuba needs.
+            RuntimeError: Mitsuba's refusals, such as of a property that its plugin does not know.
         """
         for node in self.state.nodes:
             _check_complete(node.props)
             self._check_files(node.props)
+        # Readers of the description mark what they read, and Mitsuba refuses only properties that nobody has read.
+        for node, names in zip(self.state.nodes, self._unread, strict=True):
+            for name in names:
+                node.props.mark_queried(name, False)
         with variant.two_threads(), plugins.only(plugins.own_folder()), _printable_log():
             result = mi.parser.instantiate(self.config, self.state)
         return result[0] if isinstance(result, list) else result
@@ -101,11 +107,12 @@ def parse(description: Path | Mapping[str, Any]) -> Parsed:
             state = mi.parser.parse_dict(config, dictionary)
     mi.parser.transform_upgrade(config, state)
     mi.parser.transform_resolve(config, state)
+    unread = [node.props.unqueried() for node in state.nodes]
     _check_types({node.props.plugin_name() for node in state.nodes}, isinstance(description, Path))
     for node in state.nodes:
         _settle(node.props, [*search, *others])
     _check_paths(state.nodes)
-    return Parsed(config, state)
+    return Parsed(config, state, unread)
 
 
 def _parse_xml(config: Any, path: Path) -> tuple[Any, list[Path]]:

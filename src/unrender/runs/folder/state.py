@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
+import types
+import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -80,7 +82,7 @@ def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> No
     """Raise `InputError` unless each part of `state` has the form of that part in one of `patterns`, states of the same components.
 
     The form is class, keys, lengths, array types and shapes. The first axis of an array on the host may differ, because some states grow
-    with the steps. Where all patterns are empty, any state is accepted.
+    with the steps. Where all patterns are empty, a state is accepted that its field's annotation allows.
     """
     if all(pattern is None or (isinstance(pattern, (tuple, list, dict)) and not pattern) for pattern in patterns):
         return
@@ -93,8 +95,10 @@ def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> No
         raise InputError(f"{where}: expected {expected}, got {type(state).__name__}")
     if dataclasses.is_dataclass(state):
         for each in dataclasses.fields(state):
-            parts = [getattr(pattern, each.name) for pattern in fitting]
-            check_alike(getattr(state, each.name), parts, f"{where}.{each.name}")
+            part, parts = getattr(state, each.name), [getattr(pattern, each.name) for pattern in fitting]
+            if all(one is None for one in parts):
+                _check_annotation(part, type(state), each.name, where)
+            check_alike(part, parts, f"{where}.{each.name}")
     elif isinstance(state, Mapping):
         fitting = [pattern for pattern in fitting if list(pattern) == list(state)]
         if not fitting:
@@ -109,6 +113,21 @@ def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> No
             check_alike(value, [pattern[index] for pattern in fitting], f"{where}[{index}]")
     elif isinstance(state, np.ndarray) or arrays.is_drjit(state):
         _check_array(state, fitting, where)
+
+
+def _check_annotation(part: Any, kind: type, name: str, where: str) -> None:
+    """Raise `InputError` unless the annotation of this field of a class allows its value. Annotations of other than classes allow any."""
+    try:
+        hint = typing.get_type_hints(kind)[name]
+    except NameError:  # of an import for type checkers only
+        return
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    classes = [typing.get_origin(one) or one for one in (typing.get_args(hint) if union else (hint,))]
+    if any(one is Any or not isinstance(one, type) for one in classes):
+        return
+    allowed = (*classes, *((int, np.floating) if float in classes else ()))
+    if not isinstance(part, allowed):
+        raise InputError(f"{where}.{name}: expected {classes[0].__name__}, got {type(part).__name__}")
 
 
 def _check_array(array: Any, patterns: list[Any], where: str) -> None:
