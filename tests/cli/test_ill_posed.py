@@ -54,6 +54,7 @@ def played(unrender, path: Path, variant: str) -> list[str]:
     answer = unrender("run", path, "--steps", 40, "--final-spp", 4, "--out", "out", "--variant", variant)
     assert answer.status == 0, answer.error
     assert "Traceback" not in answer.out + answer.error
+    assert "(at the end)" in " ".join(answer.out.split())  # a number that is not determined is not recovered
     with np.load("out/parameters.npz") as found:
         assert all(np.isfinite(x).all() for x in found.values())
     assert "NaN" not in Path("out/run.json").read_text()

@@ -47,6 +47,9 @@ def test_a_parameter_without_influence_is_named_and_others_are_not():
     lines = undetermined(made, made.initial_values(), 16)
     assert [line.partition(":")[0] for line in lines] == keys[2:]
     assert undetermined(made, made.initial_values(), 16, seconds=0.0) == []  # the first alone, which is determined
+    seen = {key: np.ones(()) for key in keys[:2]} | {key: np.zeros(()) for key in keys[2:]}
+    for most, count in ((0.0, 1), (np.inf, 2)):  # those without a gradient come first
+        assert undetermined(made, made.initial_values(), 16, 0.0, most=most, sensitivities=seen) == lines[:count]
 
 
 @pytest.mark.parametrize(
@@ -74,12 +77,22 @@ def test_light_and_colour_of_all_that_is_seen_share_a_factor():
     assert errors == pytest.approx([0.0, 0.0], abs=1e-6)
 
 
+def test_a_factor_is_tested_with_few_samples_or_named_as_untested():
+    made = problem(scene(DIFFUSE), LIGHT, COLOUR)
+    values = made.initial_values()
+    (line,) = common_factor(made, values, 64, seconds=0.0, per_pass=4, most=np.inf)
+    assert line == f"{LIGHT} and {COLOUR}: determined up to a common factor only"
+    (line,) = common_factor(made, values, 64, seconds=0.0, per_pass=4)
+    assert line.startswith(f"whether {LIGHT} and {COLOUR} share a factor: the run is too short for this test")
+
+
 @pytest.mark.parametrize("keys", [(LIGHT, COLOUR), (LIGHT,), (COLOUR,)])
 def test_a_surface_of_known_colour_determines_the_factor(keys: tuple[str, ...]):
     """As does a light that is known, since only one of the two is an unknown then."""
     turned = mi.ScalarTransform4f().translate([0, -0.6, 0.2]).scale(0.5)
     made = problem(scene(DIFFUSE, card={"type": "rectangle", "to_world": turned, "bsdf": GREY}), *keys)
-    assert common_factor(made, made.initial_values(), 16) == []
+    for seconds in (np.inf, 0.0) if len(keys) == 1 else (np.inf,):
+        assert common_factor(made, made.initial_values(), 16, seconds) == []
 
 
 def test_cells_that_hardly_change_the_pictures_are_told():

@@ -167,7 +167,7 @@ def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypa
     monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
     values = {"wall": np.full(3, 0.4, np.float32)}
     result = replace(Result(values, values, [{}], 30.0, 0.0, "steps"), standard_error={"wall": np.full(3, 1e-3)})
-    line = "whether wall converged: no time was left to test it; use a longer run or fewer pixels"
+    line = "whether wall converged: the run is too short for this test; use more steps or seconds, or fewer pixels"
     if tested:
         assert line not in final_images.render_final_images(made, result).undetermined
         monkeypatch.setattr(final_images, "slowdown", lambda: 1e-9)

@@ -5,15 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.core.text import listed
+from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
-from unrender.scene.render import render, selected_views
+from unrender.scene.render import power_of_two, render, selected_views
 
 _LEAST = 0.005
 """Relative change of the images below which a parameter counts as undetermined over its range."""
@@ -55,25 +57,35 @@ class Change:
 
 
 def undetermined(
-    problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf, per_pass: int | None = None
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    spp: int,
+    seconds: float = np.inf,
+    per_pass: int | None = None,
+    most: float = 0.0,
+    sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> list[str]:
     """Return a line for each parameter that hardly changes the images over its entire range.
 
-    Parameters of materials and media are tested in sequence while time remains. All elements of a parameter change together. If a map
-    such as a bump map hardly changes the images then, its details are tested: a checkerboard of its bounds, or its own values if it has
-    none. If they change the images, the line says that only differences of its elements are determined. A map without bounds gets no
-    other line.
+    Parameters of materials and media are tested in sequence while time remains, first those whose sensitivity is 0. All elements of a
+    parameter change together. If a map such as a bump map hardly changes the images then, its details are tested: a checkerboard of its
+    bounds, or its own values if it has none. If they change the images, the line says that only differences of its elements are
+    determined. A map without bounds gets no other line.
 
     Args:
         values: {key: array}, values of the other parameters.
         spp: samples per pixel of each of four renderings per view.
         seconds: time after which no further parameter is tested; the first one always is.
         per_pass: see `render`.
+        most: time limit for parameters whose sensitivity is 0, if it is longer than `seconds`.
+        sensitivities: {key: array}, see `unrender.runs.sensitivity`.
     """
     known, lines = problem.renderer.parameters(), []
-    until, longest = time.perf_counter() + seconds, 0.0
-    for key, unknown in problem.unknowns.items():
-        info, (low, high) = known[key], unknown.bounds
+    unseen = {key for key, sensitivity in sensitivities.items() if not sensitivity.any()}
+    started, longest = time.perf_counter(), 0.0
+    until = {True: started + max(seconds, most), False: started + seconds}
+    for key in sorted(problem.unknowns, key=lambda key: key not in unseen):
+        info, (low, high) = known[key], problem.unknowns[key].bounds
         own = np.asarray(values[key], np.float32)
         is_map, bounded = own.ndim >= MAP_AXES, low is not None or high is not None
         if is_map and not bounded:
@@ -81,7 +93,7 @@ def undetermined(
         if low is None or high is None or info.rigid or info.viewpoint or info.welded or info.role not in _ROLES:
             continue
         started = time.perf_counter()
-        if longest > 0.0 and started + longest > until:
+        if longest > 0.0 and started + longest > until[key in unseen]:
             break
         ends = [project(np.full(own.shape, end, np.float32), low, high) for end in (low, high)]
         details = np.where(np.indices(own.shape).sum(axis=0) % 2, *ends) if bounded else own
@@ -123,26 +135,33 @@ def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
 
 
 def common_factor(
-    problem: Problem, values: Mapping[str, np.ndarray], spp: int, seconds: float = np.inf, per_pass: int | None = None
+    problem: Problem,
+    values: Mapping[str, np.ndarray],
+    spp: int,
+    seconds: float = np.inf,
+    per_pass: int | None = None,
+    most: float = 0.0,
 ) -> list[str]:
-    """Return one line if the images determine emitters and reflectances only up to a common factor; otherwise none.
+    """Return one line if the images determine emitters and reflectances only up to a common factor, or if that was not tested; or none.
 
     Emitters become brighter by a factor, and reflectances darker by the same factor. The images distinguish the two if they change.
 
     Args:
         values: {key: array}, parameters at which it is tested.
-        spp: samples per pixel of each of eight renderings per view.
-        seconds: time limit; nothing is tested if one rendering shows that it would be exceeded.
-        per_pass: see `render`.
+        spp: most samples per pixel of each of eight renderings per view.
+        seconds: time limit, from which the samples follow.
+        per_pass: least samples per pixel; see `render`.
+        most: time limit with the least samples, if it is longer than `seconds`.
     """
-    known = problem.renderer.parameters()
-    lights, colours = ([k for k in values if known[k].brightness == kind] for kind in ("light", "reflectance"))
+    lights, colours = _brightnesses(problem)
     if not lights or not colours:
         return []
-    started = time.perf_counter()
-    render(problem, values, 0, spp, _SEEDS[0], per_pass)
-    if _RENDERINGS * len(selected_views(problem)) * (time.perf_counter() - started) > seconds:
-        return []
+    least, started = min(per_pass or spp, spp), time.perf_counter()
+    render(problem, values, 0, least, _SEEDS[0], per_pass)
+    needed = _RENDERINGS * len(selected_views(problem)) * (time.perf_counter() - started)
+    if needed > max(seconds, most):
+        return untested_factor(problem)
+    spp = max(least, power_of_two(int(min(spp, least * seconds / needed))))
     brighter = {key: x * np.float32(_FACTOR) if key in lights else x for key, x in values.items()}
     darker = {key: x / np.float32(_FACTOR) if key in colours else x for key, x in brighter.items()}
     alone = _change(problem, values, brighter, spp, per_pass)
@@ -162,6 +181,23 @@ def common_factor(
     }
     error_list = listed([f"{key} {error:.3g}" for key, error in errors.items() if error is not None])
     return [f"{line}; with lights divided by {factor:.3g} and reflectances multiplied by it, errors are {error_list}"]
+
+
+def untested_factor(problem: Problem) -> list[str]:
+    """Return one line if the unknowns may share a factor: that the run was too short for `common_factor`."""
+    lights, colours = _brightnesses(problem)
+    if not lights or not colours:
+        return []
+    return [f"whether {listed(lights)} and {listed(colours)} share a factor: {TOO_SHORT}"]
+
+
+def _brightnesses(problem: Problem) -> tuple[list[str], list[str]]:
+    """Return the keys of the unknown brightnesses of lights, and of the reflectances."""
+    known = problem.renderer.parameters()
+    lights, colours = (
+        [key for key in problem.unknowns if known[key].brightness == kind] for kind in ("light", "reflectance")
+    )
+    return lights, colours
 
 
 def _factor(problem: Problem, key: str, values: np.ndarray) -> float | None:

@@ -12,7 +12,8 @@ import numpy as np
 from unrender.core import phases
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
-from unrender.runs.determination import common_factor, undetermined, undetermined_cells
+from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
+from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
@@ -125,7 +126,7 @@ def render_final_images(
         differs = misfit_of_views(problem, chosen, ends, result.warnings) if result.steps else ""
         if not tested and result.steps and not differs:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
-            lines, deviations = late.missing(), _without(deviations, late.unchecked)
+            lines, deviations = [*untested_factor(problem), *late.missing()], _without(deviations, late.unchecked)
         if everything:
             lines, warnings, deviations = _undetermined(
                 problem, result, sensitivities, 0.25 * tests, weights, fits=not differs, complete=complete
@@ -204,15 +205,16 @@ def _undetermined(
     lines = undetermined_cells(sensitivities)
     spp, seconds = _trial_spp(problem), min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
     per_pass = _pass_spp(problem)
-    lines += common_factor(problem, result.parameters, spp, seconds, per_pass)
-    lines += undetermined(problem, result.parameters, spp, seconds, per_pass)
+    lines += common_factor(problem, result.parameters, spp, seconds, per_pass, most)
+    lines += undetermined(problem, result.parameters, spp, seconds, per_pass, most, sensitivities)
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities, weights)
-    text, deviations = "\n".join(lines), _without(result.standard_error, numbers.unchecked)
+    text = "\n".join(line for line in lines if TOO_SHORT not in line)  # lines about what was tested
+    deviations = _without(result.standard_error, numbers.unchecked)
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in text]
-        lines += numbers.missing(numbers.undetermined)
+        lines += numbers.missing([key for key in numbers.unchecked if key in text] + [*numbers.undetermined])
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)

@@ -21,7 +21,7 @@ from unrender.estimators.base import Estimator
 from unrender.estimators.derivative_images import noise_weights
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.hybrid import HybridGradient, HybridState
-from unrender.runs.field_directions import add_field_directions, fields_of
+from unrender.runs.field_directions import TOO_SHORT, add_field_directions, fields_of
 from unrender.runs.numbers import Differences, Numbers
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
@@ -91,7 +91,7 @@ class NumbersCheck:
         if not keys:
             return []
         if not self.fixed:
-            return [f"whether {listed(keys)} converged: no time was left to test it; use a longer run or fewer pixels"]
+            return [f"whether {listed(keys)} converged: {TOO_SHORT}"]
         others = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
         have = "has no standard error: it is" if len(keys) == 1 else "have no standard errors: they are"
         return [f"{listed(keys)} {have} recovered together with {others}"]

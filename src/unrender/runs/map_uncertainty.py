@@ -12,6 +12,7 @@ import numpy as np
 from unrender.core.exclusive import exclusive
 from unrender.core.random import Key
 from unrender.rendering.renderer import ParameterInfo
+from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import (
     COUNTED,
     FEWEST_PROBES,
@@ -209,7 +210,7 @@ def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
     if info.curved:
         return "pictures may not change in proportion to it"
     if known.probes < FEWEST_PROBES:
-        return "no time was left; use a longer run or fewer pixels"
+        return TOO_SHORT
     overlap = known.overlap.get(key, math.inf)
     if math.isinf(overlap):
         return "it has too many texels to measure whether pixels see several of them"
