@@ -93,18 +93,48 @@ def test_initial_is_a_copy_each_time():
 def test_initial_is_moved_into_the_bounds_and_says_so():
     made = problem([Parameter("wall.value", [-1.0, 0.5, 2.0], bounds=(0.1, 0.9))])
     np.testing.assert_allclose(made.initial()["wall.value"], [0.1, 0.5, 0.9])
-    assert made.notices == ["parameter wall.value: 2 of 3 initial values moved into the bounds [0.1, 0.9]"]
+    assert made.notices == [
+        "parameter wall.value: 2 of 3 initial values moved into the bounds [0.1, 0.9]: -1 to 0.1, 2 to 0.9"
+    ]
 
 
 @pytest.mark.parametrize(("initial", "bounds"), [(7.0, (0.1, 4.0)), (None, (3.0, 4.0)), (np.float32(0), (1.0, None))])
 def test_a_number_is_moved_into_its_bounds_too(initial: Any, bounds: Any):
     made = problem([Parameter("lamp.scale", initial, bounds=bounds)])
     low, high = bounds
+    given = 2 if initial is None else initial
     assert made.initial()["lamp.scale"].shape == ()
     assert made.initial()["lamp.scale"] == (low if initial is None or initial < low else high)
     assert made.notices == [
         f"parameter lamp.scale: 1 of 1 initial values moved into the bounds [{low:g}, {'open' if high is None else f'{high:g}'}]"
+        f": {given:g} to {made.initial()['lamp.scale']:g}"
     ]
+
+
+@pytest.mark.parametrize(
+    ("truth", "values"),
+    [
+        ([-1.0, 0.5, 2.0], "2 of 3 values outside the bounds [0.1, 0.9], which no run can reach: -1, 2"),
+        ([0.1, 0.9, 0.5], ""),
+    ],
+)
+def test_a_truth_outside_the_bounds_is_named(truth: list[float], values: str) -> None:
+    made = problem([Parameter("wall.value", 0.5, bounds=(0.1, 0.9))], truth={"wall.value": truth})
+    assert made.notices == ([f"parameter wall.value: truth has {values}"] if values else [])
+
+
+def test_a_word_is_no_value() -> None:
+    with pytest.raises(
+        InputError, match=r"initial: rough: no such file; expected a number, a colour, or a picture or grid file"
+    ):
+        problem([Parameter("wall.value", "rough")])
+
+
+def test_of_many_values_outside_the_bounds_the_furthest_is_named() -> None:
+    made = problem([Parameter("wall.value", [1.5, 2.0, 0.5], bounds=(0.1, 0.9))], truth={"wall.value": [3.0, 1.5, 0.5]})
+    moved, outside = made.notices
+    assert moved.endswith("2 of 3 initial values moved into the bounds [0.1, 0.9]: such as 2 to 0.9")
+    assert outside.endswith("2 of 3 values outside the bounds [0.1, 0.9], which no run can reach: such as 3")
 
 
 @pytest.mark.parametrize(

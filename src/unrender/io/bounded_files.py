@@ -93,7 +93,9 @@ def no_file(path: Path) -> str:
         ]
     except (OSError, ValueError):  # ValueError: a name with a zero byte
         neighbours = []
-    return f"no such file{did_you_mean(path.name, neighbours)}"
+    # Equal endings make short names look alike, such as m.png and room.png.
+    near = {name for name in neighbours if did_you_mean(path.stem, [Path(name).stem])}
+    return f"no such file{did_you_mean(path.name, sorted(near))}"
 
 
 # ---------------------------------------------------------------------- bytes and text

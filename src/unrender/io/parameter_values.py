@@ -24,7 +24,7 @@ import numpy as np
 
 from unrender.core import periodic
 from unrender.core.errors import InputError
-from unrender.io import images, resampling, volumes
+from unrender.io import bounded_files, images, resampling, volumes
 from unrender.io.file_conversion import MESH_FILES, PLAIN, FileConversion
 
 
@@ -44,7 +44,10 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         InputError: the value does not fit, cannot be read, or is not finite.
     """
     if isinstance(initial, (str, Path)):
-        values, notice = _from_file(Path(initial), shape, conversion)
+        path = Path(initial)
+        if not path.suffix and not bounded_files.kind(path):  # a word, such as "rough"
+            raise InputError(f"{path}: no such file; expected a number, a colour, or a picture or grid file")
+        values, notice = _from_file(path, shape, conversion)
         return periodic.repeat(conversion.stored(values), conversion.repeated), notice
     try:
         array = np.asarray(initial)

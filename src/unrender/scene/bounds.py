@@ -11,6 +11,7 @@ import numpy as np
 from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
+from unrender.core.text import listed
 from unrender.core.trees import Tree
 from unrender.parameterisations.base import Bounds
 from unrender.rendering.renderer import ParameterInfo
@@ -22,6 +23,8 @@ At reflectance 0 no light passes a surface, so its gradient stays 0. A lobe of p
 """
 _LOBE_START = 0.01
 """Distance from an end of the range, as a fraction of it, to which a start is moved if a lobe would never be sampled."""
+_ROUNDING = 1e-6
+"""Distance of a true value from the bounds that rounding explains, relative to the largest value or to 1."""
 _CLEARANCE = 0.01
 """Distance to a singular value that bounds keep, relative to that value; at most half of the initial distance."""
 
@@ -63,15 +66,33 @@ def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[B
 def clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
     """Return `start` clamped to the bounds, and a notice with the number of changed values; "" if none changed."""
     low, high = bounds
-    moved = sum(
-        int(np.count_nonzero(outside(start, end)))
-        for outside, end in ((np.less, low), (np.greater, high))
-        if end is not None
-    )
+    moved, ends = _outside(start, bounds)
     if not moved:
         return start, ""
-    notice = f"{moved} of {start.size} initial values moved into the bounds {_interval(bounds)}"
+    example = f"{'such as ' if moved > len(ends) else ''}{listed([f'{value:g} to {end:g}' for value, end in ends])}"
+    notice = f"{moved} of {start.size} initial values moved into the bounds {_interval(bounds)}: {example}"
     return np.asarray(np.clip(start, low, high), np.float32), notice  # clip returns a scalar for a scalar
+
+
+def truth_notice(truth: np.ndarray, bounds: Bounds) -> str:
+    """Return a notice of true values outside the bounds, beyond rounding; "" for none."""
+    count, ends = _outside(truth, bounds, _ROUNDING * max(float(np.abs(truth).max(initial=0.0)), 1.0))
+    if not count:
+        return ""
+    example = f"{'such as ' if count > len(ends) else ''}{listed([f'{value:g}' for value, _ in ends])}"
+    return (
+        f"has {count} of {truth.size} values outside the bounds {_interval(bounds)}, which no run can reach: {example}"
+    )
+
+
+def _outside(values: np.ndarray, bounds: Bounds, margin: float = 0.0) -> tuple[int, list[tuple[float, float]]]:
+    """Return the number of values outside the bounds by more than a margin, and the furthest beyond each end with that end."""
+    count, ends = 0, []
+    for sign, end in zip((-1.0, 1.0), bounds, strict=True):
+        if end is not None and (beyond := sign * (values - np.float32(end)) > margin).any():
+            count += int(np.count_nonzero(beyond))
+            ends.append((float(sign * np.max(sign * values)), end))
+    return count, ends
 
 
 def open_scale(initial: np.ndarray) -> float:

@@ -365,9 +365,8 @@ def _unknowns(
     check_surfaces(surfaces, {key: u.faces for key, u in unknowns.items() if u.faces is not None})
     unknowns |= {key: replace(unknowns[key], surface=surface) for key, surface in surfaces.items()}
     for key, value in truth.items():
-        true, notice = check_truth(key, value, {each: known[each] for each in unknowns})
-        notices = (*unknowns[key].notices, *([f"parameter {key}: truth {notice}"] if notice else []))
-        unknowns[key] = replace(unknowns[key], truth=true, notices=notices)
+        true, notices = check_truth(key, value, known, unknowns)
+        unknowns[key] = replace(unknowns[key], truth=true, notices=(*unknowns[key].notices, *notices))
     return unknowns
 
 

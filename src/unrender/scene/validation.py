@@ -23,7 +23,7 @@ from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene import coarse_to_fine
-from unrender.scene.bounds import angle_notice, check_bounds, move_inside, open_scale, project
+from unrender.scene.bounds import angle_notice, check_bounds, move_inside, open_scale, project, truth_notice
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.errors import FieldError
 from unrender.scene.key_hints import instead_of, near_key
@@ -309,22 +309,27 @@ def _check_normals(start: np.ndarray, info: ParameterInfo) -> None:
         )
 
 
-def check_truth(key: str, value: Any, known: Mapping[str, ParameterInfo]) -> tuple[np.ndarray, str]:
-    """Return the true value of a parameter, float32, and a notice of how it was converted, "" if it was not.
+def check_truth(
+    key: str, value: Any, known: Mapping[str, ParameterInfo], unknowns: Mapping[str, Unknown]
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the true value of an unknown, float32, and notices of how it was converted, and of values outside the bounds.
 
     Args:
         value: the value as passed.
-        known: the problem's parameters.
+        known: the scene's parameters.
+        unknowns: the problem's unknowns.
 
     Raises:
         FieldError: the value does not suit the parameter.
     """
-    if key not in known:
-        raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, known)}")
+    if key not in unknowns:
+        raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, unknowns)}")
     try:
-        return parameter_values.fill(value, known[key].shape, known[key].conversion)
+        truth, converted = parameter_values.fill(value, known[key].shape, known[key].conversion)
     except InputError as error:
         raise FieldError(("truth", key), str(error)) from error
+    notices = filter(None, (converted, truth_notice(truth, unknowns[key].bounds)))
+    return truth, tuple(f"parameter {key}: truth {notice}" for notice in notices)
 
 
 def open_renderer(scene: Any, max_depth: int | None, keys: Iterable[str] = ()) -> Renderer:
