@@ -15,6 +15,7 @@ from tests.analytic import AnalyticRenderer
 from unrender import optimizers
 from unrender.core import phases
 from unrender.estimators.path import PathGradient
+from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.runs import final_images, least_squares
 from unrender.runs.callbacks import Callback
 from unrender.runs.image_sensitivity import Curvature
@@ -23,6 +24,7 @@ from unrender.runs.optimize import optimize
 from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.result import Result
 from unrender.runs.run import Run
+from unrender.runs.verification import DIFFERS
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
@@ -226,3 +228,56 @@ def test_a_texture_without_a_map_has_the_reason_in_the_record(tmp_path: Path) ->
         "fog: no map of standard errors: the end of the run was not tested, or had no time left",
     )
     assert not final_images.render_final_images(made, replace(result, history=[])).without_errors
+
+
+def textured(shift: float, noise: float) -> Problem:
+    """Two views of one texture of 32 elements, of which the second reference shows it brighter by `shift`."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(*[np.linspace(0, 1, 40)] * 2)
+    blobs = [np.exp(-8 * ((x - a) ** 2 + (y - b) ** 2)).ravel() for a, b in rng.random((32, 2))]
+    matrix = np.repeat(np.stack(blobs, axis=1), 3, axis=0)
+    truth = {"map": rng.uniform(0.3, 0.7, 32)}
+    renderer = AnalyticRenderer({"map": np.full(32, 0.5)}, matrix, noise=noise, shape=(40, 40), sensors=2)
+    exact = renderer.exact(truth)
+    given = [View(exact * (1.0 + shift * view), sensor=view) for view in range(2)]
+    return Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], given)
+
+
+@pytest.mark.parametrize(("shift", "told"), [(0.25, True), (0.0, False)])
+def test_a_wrong_model_is_told_by_the_final_pictures_where_others_have_too_few_paths(
+    shift: float, told: bool, tmp_path: Path
+) -> None:
+    made, steps = textured(shift, noise=2.5), 128
+    estimator = PathGradient(image=RecursiveControlVariate(), spp=4)
+    adam, pictures = optimizers.Adam(0.02), RunAnnotations(final_spp=256)
+    result = optimize(made, estimator, adam, steps, run_directory=tmp_path, annotations=pictures)
+    assert any("no longer improves" in line for line in result.warnings) is told, (result.warnings, result.verification)
+    assert result.status == "finished"
+    alone = optimize(made, estimator, adam, steps)
+    assert not any(DIFFERS in line for line in alone.warnings)  # without final pictures, noise hides the difference
+
+
+@pytest.mark.parametrize(
+    ("step", "change", "error", "told"),
+    [
+        (64, 0.0, 1e-4, True),
+        (64, -1.0, 1e-4, False),
+        (64, 0.0, 1.0, False),
+        (64, 1.0, 1.0, False),
+        (32, 0.0, 1e-4, True),
+    ],
+)
+def test_a_loss_that_falls_or_has_an_uncertain_change_is_not_judged(
+    step: int, change: float, error: float, told: bool
+) -> None:
+    made, values = textured(0.25, 0.1), {"map": np.full(32, 0.5, np.float32)}
+    result = Result(values, values, [{}] * 150, 1.0, 0.0, "steps")
+    result = replace(result, verification={"best": "end", "change": {"step": step, "loss": [change, error]}})
+    warnings = final_images.render_final_images(made, result, 16, tested=False).warnings
+    assert any(DIFFERS in line for line in warnings) is told
+    for other in (
+        replace(result, warnings=[f"{DIFFERS} by 0.1"]),
+        replace(result, verification={"best": "start"}),
+        replace(result, verification={**result.verification, "change": {"step": step, "loss": [None, None]}}),
+    ):
+        assert not final_images.render_final_images(made, other, 16, tested=False).warnings

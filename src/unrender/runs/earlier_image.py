@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
-from unrender.runs.verification import misfit
+from unrender.runs.verification import Misfit, misfit
+from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import difference
 
 FIRST_CANDIDATE = 64
@@ -52,11 +53,6 @@ class EarlierImage:
         """Return whether it is early enough for a comparison with the end of a run of that many steps."""
         return self.step <= (_EARLIER_SHORT if self.is_short else _EARLIER) * steps
 
-    @property
-    def least(self) -> float:
-        """Return the smallest difference from the references that counts at the end, relative to the image."""
-        return _OF_PICTURE_SHORT if self.is_short else _OF_PICTURE
-
     def change(self, earlier: EarlierImage, factor: float) -> tuple[float, float]:
         """Return the loss minus `factor` times that of an earlier step, and its standard error; infinite for images that are not finite."""
         first, second = factor * earlier.picture.losses, self.picture.losses
@@ -70,6 +66,39 @@ class EarlierImage:
             return _SURE * error < value < math.inf
         value, error = self.change(earlier, _STILL)
         return -(error if math.isfinite(error) else 0.0) < value < math.inf
+
+
+def stays(loss: float, step: int, change: float, error: float) -> bool:
+    """Return whether a loss has surely hardly fallen since a step.
+
+    The loss is that of pictures with little noise. A rise counts as no change, so a change whose noise is large proves nothing.
+
+    Args:
+        loss: loss at the end.
+        step: number of completed steps.
+        change, error: change of the loss since that step, and its standard error.
+    """
+    factor = _STILL_SHORT if step < FIRST_CANDIDATE else _STILL
+    return (1.0 - factor) * loss + factor * min(change, 0.0) > _SURE * factor * error
+
+
+def least_difference(step: int) -> float:
+    """Return the smallest difference from the references that counts at the end of a run compared with `step`, relative to the image."""
+    return _OF_PICTURE_SHORT if step < FIRST_CANDIDATE else _OF_PICTURE
+
+
+def unexplained(problem: Problem, differs: Misfit, step: int, steps: int) -> str:
+    """Return the warning about a difference at the end of a run of `steps` steps whose loss has hardly fallen since `step`."""
+    cause = (
+        "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
+    )
+    if any(unknown.prior is not None for unknown in problem.unknowns.values()):
+        cause = f"a prior may be too strong, or {cause}"
+    still = "no longer improves"
+    if step < FIRST_CANDIDATE:
+        still = f"has hardly improved since step {step} of {steps}"
+        cause = f"it may need more steps, or {cause}"
+    return f"{differs.describe()}, and {still}: {cause}"
 
 
 def not_converged(last: EarlierImage, earlier: EarlierImage) -> list[str]:

@@ -9,16 +9,18 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from unrender.core import phases
+from unrender.core import arrays, phases
+from unrender.estimators.penalties import penalty
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
+from unrender.runs.earlier_image import least_difference, stays, unexplained
 from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
-from unrender.runs.verification import misfit_of_views
+from unrender.runs.verification import DIFFERS, misfit, misfit_of_views, residuals_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.statistics import debiased
@@ -139,9 +141,34 @@ def render_final_images(
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
         if differs not in result.warnings:
             warnings = (*warnings, differs)
+    warnings += _no_improvement(problem, result, chosen, ends)
     return FinalImages(
         pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share, maps.missing
     )
+
+
+def _no_improvement(
+    problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
+) -> tuple[str, ...]:
+    """Return a warning if the final images differ from the references and the loss no longer improves; () if it is known or uncertain.
+
+    Images of `runs.verify` have few paths. Their paired difference tells the change of the loss, but their noise may hide its value.
+    """
+    change = result.verification.get("change")
+    known = any(DIFFERS in line for line in result.warnings)
+    if change is None or None in change["loss"] or known or len(views) < len(problem.views) or len(ends[0]) < 2:
+        return ()
+    loss, array = penalty(problem, result.parameters), problem.renderer.array
+    for view, (one, other) in zip(views, ends, strict=True):
+        both, *halves = (
+            arrays.number(problem.loss_value(view, array(image))) for image in ((one + other) / 2, one, other)
+        )
+        loss += 2.0 * both - sum(halves) / 2.0  # without the bias from the images' noise
+    if not stays(loss, change["step"], *change["loss"]):
+        return ()
+    residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
+    differs = misfit(residuals[:1], residuals[1:], references, weights, sizes, least_difference(change["step"]))
+    return (unexplained(problem, differs, change["step"], result.steps),) if differs else ()
 
 
 def _untested(problem: Problem, result: Result, reason: str) -> Uncertainty:

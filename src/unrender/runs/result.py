@@ -51,7 +51,8 @@ class Result:
         truth: {key: array} of known true values.
         verification: results of new images, see `runs.verify`; empty if there were none. "status", "start", "end" and "best_loss" (loss
             and its standard error), "best" ("start", "step N" or "end"), "paths" (of each image), and "memory" (the root mean square
-            "error" of a control variate, and of the "picture").
+            "error" of a control variate, and of the "picture"). "change" holds the change of the "loss" since a "step", and its standard
+            error, if the end is best.
         image_errors: {"view0/initial": (error, standard error), "view0/result": ...}: root mean square differences between the reference
             and the image's expectation, without rendering noise; see `statistics.debiased`.
         standard_error: {key: array} of the parameters' shapes: standard deviation of each number from the noise of this run's renderings

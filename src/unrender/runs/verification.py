@@ -158,12 +158,19 @@ def misfit_of_views(
     problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]], known: Sequence[str] = ()
 ) -> str:
     """Return `misfit_of_numbers` of independent images (H, W, 3) of each of some views."""
+    return misfit_of_numbers(problem, *residuals_of_views(problem, views, images), known)
+
+
+def residuals_of_views(
+    problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:
+    """Return `residuals`, `references`, `weights` and `sizes` of `misfit_of_numbers`, from K images (H, W, 3) of each of some views."""
     references = [np.asarray(problem.views[view].reference, np.float32) for view in views]
     weights = [problem.views[view].pixel_weights(x.shape[:2]) for view, x in zip(views, references, strict=True)]
     pixels = np.concatenate([image.reshape(-1, 3) for image in references])
     residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
     sizes = [(height, width) for height, width, _ in map(np.shape, references)]
-    return misfit_of_numbers(problem, residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), sizes, known)
+    return residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), sizes
 
 
 def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) -> str:

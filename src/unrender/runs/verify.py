@@ -17,7 +17,7 @@ from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
-from unrender.runs.earlier_image import FIRST_CANDIDATE, EarlierImage, not_converged
+from unrender.runs.earlier_image import FIRST_CANDIDATE, EarlierImage, least_difference, not_converged, unexplained
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.number_means import averaged, unit_directions
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
@@ -149,7 +149,7 @@ class Verify(Callback):
         best = min(places, key=lambda name: places[name][0].loss[0], default="end")
         disagrees = memory is not None and memory.disagrees
         best_loss = {"start": judged[0], "end": judged[1]}.get(best, candidate_picture or last).loss
-        lines = self._residual(problem, result, pictures, last, unaveraged)
+        lines, change = self._residual(problem, result, pictures, last, unaveraged)
         if result.standard_error and not (lines or places):
             lines = _misfit_of_numbers(problem, pictures, result, first, last)
         if lines:
@@ -169,6 +169,7 @@ class Verify(Callback):
             "best": best,
             "best_loss": _numbers(*best_loss),
             "paths": pictures.paths,
+            **({} if places else change),
         }
         if memory is not None:
             verification["memory"] = {"error": _number(memory.error), "picture": _number(memory.picture)}
@@ -222,8 +223,10 @@ class Verify(Callback):
 
     def _residual(
         self, problem: Problem, result: Result, pictures: FreshPictures, end: Picture, unaveraged: Picture
-    ) -> list[str]:
+    ) -> tuple[list[str], dict[str, Any]]:
         """Return a warning if the images differ from the references by more than noise, and the loss stays or still falls fast.
+
+        The second value is {"change": …} of `Result.verification`; {} if no earlier image is compared.
 
         Args:
             pictures: renderer of the images of the end.
@@ -233,32 +236,26 @@ class Verify(Callback):
         earlier = next((one for one in reversed(self._earlier) if one.is_compared(result.steps)), None)
         small = self._small
         if small is None or earlier is None:
-            return []
+            return [], {}
         averages = unaveraged is not end
         if small is not pictures:
             unaveraged = small.picture(result.last)
         # Averages over steps lower the loss without progress, so the comparison with an earlier step is of the last step itself.
         last = EarlierImage(result.steps, unaveraged, small)
+        change = {"change": {"step": earlier.step, "loss": _numbers(*last.change(earlier, 1.0))}}
         if not last.is_still(earlier):
-            return not_converged(last, earlier)
+            return not_converged(last, earlier), change
         if averages:
             last = replace(last, picture=end if small is pictures else small.picture(result.parameters))
         own = small.references, small.weights, small.sizes
         differences = pictures.differences(end.images)
         # A sample of pixels has others than the images of earlier steps.
         halves = None if pictures.sampled or small.sampled else (differences[0::2], differences[1::2])
-        difference = misfit(last.residuals, earlier.residuals, *own, earlier.least, halves)
+        difference = misfit(last.residuals, earlier.residuals, *own, least_difference(earlier.step), halves)
         at_truth = partial(_at_truth, problem, small, result) if problem.has_truth else None
         if difference is None or difference.is_references_noise(at_truth):
-            return []
-        cause = "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
-        if any(unknown.prior is not None for unknown in problem.unknowns.values()):
-            cause = f"a prior may be too strong, or {cause}"
-        still = "no longer improves"
-        if earlier.is_short:
-            still = f"has hardly improved since step {earlier.step} of {result.steps}"
-            cause = f"it may need more steps, or {cause}"
-        return [f"{difference.describe()}, and {still}: {cause}"]
+            return [], change
+        return [unexplained(problem, difference, earlier.step, result.steps)], change
 
 
 def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Picture, Picture]:
