@@ -379,7 +379,7 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     formed.update(dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)})
     assert isinstance(plan.optimizer, optimizers.AveragedNewton)
     assert "4 numbers" in plan.reasons[0]
-    assert "with place" in plan.reasons[0]
+    assert "not linear in place" in plan.reasons[0]
     for settings in ({"image": "plain"}, {"pixels": 8}):
         assert isinstance(chosen(made, **settings)[0], PathGradient)
     constants(monkeypatch, few_numbers=3)
@@ -412,7 +412,7 @@ def test_numbers_of_bsdfs_take_gauss_newton_steps_on_small_films_or_without_path
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
     plan = method("auto").plan(made)
     assert isinstance(plan.estimator, GaussNewton) == newton
-    assert ("with rough" in plan.reasons[0]) == newton
+    assert ("not linear in rough" in plan.reasons[0]) == newton
     absolute = Problem(renderer, unknown, made.views, loss=losses.L1())
     assert isinstance(chosen(absolute)[0], GaussNewton) != reached
 
