@@ -130,15 +130,22 @@ def _completed(state: GradientBlocks) -> GradientBlocks:
         products = inner_products([pair for key, m in mean.items() for pair in ((m, state.earlier[key]), (m, m))])
         arrays.evaluate(products)
         numbers = [arrays.number(product) for product in products]
-        kept = 0.0 if state.blocks == 2 else 0.5
+        weight = 1.0 if state.blocks == 2 else 0.5  # of this block, relative to all earlier ones
         fractions, inflations = {}, {}
         for key, lasting, square in zip(mean, numbers[::2], numbers[1::2], strict=True):
             new = _fraction(lasting, arrays.number(state.agreement[key]) / state.count)
-            fractions[key] = kept * state.fractions[key] + (1.0 - kept) * new
+            fractions[key] = (1.0 - weight) * state.fractions[key] + weight * new
             new = _inflation(lasting, square, arrays.number(state.squares[key]) / state.count, state.count)
-            inflations[key] = kept * state.inflations[key] + (1.0 - kept) * new
-    fields = {"count": 0, "blocks": state.blocks + 1, "fractions": fractions, "inflations": inflations}
-    return replace(state, last=mean, earlier=state.last, **fields)
+            inflations[key] = (1.0 - weight) * state.inflations[key] + weight * new
+    return replace(
+        state,
+        last=mean,
+        earlier=state.last,
+        count=0,
+        blocks=state.blocks + 1,
+        fractions=fractions,
+        inflations=inflations,
+    )
 
 
 def _fraction(lasting: float, agreement: float) -> float:
