@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -85,6 +87,34 @@ def stays(loss: float, step: int, change: float, error: float) -> bool:
 def least_difference(step: int) -> float:
     """Return the smallest difference from the references that counts at the end of a run compared with `step`, relative to the image."""
     return _OF_PICTURE_SHORT if step < FIRST_CANDIDATE else _OF_PICTURE
+
+
+def no_improvement(
+    problem: Problem,
+    change: Mapping[str, Any],
+    loss: float,
+    steps: int,
+    residuals: np.ndarray,
+    references: np.ndarray,
+    weights: np.ndarray,
+    sizes: Sequence[tuple[int, int]],
+) -> list[str]:
+    """Return a warning if images of the end of a run differ from the references and its loss surely no longer improves.
+
+    Images of `runs.verify` have few paths. Their paired difference tells the change of the loss, but their noise may hide its value.
+
+    Args:
+        change: "change" of `Result.verification`.
+        loss: loss of the images, without their noise.
+        steps: number of the run's steps.
+        residuals: differences of K >= 2 independent images from the references, (K, N, 3).
+        references, weights, sizes: see `misfit`.
+    """
+    if None in change["loss"] or not stays(loss, change["step"], *change["loss"]):
+        return []
+    of = residuals[0::2], residuals[1::2], references, weights, sizes
+    differs = misfit(*of, least_difference(change["step"]))
+    return [unexplained(problem, differs, change["step"], steps)] if differs else []
 
 
 def unexplained(problem: Problem, differs: Misfit, step: int, steps: int) -> str:

@@ -14,13 +14,13 @@ from unrender.estimators.penalties import penalty
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
-from unrender.runs.earlier_image import least_difference, stays, unexplained
+from unrender.runs.earlier_image import no_improvement
 from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
-from unrender.runs.verification import DIFFERS, misfit, misfit_of_views, residuals_of_views
+from unrender.runs.verification import DIFFERS, misfit_of_views, residuals_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.statistics import debiased
@@ -150,13 +150,10 @@ def render_final_images(
 def _no_improvement(
     problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
 ) -> tuple[str, ...]:
-    """Return a warning if the final images differ from the references and the loss no longer improves; () if it is known or uncertain.
-
-    Images of `runs.verify` have few paths. Their paired difference tells the change of the loss, but their noise may hide its value.
-    """
+    """Return `earlier_image.no_improvement` of the final images; () if it is known or they are not all."""
     change = result.verification.get("change")
     known = any(DIFFERS in line for line in result.warnings)
-    if change is None or None in change["loss"] or known or len(views) < len(problem.views) or len(ends[0]) < 2:
+    if change is None or known or len(views) < len(problem.views) or len(ends[0]) < 2:
         return ()
     loss, array = penalty(problem, result.parameters), problem.renderer.array
     for view, (one, other) in zip(views, ends, strict=True):
@@ -164,11 +161,7 @@ def _no_improvement(
             arrays.number(problem.loss_value(view, array(image))) for image in ((one + other) / 2, one, other)
         )
         loss += 2.0 * both - sum(halves) / 2.0  # without the bias from the images' noise
-    if not stays(loss, change["step"], *change["loss"]):
-        return ()
-    residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
-    differs = misfit(residuals[:1], residuals[1:], references, weights, sizes, least_difference(change["step"]))
-    return (unexplained(problem, differs, change["step"], result.steps),) if differs else ()
+    return tuple(no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends)))
 
 
 def _untested(problem: Problem, result: Result, reason: str) -> Uncertainty:

@@ -13,6 +13,7 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.display import formatting
+from unrender.estimators.fresh_pictures import FreshPictures, Picture
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
@@ -30,6 +31,8 @@ _RARE, _ERRORS = 25.0, 2.0
 """Number of paths, of which one brings light, from which a warning says so, and standard errors by which it must be reached."""
 _OF_TRUTH = 4.0
 """Smallest mean square of a residual judged pixel by pixel, relative to that at the true values, if these are known."""
+_OF_RESIDUAL, _OF_SEEN = 0.1, 0.02
+"""Smallest error of a control variate, as a fraction of the mean square residual, and relative to the image."""
 
 
 @dataclass(frozen=True)
@@ -197,6 +200,57 @@ def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) ->
         f"at most one path in {paths:.0f} brings light, so pictures and gradients are noisy: paths from the camera rarely find lights "
         "behind glass, in caustics, or through small openings; use more samples per pixel, larger lights, or rough materials"
     )
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Comparison of a control variate with a new image.
+
+    Attributes:
+        error: root mean square of the difference that neighbouring pixels share.
+        picture: root mean square of the new image.
+        residual: root mean square difference of the new image from the references, without noise.
+        score: score of `error`; see `paired_losses.SystematicDifference`.
+    """
+
+    error: float
+    picture: float
+    residual: float
+    score: float
+
+    @property
+    def disagrees(self) -> bool:
+        """Return whether the error exceeds noise, and is a fraction of the residual that misleads the optimisation."""
+        if not math.isfinite(self.error):
+            return True
+        relevant = self.error**2 > _OF_RESIDUAL * self.residual**2 and self.error > _OF_SEEN * self.picture
+        return self.score > paired_losses.SIGNIFICANT and relevant
+
+
+def compare_memory(
+    pictures: FreshPictures, memory: list[np.ndarray], fresh: list[np.ndarray], residual: Picture
+) -> Memory:
+    """Compare new images (K, N, 3) with control variates (N, 3) of the same parameters, frame by frame.
+
+    `residual` is the image whose distance from the references serves as scale.
+    """
+    weights = pictures.weights
+    means = np.concatenate([images.mean(axis=0) for images in fresh])
+    differences = np.concatenate(memory) - means
+    finite: np.ndarray = np.isfinite(np.sum(means, axis=1, keepdims=True))[:, 0]
+    if not np.isfinite(differences[finite]).all():
+        return Memory(math.inf, 0.0, 0.0, math.inf)
+    shared = paired_losses.systematic(np.where(finite[:, None], differences, 0.0), weights * finite)
+    total = max(float((weights * finite).sum()) * 3, 1e-300)
+
+    def product(images: list[np.ndarray], subtracted: np.ndarray | float) -> float:
+        joined = np.concatenate(images, axis=1)
+        one, other = joined[0::2].mean(axis=0) - subtracted, joined[1::2].mean(axis=0) - subtracted
+        products = np.where(np.isfinite(one * other), one * other, 0.0) * (weights * finite)[:, None]
+        return math.sqrt(max(float(products.sum()) / total, 0.0))
+
+    error = math.sqrt(max(shared.mean_square, 0.0))
+    return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), shared.score)
 
 
 @runtime_checkable

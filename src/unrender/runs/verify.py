@@ -17,13 +17,20 @@ from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
-from unrender.runs.earlier_image import FIRST_CANDIDATE, EarlierImage, least_difference, not_converged, unexplained
+from unrender.runs.earlier_image import (
+    FIRST_CANDIDATE,
+    EarlierImage,
+    least_difference,
+    no_improvement,
+    not_converged,
+    unexplained,
+)
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.number_means import averaged, unit_directions
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
-from unrender.runs.verification import control_variates, misfit, misfit_of_numbers, rare_light
+from unrender.runs.verification import Memory, compare_memory, control_variates, misfit, misfit_of_numbers, rare_light
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
@@ -42,8 +49,6 @@ _LEVEL, _LEVEL_AGAIN = 1e-4, 1e-3
 """False positive rate of each test; that of the test by more paths, which few runs reach."""
 _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
-_OF_RESIDUAL, _OF_PICTURE = 0.1, 0.02
-"""Smallest error of a control variate, as a fraction of the mean square residual, and relative to the image."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
 _FIRST_EARLIER, _COST = 4, 0.005
@@ -52,45 +57,22 @@ _SMALL, _END, _AGAIN = 1, 2, 3
 """Indices of the sets of random numbers."""
 
 
-@dataclass(frozen=True)
-class Memory:
-    """Comparison of a control variate with a new image.
-
-    Attributes:
-        error: root mean square of the difference that neighbouring pixels share.
-        picture: root mean square of the new image.
-        residual: root mean square difference of the new image from the references, without noise.
-        score: score of `error`; see `paired_losses.SystematicDifference`.
-    """
-
-    error: float
-    picture: float
-    residual: float
-    score: float
-
-    @property
-    def disagrees(self) -> bool:
-        """Return whether the error exceeds noise, and is a fraction of the residual that misleads the optimisation."""
-        if not math.isfinite(self.error):
-            return True
-        relevant = self.error**2 > _OF_RESIDUAL * self.residual**2 and self.error > _OF_PICTURE * self.picture
-        return self.score > paired_losses.SIGNIFICANT and relevant
-
-
 @dataclass
 class Verify(Callback):
     """Callback that verifies a run at its end by new images, and returns the best parameters.
 
     Candidates are the start, the parameters after 64, 128, 256, … steps, and the end. The one with the least loss becomes
     `Result.parameters`; another one than the end must be significantly better. All images together use at most 2 % of the run's paths,
-    if these are a million or more. Each uses 0.25 %, or about 4,000 paths in a short run. Where start and end are not told apart, larger
-    images use the paths that are left, if there is time. The steps are not affected.
+    if these are a million or more. Each uses 0.25 %, or about 4,000 paths in a short run. Larger images use the
+    paths that are left, if there is time: where start and end are not told apart, and for the end of a run without a run folder, which has
+    no final pictures. The steps are not affected.
     """
 
     _small: FreshPictures | None = field(default=None, init=False)
     _first: Picture | None = field(default=None, init=False)
     _candidate: tuple[int, Picture] | None = field(default=None, init=False)
     _earlier: list[EarlierImage] = field(default_factory=list, init=False)
+    _larger: tuple[FreshPictures, Picture] | None = field(default=None, init=False)
 
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Render the start, which also compiles the kernels of fresh pictures, so that nothing compiles after the last step."""
@@ -152,6 +134,8 @@ class Verify(Callback):
         lines, change = self._residual(problem, result, pictures, last, unaveraged)
         if result.standard_error and not (lines or places):
             lines = _misfit_of_numbers(problem, pictures, result, first, last)
+        if run.folder is None and not (lines or places):
+            lines = self._by_more_paths(run, result, pictures, change, seconds)
         if lines:
             result = replace(result, standard_error={})
         # A Gauss-Newton step solves for all unknowns, so few of them may converge.
@@ -208,18 +192,50 @@ class Verify(Callback):
         first, last = ends
         if _is_worse(pictures, first, last) or _is_worse(pictures, last, first):
             return ends
-        spent = pictures.rendered
-        if self._small is not None and self._small is not pictures:
-            spent += self._small.rendered + len(ends) * self._small.paths  # `_residual` renders these
-        left = (_MOST_SHARE * run.state.samples - spent) / len(ends)
-        left = left if pictures.sampled else max(left, _LEAST_LARGER)
-        larger = FreshPictures(run.problem, run.seed, left, _AGAIN, _PARTS)
-        expected = len(ends) * seconds * larger.paths / pictures.paths
-        if larger.sampled or not pictures.paths < larger.paths <= left or expected > run.time_left():
+        waiting = (
+            0 if self._small is None or self._small is pictures else len(ends) * self._small.paths
+        )  # of `_residual`
+        larger = self._larger_pictures(run, pictures, len(ends), waiting, seconds)
+        if larger is None or larger.sampled:
             return ends
         start = run.problem.remeshed_from or run.problem
         others = larger.picture(result.initial, start), larger.picture(result.parameters)
+        self._larger = larger, others[1]
         return others if _is_worse(larger, *others, _LEVEL_AGAIN) else ends
+
+    def _by_more_paths(
+        self, run: Run, result: Result, pictures: FreshPictures, change: Mapping[str, Any], seconds: float
+    ) -> list[str]:
+        """Return the warnings that final pictures would give, from an image of the end with the paths that are left.
+
+        `change` is the second value of `_residual`; see `_judged` for the others.
+        """
+        if self._larger is None:
+            larger = self._larger_pictures(run, pictures, 1, 0, seconds)
+            self._larger = larger and (larger, larger.picture(result.parameters))
+        if self._larger is None:
+            return []
+        larger, end = self._larger
+        of = larger.differences(end.images), larger.references, larger.weights, larger.sizes
+        if line := misfit_of_numbers(run.problem, *of):
+            return [line]
+        return no_improvement(run.problem, change["change"], end.loss[0], result.steps, *of) if change else []
+
+    def _larger_pictures(
+        self, run: Run, pictures: FreshPictures, count: int, waiting: int, seconds: float
+    ) -> FreshPictures | None:
+        """Return a renderer of `count` larger images for the paths that are left; None without paths or time.
+
+        `waiting` is the number of paths of images that are still to be rendered; `seconds` is the time of an image of `pictures`.
+        """
+        spent = pictures.rendered + waiting
+        if self._small is not None and self._small is not pictures:
+            spent += self._small.rendered
+        left = (_MOST_SHARE * run.state.samples - spent) / count
+        left = left if pictures.sampled or count < 2 else max(left, _LEAST_LARGER)
+        larger = FreshPictures(run.problem, run.seed, left, _AGAIN, _PARTS)
+        expected = count * seconds * larger.paths / pictures.paths
+        return larger if pictures.paths < larger.paths <= left and expected <= run.time_left() else None
 
     def _residual(
         self, problem: Problem, result: Result, pictures: FreshPictures, end: Picture, unaveraged: Picture
@@ -288,32 +304,6 @@ def _at_truth(problem: Problem, pictures: FreshPictures, result: Result) -> floa
     """Return the mean square difference between the images at the true values and the references."""
     truth = {**result.parameters, **{key: value for key, value in problem.truth.items() if key in result.parameters}}
     return pictures.residual(pictures.images(truth))
-
-
-def compare_memory(
-    pictures: FreshPictures, memory: list[np.ndarray], fresh: list[np.ndarray], residual: Picture
-) -> Memory:
-    """Compare new images (K, N, 3) with control variates (N, 3) of the same parameters, frame by frame.
-
-    `residual` is the image whose distance from the references serves as scale.
-    """
-    weights = pictures.weights
-    means = np.concatenate([images.mean(axis=0) for images in fresh])
-    differences = np.concatenate(memory) - means
-    finite: np.ndarray = np.isfinite(np.sum(means, axis=1, keepdims=True))[:, 0]
-    if not np.isfinite(differences[finite]).all():
-        return Memory(math.inf, 0.0, 0.0, math.inf)
-    shared = paired_losses.systematic(np.where(finite[:, None], differences, 0.0), weights * finite)
-    total = max(float((weights * finite).sum()) * 3, 1e-300)
-
-    def product(images: list[np.ndarray], subtracted: np.ndarray | float) -> float:
-        joined = np.concatenate(images, axis=1)
-        one, other = joined[0::2].mean(axis=0) - subtracted, joined[1::2].mean(axis=0) - subtracted
-        products = np.where(np.isfinite(one * other), one * other, 0.0) * (weights * finite)[:, None]
-        return math.sqrt(max(float(products.sum()) / total, 0.0))
-
-    error = math.sqrt(max(shared.mean_square, 0.0))
-    return Memory(error, product(fresh, 0.0), product(list(residual.images), pictures.references), shared.score)
 
 
 def _memory(run: Run, pictures: FreshPictures, last: Picture) -> Memory | None:
