@@ -137,7 +137,7 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "SGD with momentum": lambda: ur.optimizers.SGD(learning_rate=0.02, momentum=0.8),
     "MetaAdam": lambda: ur.optimizers.MetaAdam(learning_rate=0.004),
     "Chain": lambda: ur.optimizers.Chain(
-        (transforms.PerParameter(("map",), (transforms.GradientMean(),)), transforms.ScaleByRms()),
+        (transforms.GradientMean(), transforms.ScaleByRms()),
         0.02,
         ur.optimizers.schedules.Exponential(100),
     ),

@@ -13,7 +13,7 @@ import pytest
 from unrender.core import registry, tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import PastWeight, Variance
+from unrender.estimators.capabilities import Variance
 from unrender.optimizers import Adam, Chain, ScheduleFree
 from unrender.optimizers.transforms import (
     AgreementRate,
@@ -23,7 +23,6 @@ from unrender.optimizers.transforms import (
     FittedSobolev,
     GradientMean,
     LastingAgreement,
-    PerParameter,
     PullToStart,
     ScaleByDeviation,
     ScaleByRms,
@@ -47,11 +46,8 @@ CHAINS: dict[str, Callable[[], tuple[Any, ...]]] = {
     "FittedSobolev": lambda: (SMOOTH,),
     "GradientMean": lambda: (GradientMean(),),
     "LastingAgreement": lambda: (SMOOTH, LastingAgreement(2), AgreementRate()),
-    "PerParameter": lambda: (
-        PerParameter(("map",), (GradientMean(), ScaleByRms()), (ScaleByRms(), ScheduleFreeAverage())),
-    ),
     "PullToStart": lambda: (PullToStart({"map": 0.1}), ScaleByRms()),
-    "ScaleByDeviation": lambda: (ScaleByDeviation(rule="walk"),),
+    "ScaleByDeviation": lambda: (ScaleByDeviation(),),
     "ScaleByRms": lambda: (ScaleByRms(long_memory=True),),
     "ScheduleFreeAverage": lambda: (ScaleByRms(), ScheduleFreeAverage()),
     "WienerShrinkage": lambda: (SMOOTH, WienerShrinkage(("map",))),
@@ -67,8 +63,7 @@ def estimates(steps: int, seed: int = 0) -> list[Estimate]:
     for _ in range(steps):
         gradient = {key: rng.normal(0.3, 1.0, x.shape).astype(np.float32) for key, x in START.items()}
         variance = Variance({key: np.full_like(x, 0.5) for key, x in START.items()})
-        past = PastWeight({key: np.full_like(x, 0.6) for key, x in START.items()})
-        found.append(Estimate(0.0, gradient, (variance, past)))
+        found.append(Estimate(0.0, gradient, (variance,)))
     return found
 
 
@@ -229,15 +224,6 @@ def test_it_is_told_what_lasts() -> None:
     assert line.startswith("agreement of gradients that lasts: number ")
 
 
-def test_groups_of_parameters_move_as_if_alone() -> None:
-    """Also where one group has a mean to debias, or iterates of its own, and the other has not."""
-    own, others = (GradientMean(0.8), ScaleByRms(), ClipDirection(0.7)), (DecayingSum(0.3), ScheduleFreeAverage())
-    mixed = take(Chain((PerParameter(("map",), own, others),), 0.1, Cosine(30)), estimates(7))[2]
-    for key, parts in (("map", own), ("number", others)):
-        alone = take(Chain(parts, 0.1, Cosine(30)), estimates(7))[2]
-        np.testing.assert_allclose(mixed[key], alone[key], rtol=1e-6)
-
-
 def test_a_clipped_mean_is_clipped_after_debiasing() -> None:
     """The first mean is 0.1 g before debiasing: clipping that at 0.5 would let a direction of 5 pass."""
     gradient = {"x": np.array([3.0, -0.2, 9.0])}
@@ -252,17 +238,11 @@ def test_a_clipped_mean_is_clipped_after_debiasing() -> None:
         (lambda: Chain((AgreementRate(),)), "AgreementRate: no transform before it stores .* FittedSobolev"),
         (lambda: Chain((FittedSobolev(), WienerShrinkage(("map",)))), "FittedSobolev must precondition map"),
         (lambda: Chain((WienerShrinkage(("mop",)),)), 'unknown parameter "mop"'),
-        (lambda: Chain((PerParameter(("mop",)),)), 'unknown parameter "mop"'),
         (lambda: Chain((FittedSobolev(Sobolev(), ("mop",)),)), 'unknown parameter "mop"'),
         (lambda: Chain((FittedSobolev(Sobolev(), ("number",)),)), "needs a texture"),
         (lambda: Chain((Adam(),)), r"Chain: transforms: expected transforms such as ScaleByRms\(\), got Adam"),  # type: ignore
         (lambda: Chain(GradientMean()), "Chain: transforms: expected a list of transforms"),  # type: ignore
         (lambda: Chain((ScheduleFreeAverage(), ClipDirection())), "ScheduleFreeAverage sets the steps"),
-        (
-            lambda: Chain((PerParameter(("map",), (ScheduleFreeAverage(),)), ClipDirection())),
-            "PerParameter sets the steps",
-        ),
-        (lambda: PerParameter(("a",), others=(Adam(),)), "PerParameter: others: expected transforms"),  # type: ignore
         (lambda: tables.component({"type": "Chain", "transforms": [{"type": "Adam"}]}), r"transforms\[0\]: .*Adam"),
     ],
 )
@@ -272,9 +252,7 @@ def test_mistakes_are_told_in_a_line(make: Callable[[], Any], message: str) -> N
 
 
 def test_what_a_transform_requires_the_chain_requires() -> None:
-    assert set(Chain((PerParameter(("a",), (ScaleByDeviation(rule="walk"),)),)).requires) == {
-        *("gradient", "variance", "past_weight"),
-    }
+    assert set(Chain((GradientMean(), ScaleByDeviation())).requires) == {"gradient", "variance"}
     with pytest.raises(InputError, match="variance"):
         take(Chain((ScaleByDeviation(),)), [replace(estimates(1)[0], capabilities=())])
 

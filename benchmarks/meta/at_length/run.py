@@ -6,7 +6,7 @@ alike. They are chosen in two rounds: the best of two, and of more where it is a
 their own; then, since longer runs want lower rates, whole runs with that and with the next lower ones, for as long as their ends get
 nearer, of which the best is kept. Other resolutions than 64² have entries of their own. β_F is 0.999, the loss the paper's mean relative
 squared error. Raced are Adam on plain gradients at 16 and 64 samples per pixel, the paper's form at (1, 2), (12, 4) and (4, 16) difference
-and proportional samples, that with MetaAdam's rule "walk", and the coupled form at 3 samples on plain images and on a control variate's.
+and proportional samples, and the coupled form at 3 samples on plain images and on a control variate's.
 Error is each parameter's RMSE relative to where it began, averaged over parameters; seconds are the processor's, on one thread.
 """
 
@@ -45,12 +45,12 @@ MERGE = ("entries.*.methods",)
 QUICK = {"problem": ("chalice",), "steps": 20, "seeds": 1, "resolution": 8, "only": ("Adam, 16 spp", "meta, 1 + 2")}
 _SPIRAL = {
     "meta, 1 + 2": (0.0003, 0.001), "Adam, 16 spp": (0.01, 0.03), "Adam, 64 spp": (0.03, 0.06),
-    "coupled on rcv": (0.001, 0.003), "meta, 4 + 16": (0.001, 0.003), "meta, 1 + 2, walk": (0.005, 0.02),
+    "coupled on rcv": (0.001, 0.003), "meta, 4 + 16": (0.001, 0.003),
     "coupled": (0.0005, 0.0015), "meta, 12 + 4": (0.0005, 0.0015),
 }  # fmt: skip
 _AJAR = {
     "meta, 1 + 2": (0.0001, 0.0005), "Adam, 64 spp": (0.02, 0.06), "coupled on rcv": (0.0005, 0.0015),
-    "meta, 4 + 16": (0.0003, 0.001), "meta, 1 + 2, walk": (0.002, 0.008), "coupled": (0.0003, 0.001),
+    "meta, 4 + 16": (0.0003, 0.001), "coupled": (0.0003, 0.001),
     "meta, 12 + 4": (0.0003, 0.001),
 }  # fmt: skip
 RATES = {"spiral": _SPIRAL, "chalice": {**_SPIRAL, "Adam, 64 spp": (0.02, 0.06)}, "ajar": {**_SPIRAL, **_AJAR}}
@@ -60,12 +60,10 @@ RATES = {"spiral": _SPIRAL, "chalice": {**_SPIRAL, "Adam, 64 spp": (0.02, 0.06)}
 def entrants(problem: str) -> dict[str, Entrant]:
     """Who races."""
     adam, meta, control = ur.optimizers.Adam, ur.optimizers.MetaAdam, ur.images.RecursiveControlVariate()
-    walk = functools.partial(meta, rule="walk")
     made: dict[str, tuple[str, Estimator, Callable[..., Optimizer]]] = {
         "meta, 1 + 2": ("meta", ur.MetaEstimator(2, 1, beta_proportional=BETA), meta),
         "meta, 12 + 4": ("meta", ur.MetaEstimator(4, 12, beta_proportional=BETA), meta),
         "meta, 4 + 16": ("meta", ur.MetaEstimator(16, 4, beta_proportional=BETA), meta),
-        "meta, 1 + 2, walk": ("meta", ur.MetaEstimator(2, 1, beta_proportional=BETA), walk),
         "Adam, 16 spp": ("Adam", ur.PathGradient(spp=16), adam),
         "Adam, 64 spp": ("Adam", ur.PathGradient(spp=64), adam),
         "coupled": ("coupled", ur.MetaEstimator(coupled=True, spp=3, beta_proportional=BETA), meta),

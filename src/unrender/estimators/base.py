@@ -22,7 +22,6 @@ from unrender.estimators.capabilities import (
     HessianNoise,
     HessianProduct,
     LossFunction,
-    PastWeight,
     ScoreCovariance,
     Smoothing,
     Variance,
@@ -100,8 +99,6 @@ def as_numpy(estimate: Estimate) -> Estimate:
         match capability:
             case Variance(values):
                 return Variance(trees.numpy(values))
-            case PastWeight(values):
-                return PastWeight(trees.numpy(values))
             case FreshGradient(values):
                 return FreshGradient(trees.numpy(values))
             case Hessian(matrix):

@@ -43,18 +43,6 @@ class Variance(Capability):
 
 
 @dataclass(frozen=True)
-class PastWeight(Capability):
-    """Weight of earlier estimates in the gradient. Its noise is correlated with that of the last step by this factor.
-
-    Attributes:
-        values: {key: array}, with the gradient's keys and shapes, in [0, 1).
-    """
-
-    name: ClassVar[str] = "past_weight"
-    values: Tree
-
-
-@dataclass(frozen=True)
 class FreshGradient(Capability):
     """Gradient from this step's samples alone. Its noise has mean 0, independent of earlier samples.
 

@@ -13,7 +13,7 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, Gradient, PastWeight, Variance
+from unrender.estimators.capabilities import Capabilities, Gradient, Variance
 from unrender.estimators.sample_groups import PIXELS, GradientRequest, GradientSample, check_pixels, draws_pixels
 from unrender.images.base import ImageEstimator, PairRequest, needs_full_views
 from unrender.images.plain import Plain
@@ -203,7 +203,7 @@ class MetaEstimator:
     @property
     def provides(self) -> Capabilities:
         """A gradient, its variance, and the weight of earlier estimates in it."""
-        return Capabilities(Gradient, Variance, PastWeight)
+        return Capabilities(Gradient, Variance)
 
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
         """Return the state before the first step. Raise `InputError` for a parameter whose values share no paths, with `space="path"`."""
@@ -264,7 +264,7 @@ class MetaEstimator:
             **step.info,
         }
         loss = sum(arrays.number(value) for value in step.losses)
-        return Estimate(loss, gradient, (Variance(variance), PastWeight(alpha)), info, preconditioned=True), after
+        return Estimate(loss, gradient, (Variance(variance),), info, preconditioned=True), after
 
     def _space(self, problem: Problem, parameters: Tree) -> Space:
         if self.space != "auto":

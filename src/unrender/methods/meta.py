@@ -25,11 +25,6 @@ class MetaCommonOptions(Options):
         "meta-adam",
         description="optimizer; adam, which assumes independent gradients, is for comparison",
     )
-    step_rule: Literal["deviation", "walk"] = Field(
-        "deviation",
-        description="rule of meta-adam: deviation divides by the deviation of the gradient, as in the paper; walk limits steps made "
-        "by noise to those of adam",
-    )
     learning_rate: PositiveFloat = Field(0.002, description="learning rate of parameters without their own")
     schedule: str | None = Field(None, description=SCHEDULE_HELP)
     space: Literal["auto", "path", "primary"] = Field(
@@ -53,7 +48,7 @@ class MetaCommonOptions(Options):
         schedule = parse_schedule(self.schedule)
         if self.optimizer == "adam":
             return Adam(self.learning_rate, schedule=schedule)
-        return MetaAdam(self.learning_rate, schedule=schedule, rule=self.step_rule)
+        return MetaAdam(self.learning_rate, schedule=schedule)
 
     def shared(self) -> dict[str, Any]:
         """Return the arguments that both forms of `MetaEstimator` share."""

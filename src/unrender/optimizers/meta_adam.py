@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from unrender.core import checks
-from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.optimizers import rates
 from unrender.optimizers.chain import Recipe
@@ -29,10 +27,7 @@ class MetaAdam(Recipe):
 
     The noise of successive meta-estimates is correlated, so the steps of a noisy element do not average out. After n steps with full
     weight of the past it has moved by about 0.8 η n, whereas Adam with independent gradients moves it by η √n: a factor of 14 after 300
-    steps. `rule="walk"` multiplies each step by √((1 − α) / (1 + α)), the inverse root of the correlation time for the weight α of the
-    past. Noise then moves the element by η √n. Learning rates are those of Adam, and the steps of a long average decrease as 1 / √n. The
-    ratio between the movement by the gradient and by noise is about the same for both rules and for Adam, because a factor of the step
-    does not change it.
+    steps.
 
     At the first step a meta-estimate's variance is its square, and the step is −η sign(g), as in Adam. The chain is `ScaleByDeviation`,
     and `ClipDirection` with `longest`.
@@ -43,23 +38,19 @@ class MetaAdam(Recipe):
             Adam's ε, which is outside the root: a texel's gradient of a mean over pixels is small.
         schedule: factor of every learning rate by step; see `unrender.schedules.functions`.
         longest: largest step of an element in units of η, > 0; None for no limit.
-        rule: "deviation" is the paper's; "walk" requires the weight of the past.
     """
 
     learning_rate: float | Mapping[str, float] = 0.002
     epsilon: float = 1e-24
     schedule: Schedule | None = None
     longest: float | None = None
-    rule: Literal["deviation", "walk"] = "deviation"
 
     def __post_init__(self):
         rates.check("MetaAdam", self.learning_rate, self.schedule)
         checks.number("MetaAdam", "epsilon", self.epsilon, above=0.0)
         if self.longest is not None:
             checks.number("MetaAdam", "longest", self.longest, above=0.0)
-        if self.rule not in ("deviation", "walk"):
-            raise InputError(f"MetaAdam: rule must be one of deviation, walk, got {self.rule!r}")
 
     def compose(self) -> tuple[StepTransform, ...]:
-        scale = ScaleByDeviation(self.epsilon, self.rule)
+        scale = ScaleByDeviation(self.epsilon)
         return (scale,) if self.longest is None else (scale, ClipDirection(self.longest))

@@ -4,7 +4,6 @@ from unrender.optimizers.transforms.agreement_rate import AgreementRate
 from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, FittedSobolev
 from unrender.optimizers.transforms.lasting_agreement import LastingAgreement
 from unrender.optimizers.transforms.momentum import DecayingSum, GradientMean
-from unrender.optimizers.transforms.per_parameter import PerParameter
 from unrender.optimizers.transforms.pull_to_start import PullToStart
 from unrender.optimizers.transforms.scale import ClipDirection, ScaleByDeviation, ScaleByRms
 from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
@@ -18,7 +17,6 @@ __all__ = [
     "FittedSobolev",
     "GradientMean",
     "LastingAgreement",
-    "PerParameter",
     "PullToStart",
     "ScaleByDeviation",
     "ScaleByRms",

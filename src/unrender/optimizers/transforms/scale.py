@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 from unrender.core import arrays, checks, trees
-from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.estimators.capabilities import Capability, PastWeight, Variance
+from unrender.estimators.capabilities import Capability, Variance
 from unrender.optimizers.transforms.base import (
     MEAN_SQUARES,
     SMOOTHING_UNCHANGED,
@@ -100,21 +98,17 @@ class ScaleByDeviation(StepTransform):
 
     Args:
         epsilon: ε, in squared units of the gradient, > 0.
-        rule: "deviation" is the paper's; "walk" also multiplies by √((1 − α) / (1 + α)) with the weight α of the past, see `MetaAdam`.
     """
 
     epsilon: float = 1e-24
-    rule: Literal["deviation", "walk"] = "deviation"
 
     def __post_init__(self):
         checks.number("ScaleByDeviation", "epsilon", self.epsilon, above=0.0)
-        if self.rule not in ("deviation", "walk"):
-            raise InputError(f"ScaleByDeviation: rule must be one of deviation, walk, got {self.rule!r}")
 
     @property
     def requires(self) -> tuple[type[Capability], ...]:
-        """The variance; for the rule "walk" also the weight of the past."""
-        return (Variance, PastWeight) if self.rule == "walk" else (Variance,)
+        """The variance."""
+        return (Variance,)
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float]) -> None:
         del parameters, learning_rates
@@ -123,9 +117,6 @@ class ScaleByDeviation(StepTransform):
         del state
         variance = update.estimate.require("ScaleByDeviation", Variance).values
         direction = {key: x / arrays.sqrt(variance[key] + self.epsilon) for key, x in update.direction.items()}
-        if self.rule == "walk":
-            past = update.estimate.require("ScaleByDeviation", PastWeight).values
-            direction = {key: x * arrays.sqrt((1.0 - past[key]) / (1.0 + past[key])) for key, x in direction.items()}
         return replace(update, direction=direction), None
 
 
