@@ -12,7 +12,7 @@ import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.core import arrays
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import FreshGradient, PastWeight, Variance
+from unrender.estimators.capabilities import FreshGradient, Variance
 from unrender.methods.plan import bind
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.preconditioners.mesh import MeshTopology
@@ -143,7 +143,6 @@ OPTIMIZERS: dict[str, Callable[[], Any]] = {
     "SGD": lambda: ur.optimizers.SGD(0.05),
     "SGD, momentum": lambda: ur.optimizers.SGD(0.02, momentum=0.8, schedule=ur.schedules.Cosine(60)),
     "MetaAdam": lambda: ur.optimizers.MetaAdam(0.004),
-    "MetaAdam, walk": lambda: ur.optimizers.MetaAdam(0.02, longest=3.0, rule="walk"),
     "ScheduleFree": lambda: ur.optimizers.ScheduleFree(0.05),
     "ScheduleFree, scheduled": lambda: ur.optimizers.ScheduleFree(
         0.05, 0.8, averaging=4.0, growth=0.2, decay=0.4, schedule=ur.schedules.Cosine(60)
@@ -194,6 +193,5 @@ def _estimates(
         gradient = {key: exact[key] + remembered[key] for key in exact}
         fresh = FreshGradient({key: exact[key] + noise[key] for key in exact})
         variance = Variance({key: np.full_like(value, 0.01) for key, value in exact.items()})
-        past = PastWeight({key: np.full_like(value, 0.8) for key, value in exact.items()})
         loss = sum(float(np.square(x).sum()) for x in exact.values())
-        yield loss, Estimate(loss, gradient, capabilities=(fresh, variance, past))
+        yield loss, Estimate(loss, gradient, capabilities=(fresh, variance))
