@@ -45,10 +45,8 @@ _DOUBTFUL = 0.1
 """Standard error, as a share of a number's size, from which on the references leave it open."""
 _FURTHER, _STEP_ERRORS = 0.05, 4.0
 """Least remaining step, as a share of a number's size and in standard errors, that is reported."""
-_OF_WIDTHS = 10.0
-"""Size of a pose, in widths of its differences: it may be 0 at the end."""
-_TOGETHER = 0.9
-"""Correlation from which on two numbers count as determined together."""
+_OF_WIDTHS, _TOGETHER = 10.0, 0.9
+"""Size of a pose, in widths of its differences; correlation from which on two numbers count as determined together."""
 _ROUNDS, _WEAK = 3, 0.3
 """Most rounds that measure weak directions again; length relative to the wanted one below which a direction is weak."""
 _CLEAR = 3.0
@@ -277,7 +275,7 @@ class _Fit:
         error: standard errors of the numbers, (n,); infinite along directions whose changes the noise of this check hides.
         own: the same from the noise of this check, its slopes included, (n,).
         step: step of the numbers, (n,).
-        unseen: largest changes of the numbers along each hidden direction, (n, number of hidden directions).
+        unseen: largest changes of the numbers along each hidden direction, signed, (n, number of hidden directions).
         better: standard errors by which the picture is better than with the start's numbers.
     """
 
@@ -331,7 +329,7 @@ class _Fit:
         comparable = np.mean(after[0] * after[1]) > _COMPARABLE**2 * np.mean(noise * noise)
         # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
         open_ = flat[None] | (~numbers.rigid[:, None] & comparable)
-        unseen = np.abs(changes[:n]) * (hidden[None] & open_)
+        unseen = changes[:n] * (hidden[None] & open_)
         better = math.inf if before is None else _better(residuals, before)
         return cls(total, error, own, step[:n], unseen[:, hidden], better)
 
@@ -346,15 +344,19 @@ def _better(residuals: np.ndarray, before: np.ndarray) -> float:
 
 def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     """Return the check of a fit: standard errors, and a line for each number that is undetermined or had not settled."""
-    posed = numbers.rigid | (numbers.sizes <= 0.0)
-    longest = 2.0 * numbers.limits[: numbers.count]
+    posed, longest = numbers.rigid | (numbers.sizes <= 0.0), 2.0 * numbers.limits[: numbers.count]
     sizes = np.where(posed, np.maximum(numbers.sizes, np.minimum(_OF_WIDTHS * widths, longest)), numbers.sizes)
-    unseen = fit.unseen > _DOUBTFUL * np.where(posed, longest, sizes)[:, None]
+    unseen = np.abs(fit.unseen) > _DOUBTFUL * np.where(posed, longest, sizes)[:, None]
     hidden = np.sqrt(np.square(fit.unseen).sum(axis=1))  # uncertainty shared with undetermined numbers
     error = np.where(unseen.any(axis=1), np.inf, np.hypot(fit.error, hidden))
-    open_ = error > _DOUBTFUL * sizes
     n, spread = numbers.count, np.outer(fit.error, fit.error)
-    together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (unseen[:, None] & unseen[None]).any(axis=2)
+    # An open number may be anywhere in its range. Numbers that trade off against it move along, beyond their own errors.
+    total = np.nan_to_num(fit.covariance[:n, :n], posinf=0.0, neginf=0.0) + fit.unseen @ fit.unseen.T
+    along = np.where(error > sizes, np.abs(total) / np.maximum(np.diag(total), 1e-300) * longest, 0.0)
+    error = np.maximum(error, along.max(axis=1))
+    open_ = error > _DOUBTFUL * sizes
+    together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (along > _DOUBTFUL * sizes[:, None])
+    together |= (unseen[:, None] & unseen[None]).any(axis=2)
     shared = open_ & (_shared_with_fields(fit.covariance, n) | unseen.any(axis=1))
     of_step = np.maximum(error, fit.own)  # references without noise leave the noise of this check
     further = np.abs(fit.step) > np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes)
