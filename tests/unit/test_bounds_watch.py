@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 
 
-def test_numbers_that_end_at_their_bounds_are_told() -> None:
-    """One whose best value is beyond its bound; not one within, one that began there, one without two ends, nor a texture."""
-    names = ("beyond", "within", "there", "open", "map")
-    sizes = dict.fromkeys(names, 1) | {"map": 2}
-    matrix = np.eye(6)[np.arange(48) % 6]  # each number has pixels of its own
-    target = np.array([1.5, 0.5, 1.5, 1.5, 1.5, 1.5])
+def test_numbers_that_end_at_their_bounds_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One whose best value is beyond its bound; not one within, one that began there, nor one without two ends. A texture at bounds of its
+    own, not at the ends of its physical range."""
+    names = ("beyond", "within", "there", "open", "map", "physical")
+    sizes = dict.fromkeys(names, 1) | {"map": 2, "physical": 2}
+    matrix = np.eye(8)[np.arange(48) % 8]  # each number has pixels of its own
+    target = np.array([1.5, 0.5, 1.5, 1.5, 1.5, 0.5, 1.5, 1.5])
     values = {name: np.full(() if n == 1 else (n,), 0.4) for name, n in sizes.items()}
     renderer = AnalyticRenderer(values, matrix)
+    infos = dict(renderer.parameters())
+    infos["physical"] = replace(infos["physical"], lowest=0.0, highest=1.0)
+    monkeypatch.setattr(renderer, "parameters", lambda: infos)
     reference = (matrix @ target).reshape(4, 4, 3)
     parameters = [
         ur.Parameter(name, 1.0 if name == "there" else 0.4, bounds=(0, 1)) for name in names if name != "open"
@@ -24,5 +31,6 @@ def test_numbers_that_end_at_their_bounds_are_told() -> None:
     problem = ur.Problem(renderer, parameters, [ur.View(reference)], max_depth=1)
     result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.05), steps=200)
     assert [line for line in result.warnings if "next to its bound" in line] == [
-        "parameter beyond: ended at 1, next to its bound 1: if this is unexpected, try another seed or a lower learning_rate"
+        f"parameter {key}: {ended} next to its bound 1: if this is unexpected, try wider bounds, another seed or a lower learning_rate"
+        for key, ended in (("beyond", "ended at 1,"), ("map", "1 of 2 values ended"))
     ]

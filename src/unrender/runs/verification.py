@@ -152,7 +152,7 @@ def misfit_of_numbers(
         else "noise does not explain:"
     )
     return (
-        f"{difference.describe()}, which {noise} the run needs more steps, another start or narrower bounds, or something that is not "
+        f"{difference.describe()}, which {noise} the run needs more steps, another start or other bounds, or something that is not "
         "among the unknowns is wrong; hence no standard errors"
     )
 

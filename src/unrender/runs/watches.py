@@ -22,27 +22,34 @@ if TYPE_CHECKING:
 
 _NEAR = 0.01
 """Distance to a bound, relative to the range, below which a number counts as at the bound."""
+_SHARE = 0.05
+"""Share of the elements of a texture, grid or colour that must be at a bound."""
 
 
 class BoundsWatch(Callback):
     """Callback that warns of numbers that started inside of a bounded range and end next to one of its bounds.
 
-    A derivative may vanish there or be mostly noise, so an optimisation that overshot does not return.
+    A derivative may vanish there or be mostly noise, so an optimisation that overshot does not return. Elements of colours, textures and
+    grids may well be at the ends of the physical range, so they count at other bounds only.
     """
 
     def warnings(self, run: Run) -> list[str]:
-        lines = []
+        lines, known = [], run.problem.renderer.parameters()
         for key, unknown in run.problem.unknowns.items() if run.stopped else ():
             first, (low, high) = unknown.initial, unknown.bounds
-            if first.size != 1 or low is None or high is None:
+            if low is None or high is None:
                 continue
-            last, near = float(arrays.numpy(run.parameters[key]).item()), _NEAR * (high - low)
-            for bound in (low, high):
-                if abs(last - bound) <= near < abs(float(first.item()) - bound):
-                    lines.append(
-                        f"parameter {key}: ended at {last:.3g}, next to its bound {bound:g}: if this is unexpected, "
-                        "try another seed or a lower learning_rate"
-                    )
+            last, near = arrays.numpy(run.parameters[key]), _NEAR * (high - low)
+            for bound, physical in ((low, known[key].lowest), (high, known[key].highest)):
+                count = int(np.sum((np.abs(last - bound) <= near) & (near < np.abs(first - bound))))
+                if count < (1.0 if first.size == 1 else _SHARE * first.size) or (first.size > 1 and bound == physical):
+                    continue
+                ended = f"ended at {last.item():.3g}," if first.size == 1 else f"{count} of {first.size} values ended"
+                wider = "" if bound == physical else "wider bounds, "
+                lines.append(
+                    f"parameter {key}: {ended} next to its bound {bound:g}: if this is unexpected, try {wider}another seed or a lower "
+                    "learning_rate"
+                )
         return lines
 
 
