@@ -257,8 +257,25 @@ def test_a_wrong_model_is_told_by_the_final_pictures_where_others_have_too_few_p
     assert any("no longer improves" in line for line in alone.warnings) is told  # by the paths left for verification
 
 
+@pytest.mark.parametrize(("rate", "rises"), [(0.1, True), (0.003, False)])
+def test_a_run_that_the_final_pictures_find_worse_returns_its_start(rate: float, rises: bool, tmp_path: Path) -> None:
+    """The pictures of the verification have too few paths to tell."""
+    made = textured(0.0, noise=0.6)
+    truth = np.linalg.lstsq(made.renderer.matrix, np.ravel(made.views[0].reference))[0].astype(np.float32)  # type: ignore
+    made = made.replaced(parameters=[Parameter("map", initial=truth, bounds=(0, 1))])
+    parts, pictures = (PathGradient(spp=4), optimizers.Adam(rate)), RunAnnotations(final_spp=512)
+    alone = optimize(made, *parts, 32)
+    assert alone.status == "finished"
+    result = optimize(made, *parts, 32, run_directory=tmp_path, annotations=pictures)
+    assert (result.status == "worse than start") is rises
+    assert any("the final picture is worse than the initial one" in line for line in result.warnings) is rises
+    assert np.array_equal(result.parameters["map"], result.initial["map"]) is rises
+    assert result.image_errors["view0/result"][0] < 0.02
+
+
+@pytest.mark.parametrize("shift", [0.25, 0.1])
 @pytest.mark.parametrize(
-    ("step", "change", "error", "told"),
+    ("step", "change", "error", "stays"),
     [
         (64, 0.0, 1e-4, True),
         (64, -1.0, 1e-4, False),
@@ -267,17 +284,22 @@ def test_a_wrong_model_is_told_by_the_final_pictures_where_others_have_too_few_p
         (32, 0.0, 1e-4, True),
     ],
 )
-def test_a_loss_that_falls_or_has_an_uncertain_change_is_not_judged(
-    step: int, change: float, error: float, told: bool
+def test_a_loss_that_falls_or_has_an_uncertain_change_is_judged_by_large_differences_alone(
+    step: int, change: float, error: float, stays: bool, shift: float
 ) -> None:
-    made, values = textured(0.25, 0.1), {"map": np.full(32, 0.5, np.float32)}
+    made = textured(shift, 0.1)
+    values = {"map": np.linalg.lstsq(made.renderer.matrix, np.ravel(made.views[0].reference))[0].astype(np.float32)}  # type: ignore
     result = Result(values, values, [{}] * 150, 1.0, 0.0, "steps")
     result = replace(result, verification={"best": "end", "change": {"step": step, "loss": [change, error]}})
     warnings = final_images.render_final_images(made, result, 16, tested=False).warnings
-    assert any(DIFFERS in line for line in warnings) is told
+    assert any(DIFFERS in line for line in warnings) is (stays or shift == 0.25)
+    assert any("may still improve" in line for line in warnings) is (not stays and shift == 0.25)
     for other in (
         replace(result, warnings=[f"{DIFFERS} by 0.1"]),
         replace(result, verification={"best": "start"}),
-        replace(result, verification={**result.verification, "change": {"step": step, "loss": [None, None]}}),
     ):
         assert not final_images.render_final_images(made, other, 16, tested=False).warnings
+    for change_of in ({}, {"change": {"step": step, "loss": [None, None]}}):  # no earlier image
+        other = replace(result, verification={"best": "end", **change_of})
+        warnings = final_images.render_final_images(made, other, 16, tested=False).warnings
+        assert any("may still improve" in line for line in warnings) is (shift == 0.25)

@@ -24,7 +24,8 @@ _EARLIER_SHORT, _STILL_SHORT, _SURE, _OF_PICTURE_SHORT = 0.5, 0.9, 2.0, 0.05
 """The same limits as above for runs whose earlier image is of a step before 64: fraction of the steps; ratio of the losses, with the number
 of standard errors by which it must be exceeded; smallest size of the residual relative to the image."""
 _FALLS, _OF_PICTURE_FALLING = 0.8, 0.1
-"""Ratio of the last loss to the earlier one below which a run has not converged, and smallest difference relative to the image."""
+"""Ratio of the last loss to the earlier one below which a run has not converged, and smallest difference, relative to the image, that is
+reported of a run whose loss falls or may do so."""
 
 
 @dataclass(frozen=True)
@@ -99,52 +100,60 @@ def no_improvement(
     weights: np.ndarray,
     sizes: Sequence[tuple[int, int]],
 ) -> list[str]:
-    """Return a warning if images of the end of a run differ from the references and its loss surely no longer improves.
+    """Return a warning if images of the end of a run differ from the references, by a tenth where the loss may still fall.
 
     Images of `runs.verify` have few paths. Their paired difference tells the change of the loss, but their noise may hide its value.
 
     Args:
-        change: "change" of `Result.verification`.
+        change: "change" of `Result.verification`; {} without an earlier image.
         loss: loss of the images, without their noise.
         steps: number of the run's steps.
         residuals: differences of K >= 2 independent images from the references, (K, N, 3).
         references, weights, sizes: see `misfit`.
     """
-    if None in change["loss"] or not stays(loss, change["step"], *change["loss"]):
-        return []
+    step, fall = change.get("step", 0), change.get("loss", (None, None))
+    still = None not in fall and stays(loss, step, *fall)
     of = residuals[0::2], residuals[1::2], references, weights, sizes
-    differs = misfit(*of, least_difference(change["step"]))
-    return [unexplained(problem, differs, change["step"], steps)] if differs else []
+    differs = misfit(*of, least_difference(step) if still else _OF_PICTURE_FALLING)
+    return [unexplained(problem, differs, step, steps, still)] if differs else []
 
 
-def unexplained(problem: Problem, differs: Misfit, step: int, steps: int) -> str:
-    """Return the warning about a difference at the end of a run of `steps` steps whose loss has hardly fallen since `step`."""
+def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays: bool = True) -> str:
+    """Return the warning about a difference at the end of a run of `steps` steps whose loss has hardly fallen since `step`.
+
+    Args:
+        problem: problem of the run.
+        differs: the difference.
+        step, steps: earlier step and last step that were compared.
+        stays: whether it is certain that the loss has hardly fallen.
+    """
     cause = (
         "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
     )
     if any(unknown.prior is not None for unknown in problem.unknowns.values()):
         cause = f"a prior may be too strong, or {cause}"
     still = "no longer improves"
-    if step < FIRST_CANDIDATE:
-        still = f"has hardly improved since step {step} of {steps}"
+    if step < FIRST_CANDIDATE or not stays:
+        still = f"has hardly improved since step {step} of {steps}" if stays else "may still improve"
         cause = f"it may need more steps, or {cause}"
     return f"{differs.describe()}, and {still}: {cause}"
 
 
-def not_converged(last: EarlierImage, earlier: EarlierImage) -> list[str]:
-    """Return a warning if the loss still falls, and the image differs from the references by a tenth beyond noise.
+def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -> list[str]:
+    """Return a warning if the image differs from the references by a tenth beyond noise, and the loss still falls, or may do so.
 
     Args:
+        problem: problem of the run.
         last, earlier: images of the last and of an earlier step, with the same random numbers. Averages over steps would lower the loss
             without progress, so neither is of averages.
     """
-    value, error = last.change(earlier, _FALLS)
-    if not value + _SURE * error < 0.0:
-        return []
     residuals, pictures = last.residuals, last.pictures
     of = residuals, residuals, pictures.references, pictures.weights, pictures.sizes
     differs = misfit(*of, _OF_PICTURE_FALLING)
     if differs is None:
         return []
+    value, error = last.change(earlier, _FALLS)
+    if not value + _SURE * error < 0.0:
+        return [unexplained(problem, differs, earlier.step, last.step, stays=False)]
     fallen = f"its loss has fallen by {1 - last.picture.loss[0] / earlier.picture.loss[0]:.0%} since step {earlier.step} of {last.step}"
     return [f"{differs.describe()}, and the run has not converged: {fallen}; give it more steps or seconds"]

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from unrender.core import arrays, phases
+from unrender.display import formatting
 from unrender.estimators.penalties import penalty
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
 from unrender.runs.earlier_image import no_improvement
 from unrender.runs.field_directions import TOO_SHORT
+from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
@@ -45,6 +47,10 @@ _PICTURES_SHARE = 0.5
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
+_ERRORS, _ERRORS_OF_RISE, _OF_START, _OF_PICTURE = 2.0, 4.0, 0.2, 1e-4
+"""Standard errors by which a verified loss must have fallen to be lower; those by which final images must be worse than the initial ones,
+and by how much of the initial mean square error and of the mean square of the references."""
+
 _SEEDS = {"initial": 1, "result": 2}
 _SECOND_HALF = 1 << 16
 """Offset of the seed for the second half of an image's samples."""
@@ -64,6 +70,8 @@ class FinalImages:
         standard_error: see `Result.standard_error`.
         data_share: see `Result.data_share`.
         without_errors: see `Result.without_errors`.
+        rise: warning that the final images are worse than those of the start, where the verification was uncertain; "" if they are not.
+            Nothing is tested then.
     """
 
     pictures: dict[str, np.ndarray]
@@ -75,6 +83,7 @@ class FinalImages:
     standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
     data_share: Mapping[str, np.ndarray] = field(default_factory=dict)
     without_errors: tuple[str, ...] = ()
+    rise: str = ""
 
 
 def warm_up(problem: Problem, values: Mapping[str, np.ndarray], tested: bool = True) -> None:
@@ -115,6 +124,8 @@ def render_final_images(
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
         chosen = _chosen(problem)
         pictures, errors, ends = _pictures(problem, result, chosen, samples, advance)
+        if len(chosen) == len(problem.views) and (rise := _rise(problem, result, pictures, errors)):
+            return FinalImages(pictures, errors, samples, {}, rise=rise)
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
         everything = tested and len(chosen) == len(problem.views)
@@ -141,9 +152,63 @@ def render_final_images(
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
         if differs not in result.warnings:
             warnings = (*warnings, differs)
-    warnings += _no_improvement(problem, result, chosen, ends)
+    else:
+        warnings += _no_improvement(problem, result, chosen, ends)
     return FinalImages(
         pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share, maps.missing
+    )
+
+
+def at_start(result: Result, rise: str) -> Result:
+    """Return a result with the initial parameters, which final images have found to be better, and the warning about it."""
+    verification = {name: value for name, value in result.verification.items() if name != "change"}
+    verification |= {"status": WORSE, "best": "start", "best_loss": verification["start"]}
+    return replace(
+        result,
+        parameters=dict(result.initial),
+        standard_error={},
+        verification=verification,
+        warnings=[*result.warnings, rise],
+    )
+
+
+def _rise(
+    problem: Problem,
+    result: Result,
+    pictures: Mapping[str, np.ndarray],
+    errors: Mapping[str, tuple[float, float]],
+) -> str:
+    """Return a warning if the final images of all views are worse than the initial ones, by more than noise and by a visible amount.
+
+    It is "" where the verification found that the loss has fallen, or that earlier parameters are better, and for losses and priors whose
+    minimum is elsewhere.
+    """
+    if not problem.loss.linear or any(unknown.prior is not None for unknown in problem.unknowns.values()):
+        return ""
+    start, end = (result.verification.get(name, [None, None]) for name in ("start", "end"))
+    ended = problem.remeshed_from is None and result.status == "finished" and result.verification.get("best") == "end"
+    if not ended or None in (*start, *end):
+        return ""
+    if end[0] + _ERRORS * math.hypot(start[1], end[1]) < start[0] or len(errors) < 2 * len(problem.views):
+        return ""
+    totals, variance, size = {"initial": 0.0, "result": 0.0}, 0.0, 0.0
+    for index, view in enumerate(problem.views):
+        share = view.weight / sum(each.weight for each in problem.views)
+        size += share * float(np.mean(np.square(pictures[f"view{index}/reference"])))
+        for which in totals:
+            value, error = errors[image_name(index, which)]
+            totals[which] += share * value**2
+            # Beyond four errors the second number is the error of the value, else an upper bound (see `debiased.rmse`).
+            variance += (share * (2.0 * value * error if value > 4.0 * error else 0.5 * error**2)) ** 2
+    rise = totals["result"] - totals["initial"]
+    if not (
+        rise > _ERRORS_OF_RISE * math.sqrt(variance) and rise > max(_OF_START * totals["initial"], _OF_PICTURE * size)
+    ):
+        return ""
+    before, after = (formatting.number(math.sqrt(totals[which])) for which in ("initial", "result"))
+    return (
+        f"the final picture is worse than the initial one: image error {after}, {before} at the start; the result holds the initial "
+        "parameters; try a lower learning_rate, more samples per pixel, or another method"
     )
 
 
@@ -151,9 +216,8 @@ def _no_improvement(
     problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
 ) -> tuple[str, ...]:
     """Return `earlier_image.no_improvement` of the final images; () if it is known or they are not all."""
-    change = result.verification.get("change")
-    known = any(DIFFERS in line for line in result.warnings)
-    if change is None or known or len(views) < len(problem.views) or len(ends[0]) < 2:
+    known = any(DIFFERS in line for line in result.warnings) or result.verification.get("best") != "end"
+    if known or len(views) < len(problem.views) or len(ends[0]) < 2:
         return ()
     loss, array = penalty(problem, result.parameters), problem.renderer.array
     for view, (one, other) in zip(views, ends, strict=True):
@@ -161,6 +225,7 @@ def _no_improvement(
             arrays.number(problem.loss_value(view, array(image))) for image in ((one + other) / 2, one, other)
         )
         loss += 2.0 * both - sum(halves) / 2.0  # without the bias from the images' noise
+    change = result.verification.get("change", {})
     return tuple(no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends)))
 
 

@@ -219,7 +219,7 @@ class Verify(Callback):
         of = larger.differences(end.images), larger.references, larger.weights, larger.sizes
         if line := misfit_of_numbers(run.problem, *of):
             return [line]
-        return no_improvement(run.problem, change["change"], end.loss[0], result.steps, *of) if change else []
+        return no_improvement(run.problem, change.get("change", {}), end.loss[0], result.steps, *of)
 
     def _larger_pictures(
         self, run: Run, pictures: FreshPictures, count: int, waiting: int, seconds: float
@@ -260,7 +260,7 @@ class Verify(Callback):
         last = EarlierImage(result.steps, unaveraged, small)
         change = {"change": {"step": earlier.step, "loss": _numbers(*last.change(earlier, 1.0))}}
         if not last.is_still(earlier):
-            return not_converged(last, earlier), change
+            return not_converged(problem, last, earlier), change
         if averages:
             last = replace(last, picture=end if small is pictures else small.picture(result.parameters))
         own = small.references, small.weights, small.sizes

@@ -24,7 +24,7 @@ from unrender.io import files
 from unrender.optimizers.base import Measuring
 from unrender.runs import phase_times
 from unrender.runs.callbacks import Callback
-from unrender.runs.final_images import render_final_images, warm_up
+from unrender.runs.final_images import at_start, render_final_images, warm_up
 from unrender.runs.folder import checkpoint, contents, method_file
 from unrender.runs.folder.history import THINNED_FROM, HistoryFile, thinned
 from unrender.runs.folder.lock import Lock
@@ -180,9 +180,11 @@ class RunWriter(Callback):
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
             weights, complete = pixel_weights(run.estimator, run.state.estimator), isinstance(run.optimizer, Measuring)
-            images = render_final_images(
-                run.problem, result, self.final_spp, run.time_left, self._tested, weights, complete
-            )
+            given = self.final_spp, run.time_left, self._tested, weights, complete
+            images = render_final_images(run.problem, result, *given)
+            if images.rise:
+                result = at_start(result, images.rise)
+                images = render_final_images(run.problem, result, *given)
             result = replace(
                 result,
                 pictures=images.pictures,
