@@ -37,9 +37,10 @@ class BoundsWatch(Callback):
         lines, known = [], run.problem.renderer.parameters()
         for key, unknown in run.problem.unknowns.items() if run.stopped else ():
             first, (low, high) = unknown.initial, unknown.bounds
-            if low is None or high is None:
+            last = arrays.numpy(run.parameters[key])
+            if low is None or high is None or first.shape != last.shape:  # a grid that is still coarse, or another mesh
                 continue
-            last, near = arrays.numpy(run.parameters[key]), _NEAR * (high - low)
+            near = _NEAR * (high - low)
             for bound, physical in ((low, known[key].lowest), (high, known[key].highest)):
                 count = int(np.sum((np.abs(last - bound) <= near) & (near < np.abs(first - bound))))
                 if count < (1.0 if first.size == 1 else _SHARE * first.size) or (first.size > 1 and bound == physical):
