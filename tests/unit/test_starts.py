@@ -208,8 +208,7 @@ def test_places_are_spread_over_the_range(
     info = dataclasses.replace(renderer.parameters()["place"], nonlinear=True, role=role)
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: {"place": info})
     made = Problem(renderer, [Parameter("place", bounds=(-1.0, 1.0))], [View(np.zeros((*SHAPE, 3)))])
-    traits: Any = type("T", (), {"infos": {"place": info}, "problem": made})
-    places = np.array([place["place"] for place in starts._places(traits, ["place"])])
+    places = np.array([place["place"] for place in starts._places(made, ["place"])])
     assert len(places) == number
     assert (np.abs(places) <= 1.0).all()
     if role == "direction":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -16,6 +17,7 @@ from unrender.methods.base import Options
 from unrender.methods.plan import Plan
 from unrender.methods.rules import RULES
 from unrender.methods.rules.constants import CONSTANTS
+from unrender.methods.rules.starts import varied_keys
 from unrender.methods.rules.traits import Traits
 from unrender.methods.smoothed import SIGMA_HELP
 from unrender.optimizers.base import Optimizer
@@ -88,4 +90,6 @@ class AutoMethod(Options):
 
     def plan(self, problem: Problem) -> Plan:
         traits = Traits(problem, self, CONSTANTS)
-        return next(plan for rule in RULES if (plan := rule(traits)) is not None)
+        plan = next(plan for rule in RULES if (plan := rule(traits)) is not None)
+        few = traits.elements <= CONSTANTS.few_numbers
+        return replace(plan, other_starts=tuple(varied_keys(problem, list(traits.infos)))) if few else plan

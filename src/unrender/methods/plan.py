@@ -31,6 +31,7 @@ class Plan:
         optimizer: Optimizer.
         settings: {key: settings of a parameter whose own are None}.
         reasons: Choices and their reasons, one line each.
+        other_starts: Keys of unknowns of which other values are compared during a run whose picture differs, see `runs.other_start`.
     """
 
     problem: Problem
@@ -38,6 +39,7 @@ class Plan:
     optimizer: Optimizer
     settings: Mapping[str, ParameterSettings] = field(default_factory=dict)
     reasons: tuple[str, ...] = ()
+    other_starts: tuple[str, ...] = ()
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -54,13 +56,14 @@ class Plan:
         return bind(self.optimizer, problem.topology, problem.coordinates.repeated)
 
     def table(self) -> dict[str, Any]:
-        """Return the plan as a TOML table: estimator, optimizer, settings by key.
+        """Return the plan as a TOML table: estimator, optimizer, settings by key, and keys of other starts.
 
         A component that cannot be described becomes a text with the reason.
         """
         parts: dict[str, Any] = {name: _table(getattr(self, name)) for name in _COMPONENTS}
         settings = {key: table for key, own in self.settings.items() if (table := _settings_table(own))}
-        return parts | ({"settings": settings} if settings else {})
+        others = {"other_starts": list(self.other_starts)} if self.other_starts else {}
+        return parts | others | ({"settings": settings} if settings else {})
 
     @classmethod
     def from_table(
@@ -93,7 +96,10 @@ class Plan:
         if other := next((key for key in entries if key not in problem.unknowns), None):
             raise InputError(f"{where}: settings: {other} is not an unknown{did_you_mean(other, problem.unknowns)}")
         settings = {key: _settings(own, f"{where}: settings: {key}") for key, own in entries.items()}
-        return cls(problem, made["estimator"], made["optimizer"], settings)
+        others = table.get("other_starts", [])
+        if not isinstance(others, list) or not all(isinstance(key, str) and key in problem.unknowns for key in others):
+            raise InputError(f"{where}: other_starts: expected a list of unknowns, got {others!r:.60}")
+        return cls(problem, made["estimator"], made["optimizer"], settings, other_starts=tuple(others))
 
 
 def bind(part: Any, topology: Callable[[str], MeshTopology | None], repeated: Mapping[str, int]) -> Any:

@@ -53,8 +53,13 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
 
 def initialize(run: Run, step: int) -> None:
     """Set the initial parameters of a new run at the resolution of a step, and initial states for that resolution."""
+    begin_at(run, run.problem.start(step))
+
+
+def begin_at(run: Run, parameters: Tree) -> None:
+    """Set parameters, and initial states of estimator and optimizer."""
     problem = run.problem
-    run.parameters = {k: problem.unknowns[k].project(x) for k, x in problem.start(step).items()}
+    run.parameters = {k: problem.unknowns[k].project(x) for k, x in parameters.items()}
     run.state.estimator = run.estimator.init(problem, run.parameters)
     run.state.optimizer = run.optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
 

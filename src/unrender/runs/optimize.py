@@ -33,6 +33,7 @@ from unrender.runs.metadata import (
 )
 from unrender.runs.notebook import NotebookProgress
 from unrender.runs.number_means import NumberMeans
+from unrender.runs.other_start import OtherStart
 from unrender.runs.phase_times import PhaseTimes
 from unrender.runs.refinement import MeshRefinement, Refinement
 from unrender.runs.result import Result
@@ -159,6 +160,7 @@ def connected(
         Budget(),
         Refinement(),
         MeshRefinement(),
+        OtherStart(),
         NumberMeans(),
         Verify(),
         *writing,

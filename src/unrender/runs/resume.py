@@ -40,7 +40,7 @@ from unrender.scene.serialization import origin
 
 _WARNINGS = "warnings"
 _SENT, _CANDIDATE, _AHEAD, _NUMBERS = "sent", "candidate", "ahead", "numbers"
-_OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS, "few_steps")
+_OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS, "few_steps", "other_start")
 """Parts of a snapshot that only some runs have."""
 
 

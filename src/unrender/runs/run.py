@@ -167,7 +167,7 @@ class Run:
         state, noise, executor = self.state, self.state.noise, self.problem.executor
         candidate = None if state.candidate is None else vars(state.candidate)
         parts = {"sent": executor.snapshot(), "candidate": candidate, "ahead": self.ahead or None}
-        parts |= {"few_steps": self.few_steps or None}
+        parts |= {"few_steps": self.few_steps or None, "other_start": state.other_start or None}
         parts |= {"numbers": state.numbers.snapshot()}
         return {
             "parameters": self.parameters,
@@ -196,6 +196,7 @@ class Run:
         state.skipped_in_a_row, state.next_error = saved["skipped_in_a_row"], saved["next_error"]
         state.candidate = Candidate(**saved["candidate"]) if "candidate" in saved else None
         state.numbers = NumberTrace.restored(saved.get("numbers"))
+        state.other_start = str(saved.get("other_start") or "")
         self.problem.executor.restore(saved.get("sent"))
 
 
@@ -227,6 +228,7 @@ class RunState:
         next_error: time on the run's clock at which the parameters' error is measured again.
         candidate: best of the tested earlier parameters; None before the first.
         numbers: values of the numbers at each step.
+        other_start: outcome of the comparison with other starts, see `runs.other_start`; "" before it.
     """
 
     estimator: Any
@@ -238,6 +240,7 @@ class RunState:
     next_error: float = 0.0
     candidate: Candidate | None = None
     numbers: NumberTrace = field(default_factory=NumberTrace)
+    other_start: str = ""
 
 
 SNAPSHOT_COUNTS = ("step", "clock", "skipped", "samples", "skipped_in_a_row", "next_error")

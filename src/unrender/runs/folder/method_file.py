@@ -27,7 +27,7 @@ class Method(BaseModel):
         name: name of the method; "" for none.
         steps, seconds: the budget.
         checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
-        estimator, optimizer, settings: See `Plan.table`.
+        estimator, optimizer, other_starts, settings: See `Plan.table`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -41,6 +41,7 @@ class Method(BaseModel):
     threads: _Positive | None = None
     estimator: dict[StrictStr, Any] | StrictStr
     optimizer: dict[StrictStr, Any] | StrictStr
+    other_starts: list[StrictStr] = Field(default_factory=list)
     settings: dict[StrictStr, dict[StrictStr, Any]] = Field(default_factory=dict)
 
 
