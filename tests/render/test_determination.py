@@ -86,6 +86,24 @@ def test_a_factor_is_tested_with_few_samples_or_named_as_untested():
     assert line.startswith(f"whether {LIGHT} and {COLOUR} share a factor: the run is too short for this test")
 
 
+def test_a_scale_and_the_values_that_it_multiplies_share_a_factor():
+    """A sky with its scale, and a projector with its own."""
+    pixels = np.random.default_rng(0).uniform(0.2, 1.0, (4, 8, 3)).astype(np.float32)
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(pixels), "scale": 2.0}
+    made = problem(scene(DIFFUSE, sky=sky), "sky.data", "sky.scale")
+    expected = "sky.scale and sky.data: determined up to a common factor only"
+    assert common_factor(made, made.initial_values(), 16) == [expected]
+    (line,) = common_factor(made, made.initial_values(), 16, seconds=0.0, per_pass=4)
+    assert line.startswith("whether sky.scale and sky.data share a factor: the run is too short for this test")
+    light = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+    look = mi.ScalarTransform4f().look_at([0, 0, 3], [0, 0, 0], [0, 1, 0])
+    beam = {"type": "projector", "irradiance": light, "scale": 5.0, "to_world": look}
+    made = problem(scene(DIFFUSE, beam=beam, sky=sky), "beam.irradiance.data", "beam.scale", "sky.scale")
+    assert common_factor(made, made.initial_values(), 64) == [
+        "beam.scale and beam.irradiance.data: determined up to a common factor only"
+    ]
+
+
 @pytest.mark.parametrize("keys", [(LIGHT, COLOUR), (LIGHT,), (COLOUR,)])
 def test_a_surface_of_known_colour_determines_the_factor(keys: tuple[str, ...]):
     """As does a light that is known, since only one of the two is an unknown then."""

@@ -27,6 +27,8 @@ _ERRORS = 2.0
 """Number of standard errors by which a change must be below its limit."""
 _UNSEEN = 0.05
 """Fraction of unseen cells of a texture or grid from which a line is returned."""
+_SCALE = "scale"
+"""Last part of the keys of factors, such as that of an environment map."""
 _ROLES = ("value", "height")
 """Roles of the tested parameters; equal normals or directions are no range."""
 _SEEDS, _RENDERINGS = (3, 4), 8
@@ -142,36 +144,50 @@ def common_factor(
     per_pass: int | None = None,
     most: float = 0.0,
 ) -> list[str]:
-    """Return one line if the images determine emitters and reflectances only up to a common factor, or if that was not tested; or none.
+    """Return a line for parameters that the images determine only up to a common factor, or for which that was not tested.
 
-    Emitters become brighter by a factor, and reflectances darker by the same factor. The images distinguish the two if they change.
+    Emitters become brighter by a factor, and reflectances darker by the same factor. The images distinguish the two if they change. The
+    same test follows for a scale and the values that it multiplies, such as those of an environment map.
 
     Args:
         values: {key: array}, parameters at which it is tested.
-        spp: most samples per pixel of each of eight renderings per view.
+        spp: most samples per pixel of each of eight renderings per view and test.
         seconds: time limit, from which the samples follow.
         per_pass: least samples per pixel; see `render`.
         most: time limit with the least samples, if it is longer than `seconds`.
     """
-    lights, colours = _brightnesses(problem)
-    if not lights or not colours:
+    tests = _products(problem)
+    if not tests:
         return []
     least, started = min(per_pass or spp, spp), time.perf_counter()
     render(problem, values, 0, least, _SEEDS[0], per_pass)
-    needed = _RENDERINGS * len(selected_views(problem)) * (time.perf_counter() - started)
+    needed = len(tests) * _RENDERINGS * len(selected_views(problem)) * (time.perf_counter() - started)
     if needed > max(seconds, most):
         return untested_factor(problem)
     spp = max(least, power_of_two(int(min(spp, least * seconds / needed))))
-    brighter = {key: x * np.float32(_FACTOR) if key in lights else x for key, x in values.items()}
-    darker = {key: x / np.float32(_FACTOR) if key in colours else x for key, x in brighter.items()}
-    alone = _change(problem, values, brighter, spp, per_pass)
-    together = _change(problem, values, darker, spp, per_pass)
-    if alone.square <= 0.0 or not together.is_below(_LEAST_OF_FACTOR, alone.square):
-        return []
-    line = f"{listed(lights)} and {listed(colours)}: determined up to a common factor only"
+    shared = [(up, down) for up, down in tests if _is_shared(problem, values, up, down, spp, per_pass)]
+    return [
+        f"{_both(up, down)}: determined up to a common factor only{_after(problem, values, up, down)}"
+        for up, down in shared
+    ]
+
+
+def _is_shared(
+    problem: Problem, values: Mapping[str, np.ndarray], up: list[str], down: list[str], spp: int, per_pass: int | None
+) -> bool:
+    """Return whether the images change by `up` times a factor, but not if `down` is divided by it."""
+    larger = {key: x * np.float32(_FACTOR) if key in up else x for key, x in values.items()}
+    smaller = {key: x / np.float32(_FACTOR) if key in down else x for key, x in larger.items()}
+    alone = _change(problem, values, larger, spp, per_pass)
+    together = _change(problem, values, smaller, spp, per_pass)
+    return alone.square > 0.0 and together.is_below(_LEAST_OF_FACTOR, alone.square)
+
+
+def _after(problem: Problem, values: Mapping[str, np.ndarray], lights: list[str], colours: list[str]) -> str:
+    """Return the errors of lights and reflectances without their common factor; "" if the truth is unknown, or for a scale."""
     ratios = [np.log(factor) for key in lights if (factor := _factor(problem, key, values[key])) is not None]
-    if not ratios:
-        return [line]
+    if not ratios or problem.renderer.parameters()[colours[0]].brightness != "reflectance":
+        return ""
     factor = float(np.exp(np.mean(ratios)))
     after = {key: values[key] / factor if key in lights else values[key] * factor for key in (*lights, *colours)}
     errors = {
@@ -180,24 +196,30 @@ def common_factor(
         if (truth := problem.unknowns[key].truth) is not None
     }
     error_list = listed([f"{key} {error:.3g}" for key, error in errors.items() if error is not None])
-    return [f"{line}; with lights divided by {factor:.3g} and reflectances multiplied by it, errors are {error_list}"]
+    return f"; with lights divided by {factor:.3g} and reflectances multiplied by it, errors are {error_list}"
 
 
 def untested_factor(problem: Problem) -> list[str]:
-    """Return one line if the unknowns may share a factor: that the run was too short for `common_factor`."""
-    lights, colours = _brightnesses(problem)
-    if not lights or not colours:
-        return []
-    return [f"whether {listed(lights)} and {listed(colours)} share a factor: {TOO_SHORT}"]
+    """Return a line for parameters that may share a factor: that the run was too short for `common_factor`."""
+    return [f"whether {_both(up, down)} share a factor: {TOO_SHORT}" for up, down in _products(problem)]
 
 
-def _brightnesses(problem: Problem) -> tuple[list[str], list[str]]:
-    """Return the keys of the unknown brightnesses of lights, and of the reflectances."""
+def _both(up: list[str], down: list[str]) -> str:
+    return f"{listed(up)} and {listed(down)}"
+
+
+def _products(problem: Problem) -> list[tuple[list[str], list[str]]]:
+    """Return pairs of keys whose products the images may show alone: lights and reflectances; a scale and values of the same object."""
     known = problem.renderer.parameters()
     lights, colours = (
         [key for key in problem.unknowns if known[key].brightness == kind] for kind in ("light", "reflectance")
     )
-    return lights, colours
+    products = [(lights, colours)] if lights and colours else []
+    for key in problem.unknowns:
+        owner, _, name = key.rpartition(".")
+        others = [k for k in problem.unknowns if k != key and k.startswith(f"{owner}.") and known[k].role in _ROLES]
+        products += [([key], [other]) for other in others if name == _SCALE and not known[other].rigid]
+    return products
 
 
 def _factor(problem: Problem, key: str, values: np.ndarray) -> float | None:
