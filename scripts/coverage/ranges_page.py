@@ -96,8 +96,7 @@ def _own_keys(parameters: Any, prefixes: tuple[str, ...]) -> Iterator[tuple[str,
 
 
 def _ends(limits: Range) -> tuple[str, str]:
-    low, high = _number(limits.low), _number(limits.high)
-    return f"`{limits.above}`" if limits.above else low, f"`{limits.below}`" if limits.below else high
+    return _number(limits.low), _number(limits.high)
 
 
 def _number(value: float | None) -> str:

@@ -146,6 +146,13 @@ def test_an_index_of_refraction_stays_on_the_side_of_one_on_which_it_starts(star
     assert bounds(glass, ball__bsdf__eta=start)["ball.bsdf.eta"] == pytest.approx(expected, rel=1e-5)
 
 
+def test_the_angles_of_a_spotlight_do_not_bound_each_other() -> None:
+    """Each had the other one's loaded value as a bound, which excluded the truth if both were unknown."""
+    light = {"type": "spot", "cutoff_angle": 30.0, "beam_width": 20.0}
+    found = bounds(scene(lamp=light), lamp__cutoff_angle=30.0, lamp__beam_width=20.0)
+    assert found == dict.fromkeys(("lamp.cutoff_angle", "lamp.beam_width"), (0.0, 90.0))
+
+
 def test_bounds_across_a_singular_value_are_narrowed_and_a_start_at_it_is_refused() -> None:
     glass = scene(ball={"type": "sphere", "bsdf": {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.5}})
     given = ur.Problem(glass, [ur.Parameter("ball.bsdf.eta", 1.5, bounds=(0.9, 2.0))], [VIEW])

@@ -22,8 +22,6 @@ class Range:
         high: largest value; None for no limit.
         unit: unit of the values; "1" for a dimensionless number, "" for an unknown slot.
         singular: value between `low` and `high` at which images are singular; values stay on one side of it.
-        above: another parameter of the same object whose value in the scene is a lower limit; "" for none.
-        below: another parameter of the same object whose value in the scene is an upper limit; "" for none.
         lobe: whether the value decides the probability with which a lobe is sampled. At an end that probability is 0.
         shapes_bsdf: whether the value changes the form of a BSDF, such as a roughness, and not its colour.
     """
@@ -32,8 +30,6 @@ class Range:
     high: float | None = None
     unit: str = "1"
     singular: float | None = None
-    above: str = ""
-    below: str = ""
     lobe: bool = False
     shapes_bsdf: bool = False
 
@@ -164,8 +160,7 @@ CLASSES: dict[str, dict[str, Range]] = {
     "EnvironmentMapEmitter": {"data": _RADIANCE},
     "SpotLight": {
         "texture": Range(0.0, None),
-        "cutoff_angle": Range(0.0, 90.0, "degrees", above="beam_width"),
-        "beam_width": Range(0.0, 90.0, "degrees", below="cutoff_angle"),
+        **dict.fromkeys(("cutoff_angle", "beam_width"), Range(0.0, 90.0, "degrees")),  # light ends at the smaller one
     },
     "SunskyEmitter": _SKY,
     "TimedSunskyEmitter": _SKY,
@@ -206,16 +201,7 @@ class SlotReaders:
 
     def range_of(self, parameters: mi.SceneParameters, key: str) -> Range:
         """Return the range of the parameter `key`; `UNKNOWN` if no known slot reads it."""
-        node, leaf = parameters.properties[key][2], key.rpartition(".")[2]
-        own = self._of_slot(node, leaf)
-        low, high = own.low, own.high
-        for other, is_lower in ((own.above, True), (own.below, False)):
-            name = f"{key.rpartition('.')[0]}.{other}"
-            if other and name in parameters:
-                value: Any = parameters[name]
-                limit = float(value[0])
-                low, high = (limit, high) if is_lower else (low, limit)
-        return replace(own, low=low, high=high)
+        return self._of_slot(parameters.properties[key][2], key.rpartition(".")[2])
 
     def _of_slot(self, node: Any, slot: str) -> Range:
         if isinstance(node, (mi.Texture, mi.Volume)) and slot in _FORWARDED:
