@@ -14,8 +14,11 @@ SIDE, CELLS = 12, 8
 START = 0.2
 
 
-def made(noise_of_references: float = 0.0) -> ur.Problem:
-    """A texture of 8 x 8 cells, of which the pixels show the upper half; each pixel shows a cell, three channels alike."""
+def made(noise_of_references: float = 0.0, other_light: float = 0.0) -> ur.Problem:
+    """A texture of 8 x 8 cells, of which the pixels show the upper half; each pixel shows a cell, three channels alike.
+
+    `other_light` is added to half of the reference, and taken from the other half.
+    """
     generator = np.random.default_rng(0)
     cell = generator.integers(0, CELLS * CELLS // 2, SIDE * SIDE)
     matrix = np.repeat(np.eye(CELLS * CELLS)[cell], 3, axis=0)
@@ -23,6 +26,8 @@ def made(noise_of_references: float = 0.0) -> ur.Problem:
     renderer = AnalyticRenderer({"x": np.full((CELLS, CELLS, 1), 0.5)}, matrix, noise=0.02, shape=(SIDE, SIDE))
     reference = (matrix @ truth.ravel()).reshape(SIDE, SIDE, 3)
     reference = reference + noise_of_references * generator.normal(size=reference.shape)
+    reference[: SIDE // 2] += other_light
+    reference[SIDE // 2 :] -= other_light
     return ur.Problem(renderer, [ur.Parameter("x", initial=truth + START)], [ur.View(reference)], truth={"x": truth})
 
 
@@ -58,6 +63,13 @@ def test_the_noise_of_the_references_is_no_walk() -> None:
     assert lines(problem, problem.truth["x"] + noise, near) == []
     assert len(lines(made(), problem.truth["x"] + noise, near)) == 1
     assert len(lines(problem, changed(problem, 0.6, 0.0), near)) == 1
+
+
+def test_a_wrong_model_is_no_noise() -> None:
+    """The residual at the truth is then the model's error, which neighbouring pixels share."""
+    walked = np.random.default_rng(1).normal(0, 0.1, (CELLS, CELLS, 1))
+    problem = made(0.03, other_light=0.3)
+    assert len(lines(problem, problem.truth["x"] + walked, changed(problem, 0.01, 0.01))) == 1
 
 
 def test_few_steps_must_lead_further() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, sensitivity
+from unrender.runs.verification import misfit
 from unrender.scene.problem import Problem
 
 FEW_STEPS = 32
@@ -55,8 +56,7 @@ def further_from_truth(
         return []
     truth = {**last, **{key: value for key, value in problem.truth.items() if key in last}}
     sensitivities = _sensitivities(problem, truth, seconds)
-    # The sensitivity covers all views. The mean square residual at the truth is the noise of references and image.
-    residual = pictures.residual(pictures.images(truth)) if sensitivities else math.nan
+    residual = _noise_of_pixels(pictures, truth) if sensitivities else math.nan
     lines = []
     for key in suspects:
         measure, where, noise, words = problem.unknowns[key].measure, None, 0.0, ""
@@ -82,6 +82,18 @@ def _sensitivities(problem: Problem, values: Mapping[str, np.ndarray], seconds: 
         return sensitivity(problem, values, _PROBES, seconds=_SECONDS_SHARE * seconds)
     except InputError:  # the renderer rejects the true values
         return {}
+
+
+def _noise_of_pixels(pictures: FreshPictures, truth: Mapping[str, np.ndarray]) -> float:
+    """Return the mean square of the noise of references and image: of the residual at the truth, without what neighbours share.
+
+    Neighbours share the difference of a wrong model, such as of exchanged references.
+    """
+    images = pictures.images(truth)
+    residuals, total = pictures.differences(images), pictures.residual(images)
+    of = residuals[0::2], residuals[1::2], pictures.references, pictures.weights, pictures.sizes
+    shared = misfit(*of, 0.0)
+    return total if shared is None else max(total - shared.error**2, 0.0)
 
 
 def _seen(sensitivity: np.ndarray) -> np.ndarray | None:
