@@ -55,9 +55,11 @@ class Kept(ur.protocols.Callback):
         return [(seconds, values) for seconds, _, values in self._recorder.kept]
 
 
-def timed_run(problem: ur.Problem, seconds: float, seed: int, *method: Any, points: int = POINTS) -> Kept:
-    """Run `auto`, or an estimator and an optimizer, for some processor seconds without measuring errors; return what was kept."""
-    kept = Kept(seconds, points)
+def timed_run(
+    problem: ur.Problem, seconds: float, seed: int, *method: Any, points: int = POINTS, steps: int | None = None
+) -> Kept:
+    """Run `auto`, or an estimator and an optimizer, for some processor seconds or steps without measuring errors; return what was kept."""
+    kept = Kept(seconds, points, steps)
     limit = 100 * seconds  # of the clock, never reached
     ur.optimize(blind(problem), *method, seconds=limit, seed=seed, callbacks=[kept], progress=False)
     return kept

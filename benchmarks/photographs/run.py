@@ -1,4 +1,4 @@
-"""Photographs: held-out ones against the hull with photographs projected on it, a stock loop, stages and `auto`, at equal time.
+"""Photographs: held-out ones against the hull with photographs projected on it, a stock loop, stages and `auto`, at equal time or steps.
 
 The folder holds posed photographs with masks, such as an LLFF capture. One import makes the hull, the atlas and the unknowns, a normal map
 among them; all start from it.
@@ -8,6 +8,9 @@ one run of all unknowns. "stock": `mi.render` of a few views a step, `dr.backwar
 unknowns of "stages-flat"; "stock-normals": with those of "stages". Both are tuned over samples and rates; the best by held-out photographs
 is kept, which is in its favour. Seconds are of one thread of the processor, so that others on the machine cost nobody steps; what compiles
 before the first step does not count. PSNR is as displayed, inside the masks, the mean of the held-out photographs.
+
+A folder of one camera under known lights has a plate with a colour and a normal per pixel in place of a hull, held-out
+lights, and "least-squares" (Woodham 1980) as a further entrant.
 """
 
 from __future__ import annotations
@@ -30,10 +33,10 @@ from benchmarks.photographs.projection import Projection
 from benchmarks.runner.records import Record, scratch
 from benchmarks.stock_loop import stock_loop
 from benchmarks.timed_runs import Kept
-from unrender.app.capture import importing
+from unrender.app.capture import formats, importing, photometric_folder
 from unrender.app.evaluation.measures import measure
 
-ENTRANTS = ("start", "projection", "stages", "stages-flat", "auto", "stock", "stock-normals")
+ENTRANTS = ("start", "projection", "stages", "stages-flat", "auto", "stock", "stock-normals", "least-squares")
 FLAT = ("colour", "roughness", "metallic", "light")
 LAST_RATE = 1 / 20
 """Of the stock loop's falling rates, as a share of the first."""
@@ -73,6 +76,14 @@ class Judge:
     def of(self, values: dict[str, np.ndarray]) -> list[float]:
         """Of a result."""
         return self.psnr(lambda view: np.asarray(ur.render(self.problem, values, view=view, spp=self.spp)))
+
+
+def by_least_squares(photographs: Path, resolution: int) -> Callable[[int], np.ndarray]:
+    """Return the pictures of held-out lights, by number, by normals and colours from least squares over the others."""
+    views = photometric_folder.prepare(formats.lights.read(photographs), resolution, None, None)
+    kept, held_out = views.training, views.directions[np.flatnonzero(views.held_out)]
+    normal, colour = photometric_folder.least_squares(views.values[kept], views.directions[kept])
+    return lambda index: colour * np.maximum(normal @ held_out[index], 0.0)[..., None]
 
 
 def stock(problem: ur.Problem, spp: int, rate: float, falling: bool, seconds: float, seed: int) -> tuple[dict, int]:
@@ -116,6 +127,7 @@ def run(
     falling: tuple[float, ...] = (),
     seeds: int = 1,
     final_spp: int = 64,
+    steps: int | None = None,
 ) -> Iterator[dict[str, Any]]:
     """A part for each entrant, all on one import.
 
@@ -127,6 +139,7 @@ def run(
         rates: of the stock loop, that stay
         falling: likewise, that fall to a twentieth
         final_spp: of the pictures that are measured
+        steps: after which `auto` ends if its time has not; such runs have a race of their own
     """
     dr.set_thread_count(1)
     own = photographs is None
@@ -144,6 +157,8 @@ def run(
             imports.clear()
             unknowns = FLAT if kind == "flat" else None
             options = importing.ImportOptions(resolution=resolution, texture=texture, faces=faces, unknowns=unknowns)
+            if formats.is_lit(given, None):
+                options = importing.ImportOptions(resolution=resolution)
             importing.import_capture(given, folder / kind, options, overwrite=True)
             problem = ur.Problem.from_file(folder / kind / "problem.toml")
             keys = [parameter.key for parameter in problem.parameters]
@@ -155,22 +170,24 @@ def run(
         elif who == "projection":
             projection = Projection(judge.folder, problem, texture)
             found = {"psnr": [judge.psnr(lambda view, by=projection, of=judge: by.picture(of.problem, view))]}
+        elif who == "least-squares":
+            found = {"psnr": [judge.psnr(by_least_squares(given, resolution))]}
         elif who in ("stock", "stock-normals"):
             found = tuned(problem, judge, settings, seconds, seeds)
         else:
             for seed in range(seeds):
                 if who in ("stages", "stages-flat"):
-                    values, steps = in_stages(judge.folder, seconds, 100 * seed)
+                    values, taken = in_stages(judge.folder, seconds, 100 * seed)
                 else:
-                    clock = Kept(seconds, points=1)
+                    clock = Kept(seconds, 1, steps)
                     plan = method("auto").plan(problem)
-                    result = ur.optimize(problem, plan, steps=1_000_000, seed=seed, callbacks=[clock])
-                    values, steps = result.parameters, clock.steps
+                    result = ur.optimize(problem, plan, steps=steps or 1_000_000, seed=seed, callbacks=[clock])
+                    values, taken = result.parameters, clock.steps
                 found["psnr"].append(judge.of(values))
-                found["steps"].append(steps)
-                print(who, seed, steps, np.mean(found["psnr"][-1]), flush=True)
+                found["steps"].append(taken)
+                print(who, seed, taken, np.mean(found["psnr"][-1]), flush=True)
         print(who, np.mean(found["psnr"]), flush=True)
-        race = f"{name}, {resolution}, {seconds:g}"
+        race = f"{name}, {resolution}, {steps or seconds:g}{' steps' if steps else ''}"
         conditions = {"views": len(problem.views), "held_out": len(judge.problem.views)}
         conditions |= {"pixels": problem.pixels, "seconds": seconds}
         part: dict[str, Any] = {"races": {race: {**conditions, "found": {who: found}}}}
@@ -223,10 +240,11 @@ def _race(name: str, race: Record) -> str:
         for row in entry.get("tried", []):
             rate = f"{row['rate']:g}{' falling' if row.get('falling') else ''}"
             tried.append([who, row["spp"], rate, row["steps"], f"{np.mean(row['psnr']):.2f}"])
-    capture, size, _ = name.rsplit(", ", 2)
+    capture, size, budget = name.rsplit(", ", 2)
     counts = f"{race['views']} photographs of {size} pixels along the longer side, {race['held_out']} more held out"
+    given = budget if budget.endswith("steps") else f"{budget} s of the processor each"
     parts = [
-        f"{capture}: {counts}, {race['seconds']:g} s of the processor each.",
+        f"{capture}: {counts}, {given}.",
         markdown.table(" | held-out PSNR (dB) | the worst of them | seeds | steps | settings", rows),
     ]
     if tried:

@@ -113,6 +113,21 @@ def test_auto_takes_path_gradients_of_many_aims_and_perturbed_renders_of_few() -
     assert isinstance(method("auto").plan(few).estimator, ur.GaussNewton)
 
 
+def test_auto_takes_perturbed_renders_of_many_places_also_where_a_view_does_not_see_all_lights() -> None:
+    """They have no path gradient, and the loss smoothed over all of them rose. The derivative images of a hidden light are zero."""
+    many = lights.problem("places", views=1, seed=0, resolution=16, spp=64)
+    assert isinstance(method("auto").plan(many).estimator, ur.GaussNewton)
+    hidden = {"type": "spot", "to_world": mi.ScalarTransform4f().look_at([9, 3, 0], [9, 9, 0], [1, 0, 0])}
+    seen = scene(light("spot"), other=hidden)
+    target = image(scene(light("spot", motion(HEAD, shift=[0.3, 0.0, 0.0])), other=hidden), {}, 64)
+    keys = ("lamp.translation.x", "other.translation.x")
+    for count in (1, 2):
+        made = ur.Problem(
+            seen, [ur.Parameter(key, initial=0.0) for key in keys[:count]], [ur.View(target)], max_depth=3
+        )
+        assert isinstance(method("auto").plan(made).estimator, ur.GaussNewton)
+
+
 @pytest.mark.parametrize(
     ("kind", "more", "key"),
     [

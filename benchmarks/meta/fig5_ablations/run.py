@@ -4,6 +4,10 @@ Left out: the zero-centred moments (variances about the mean instead), the bound
 ones, at twice the cost), the decoupling of the difference's variance from the step. Both forms. The race on `ajar` is one of equal seconds.
 At length, on a small `indirect-room` with the paper's loss, every form takes as many steps at one rate that is not tuned; a descent has
 diverged where it ends further from the truth than half of its start.
+
+Centring: of plain gradients at the start of `ajar`, the squared mean over the mean square, summed over elements, free of
+the noise of the mean. It is the share by which centred variances differ from moments about zero. Where it is large, at
+16 samples, the coupled form and its centred variances race over equal steps.
 """
 
 from __future__ import annotations
@@ -12,8 +16,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 import unrender as ur
-from benchmarks import figures, markdown
+from benchmarks import markdown, pixel_schemes
 from benchmarks.races import Entrant, race
 from benchmarks.runner.records import Record
 
@@ -29,27 +35,42 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 }
 FORMS = {"meta": {}, "coupled": {"coupled": True, "spp": 3}}
 DIVERGED = 0.5
-MERGE = ("methods", "at length.methods")
-QUICK = {"seconds": 0.1, "seeds": 2, "resolution": 8, "steps": 4, "long_seeds": 1, "long_resolution": 8}
+MERGE = ("methods", "at length.methods", "centring")
+QUICK = {
+    "seconds": 0.1, "seeds": 2, "resolution": 8, "steps": 4, "long_seeds": 1, "long_resolution": 8, "gradients": 8,
+    "short_steps": 4,
+}  # fmt: skip
 
 
-def entrants() -> list[Entrant]:
-    """Both forms, whole and with each part left out."""
+def entrants(forms: dict[str, dict[str, Any]] = FORMS) -> list[Entrant]:
+    """The forms, whole and with each part left out."""
     return [
         Entrant(f"{form}, {name}", name, ur.MetaEstimator(**kind, **options), ur.optimizers.MetaAdam, RATES)
-        for form, kind in FORMS.items()
+        for form, kind in forms.items()
         for name, options in ABLATIONS.items()
     ]
+
+
+def centring(problem: ur.Problem, spp: int, count: int) -> list[float]:
+    """Return the squared mean over the mean square of an element, summed over elements, and its standard error."""
+    rows = pixel_schemes.gradients(problem, ur.PathGradient(spp=spp), count)[0].astype(np.float64)
+    shares = []
+    for part in np.array_split(rows, 4):
+        squared = part.mean(axis=0) ** 2 - part.var(axis=0, ddof=1) / len(part)
+        shares.append(squared.sum() / (part**2).mean(axis=0).sum())
+    return [float(np.mean(shares)), float(np.std(shares, ddof=1) / 2)]
 
 
 def run(
     seconds: float = 5.0,
     seeds: int = 2,
     resolution: int = 48,
-    part: tuple[str, ...] = ("tuned", "at length"),
+    part: tuple[str, ...] = ("tuned", "at length", "centring"),
     steps: int = 1500,
     long_seeds: int = 5,
     long_resolution: int = 16,
+    gradients: int = 96,
+    short_steps: int = 150,
 ) -> Iterator[dict[str, Any]]:
     """The race of all forms, and their descents at one rate.
 
@@ -58,10 +79,17 @@ def run(
         steps: of every descent at length
         long_seeds: of the descents at length
         long_resolution: of the descents at length
+        gradients: that the moments are of
+        short_steps: of descents at 16 samples
     """
     if "tuned" in part:
         problem = ur.gallery.problem("ajar", resolution=resolution)
         yield {"methods": race(problem, entrants(), seeds, seconds=seconds)}
+    if "centring" in part:
+        made = ur.gallery.problem("ajar", resolution=resolution)
+        found: dict[str, Any] = {f"{spp} spp": centring(made, spp, gradients) for spp in (2, 16)}
+        given = entrants({"coupled at 16 spp": {"coupled": True, "spp": 16}})[:2]
+        yield {"centring": found, "methods": race(made, given, seeds, steps=short_steps)}
     if "at length" in part:
         size = {"resolution": long_resolution, "texture_resolution": 8}
         problem = ur.gallery.problem("indirect-room", loss="RelativeL2", **size)
@@ -73,13 +101,17 @@ def run(
 
 def table(record: Record) -> str:
     blocks = [
-        "`ajar`, {resolution}², {seconds:g} s, {seeds} seeds, each tuned.".format(**record["settings"]),
+        "`ajar`, {resolution}², {seconds:g} s, at 16 spp {short_steps} steps, {seeds} seeds, each tuned.".format(
+            **record["settings"]
+        ),
         markdown.records(
             "form, and what is left out | rate | final error: median (range)",
             "{name} | {rate:g} | {final!m}",
             markdown.named(record["methods"], "name"),
         ),
     ]
+    rows = [[name, f"{share:.4f} ± {error:.4f}"] for name, (share, error) in record["centring"].items()]
+    blocks.append(markdown.table("gradients of `ajar` | squared mean over mean square", rows))
     if long := record.get("at length"):
         head = (
             "form, and what is left out | final error: median (range) | highest along a run: median (range) | diverged"
@@ -93,20 +125,3 @@ def table(record: Record) -> str:
         text = "`indirect-room`, {resolution}², {steps} steps at the rate {rate:g}, {seeds} seeds.".format(**long)
         blocks += [text, markdown.table(head, rows)]
     return markdown.blocks(*blocks)
-
-
-def plot(record: Record) -> figures.Figure:
-    """Error over the race's seconds, and over the paths of the descents at length; a panel per form."""
-    parts = [("ajar, over seconds", record["methods"], 0)]
-    if "at length" in record:
-        parts.append(("indirect-room, at length, over paths", record["at length"]["methods"], 1))
-    panels = {
-        f"{title}, {form}": {
-            f"{name.partition(', ')[2]}: {found['final'][0]:.3f}": figures.points(found["runs"], column)
-            for name, found in methods.items()
-            if name.startswith(f"{form}, ")
-        }
-        for title, methods, column in parts
-        for form in FORMS
-    }
-    return figures.curves(panels, "", columns=2)

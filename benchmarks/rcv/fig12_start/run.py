@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import figures, markdown
+from benchmarks import markdown
 from benchmarks.runner.records import Record
 from unrender.statistics import welford
 
@@ -94,16 +94,3 @@ def table(record: Record) -> str:
     return markdown.blocks(
         f"{record['settings']['sequences']} sequences of normal variates.", markdown.table(head, rows)
     )
-
-
-def plot(record: Record) -> figures.Figure:
-    """Mean squares of the two means, beside their closed forms."""
-    panels = {
-        f"α = {alpha}": {
-            f"{name}, {kind}": figures.over_steps(found[key])
-            for name, found in entry.items()
-            for kind, key in (("measured", "mean_square"), ("closed form", "closed_form"))
-        }
-        for alpha, entry in record["decays"].items()
-    }
-    return figures.curves(panels, "n", "mean square")

@@ -28,23 +28,29 @@ QUICK: dict[str, Any] = {"cases": ("spot",), "views": (1,), "seeds": 1, "steps":
 UNKNOWN: dict[str, dict[str, float]] = {
     "spot": {"lamp.rotation.x": 0.15, "lamp.rotation.z": 0.12},
     "spots": {f"lamp_{n}.rotation.{axis}": 0.12 for n in range(16) for axis in "xz"},
+    "places": {f"lamp_{n}.translation.{axis}": 0.15 for n in range(16) for axis in "xz"},
     "projector": {"lamp.translation": 0.2, "lamp.rotation": 0.1},
     "area": {"lamp.translation": 0.4},
     "envmap": {"lamp.rotation.y": 0.5},
     "sunsky": {"lamp.rotation.y": 0.5},
 }
 """{light: {key: distance of the start from the truth, in each number}}."""
-LARGE: dict[str, dict[str, int]] = {"spots": {"steps": 400, "resolution": 32}}
+LARGE: dict[str, dict[str, int]] = {
+    "spots": {"steps": 400, "resolution": 32},
+    "places": {"steps": 40, "resolution": 32},
+}
 """{light: settings of its own}."""
 RATES, SPP, TIMES = (0.01, 0.03), 16, 3
 _PROJECTIVE = {"type": "prb_projective", "guiding": "none", "sppc": SPP, "sppp": SPP // 2, "sppi": SPP // 2}
+WRONG = "projector", "sunsky"
+"""Lights by whose transforms Mitsuba's derivatives are wrong."""
 LOOPS: dict[str, dict[str, Any]] = {"area": _PROJECTIVE} | {n: {"type": "prb"} for n in ("spot", "spots", "envmap")}
 """{light: integrator of Mitsuba's loop}."""
 
 
 def lights(name: str) -> dict[str, Any]:
     """The lights of a case by id."""
-    if name != "spots":
+    if name not in LARGE:
         return {"lamp": light(name)}
     colours, found = np.random.default_rng(0).uniform(1.2, 4.0, (16, 3)), {}
     for n, (x, z) in enumerate((x, z) for x in (-1.5, -0.5, 0.5, 1.5) for z in (-1.5, -0.5, 0.5, 1.5)):
@@ -100,11 +106,13 @@ def problem(name: str, views: int, seed: int, resolution: int, spp: int, depth: 
 
 
 def by_part(ends: Mapping[str, Any]) -> dict[str, float]:
-    """The largest error of each part of a pose, over lights."""
+    """The largest error of each part of a pose, over lights; of several lights the root mean square, too."""
     found: dict[str, float] = {}
     for key, value in ends.items():
         part = key.partition(".")[2]
         found[part] = max(found.get(part, 0.0), float(np.abs(np.array(value)).max()))
+    if len(ends) > len(found):
+        found["root mean square"] = float(np.sqrt(np.mean(np.square([np.array(value) for value in ends.values()]))))
     return found
 
 
@@ -198,12 +206,12 @@ def table(record: Record) -> str:
     rows = []
     for name, counts in record["cases"].items():
         for count, entry in counts.items():
-            none = "not measured" if name in LOOPS else "wrong derivative"
+            none = "wrong derivative" if name in WRONG else "not measured"
             for key, errors in entry["errors"].items():
                 loop = "{:.2g} ({:.2g})".format(*_middle(entry["loop"][key])) if "loop" in entry else none
                 cells = *(f"{x:.2g}" for x in _middle(errors)), f"{entry['seconds']:.2f}", loop
                 rows.append([name, count, key, *cells])
     head = "light | pictures | unknown | median error | largest | seconds of `auto` | Mitsuba's loop in three times these: median (largest)"
-    settings = "{seeds} starts, {steps} steps, pictures of {resolution}² (`spots`: 400 steps, 32²). "
+    settings = "{seeds} starts, {steps} steps, pictures of {resolution}² (`spots`: 400 steps, `places`: 40, 32²). "
     settings += "Errors are largest absolute ones, in scene units or radians."
     return markdown.blocks(settings.format(**record["settings"]), markdown.table(head, rows))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks import figures, markdown
+from benchmarks import markdown
 from benchmarks.internals import Key, PixelSampler, with_preconditioner
 from benchmarks.races import TUNING_SEED, search
 from benchmarks.runner.records import Record
@@ -39,6 +39,7 @@ def samplers(pixels: int, views: int) -> dict[str, PixelSampler]:
         "whole views": ur.pixels.All(),
         "half of the views": ur.pixels.Views(max(views // 2, 1)),
         "uniform": ur.pixels.Uniform(pixels),
+        "uniform, 4 times": ur.pixels.Uniform(4 * pixels),
         "adaptive": ur.pixels.Adaptive(pixels),
     }
 
@@ -59,12 +60,12 @@ def variance(problem: ur.Problem, sampler: PixelSampler, spp: int, repetitions: 
 
 
 def descend(
-    problem: ur.Problem, sampler: PixelSampler, rate: float, spp: int, seconds: float, seed: int
+    problem: ur.Problem, sampler: PixelSampler, rate: float, spp: int, seconds: float, seed: int, steps: int | None
 ) -> dict[str, Any]:
-    """The curve of one run, and what it reached."""
+    """The curve of one run, what it reached, and in which time."""
     estimator = ur.PathGradient(ur.images.Plain(), sampler, spp=spp)
-    descent = ur.optimizers.Adam(rate, uniform=True)
-    return measured(problem, timed_run(problem, seconds, seed, estimator, descent).found)
+    kept = timed_run(problem, seconds, seed, estimator, ur.optimizers.Adam(rate, uniform=True), steps=steps)
+    return {**measured(problem, kept.found), "seconds": kept.seconds}
 
 
 def run(
@@ -79,6 +80,7 @@ def run(
     rates: tuple[float, ...] = (0.03, 0.1),
     repetitions: int = 40,
     only: tuple[str, ...] = (),
+    steps: int | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Every way.
 
@@ -88,6 +90,7 @@ def run(
         pixels: of a mini-batch
         rates: tried on a seed of its own
         repetitions: gradients that a variance is of
+        steps: after which a run ends if its time has not; such runs have an entry of their own
     """
     found: dict[str, Any] = {}
     for name in problems:
@@ -97,16 +100,17 @@ def run(
         problem = with_preconditioner(problem, ur.preconditioners.LargeSteps(4.0), key)
         what = "surface" if problem.has_truth else "pictures"
         label = name if (pixels, spp) == _USUAL else f"{name}, {pixels} pixels, {spp} spp"
+        label += f", {steps} steps" if steps else ""
         found[label] = {"judged by": what, "views": len(problem.views), "seconds": seconds, "methods": {}}
         ways = samplers(pixels, len(problem.views))
         for way, sampler in ((way, ways[way]) for way in only or ways):
 
             def final(rate: float, sampler: PixelSampler = sampler, problem: ur.Problem = problem) -> float:
-                found = descend(problem, sampler, rate, spp, seconds, TUNING_SEED)
+                found = descend(problem, sampler, rate, spp, seconds, TUNING_SEED, steps)
                 return found["surface" if problem.has_truth else "pictures"]
 
             rate, _ = search(tuple(rates), final)
-            runs = [descend(problem, sampler, rate, spp, seconds, seed) for seed in range(seeds)]
+            runs = [descend(problem, sampler, rate, spp, seconds, seed, steps) for seed in range(seeds)]
             noise = variance(problem, sampler, spp, repetitions)
             found[label]["methods"][way] = {"rate": rate, "variance": noise, "runs": runs}
             print(name, way, rate, [float(np.round(one[what], 3)) for one in runs], noise, flush=True)
@@ -122,7 +126,8 @@ def table(record: Record) -> str:
             values = ([run[what] for run in of["runs"] if what in run] for what in ("surface", "pictures"))
             finals = (markdown.spread(each) if each else "–" for each in values)
             noise = f"{of['variance'] / uniform:.3g}" if uniform else "–"
-            budget = [f"{found['seconds']:g} s", str(len(of["runs"]))]
+            used = np.mean([run.get("seconds", found["seconds"]) for run in of["runs"]])
+            budget = [f"{used:.3g} s", str(len(of["runs"]))]
             rows.append([problem, *budget, name, f"{of['rate']:g}", *finals, noise])
     text = (
         "Of the start's, after some seconds of the processor: median (least to greatest). "
@@ -131,13 +136,3 @@ def table(record: Record) -> str:
     )
     head = "problem | seconds | seeds | pixels | rate | surface error | picture error | variance"
     return markdown.blocks(text.format(**record["settings"]), markdown.table(head, rows))
-
-
-def plot(record: Record) -> figures.Figure | None:
-    """Error of the surface over seconds, of the problems where it is known; None if there are none."""
-    panels = {
-        name: figures.run_curves(found["methods"])
-        for name, found in record["problems"].items()
-        if found["judged by"] == "surface"
-    }
-    return figures.curves(panels, "processor seconds", "surface error / at the start") if panels else None

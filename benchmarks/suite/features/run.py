@@ -1,4 +1,4 @@
-"""Ties, expressions, worlds, priors, AOVs, displacement and a caustic of lenses: `auto` against Mitsuba's loop, written for each by hand.
+"""Ties, expressions, worlds, priors, AOVs, displacement, a caustic and spectra: `auto` against Mitsuba's loop, written for each by hand.
 
 The loop sets tied and derived parameters itself, renders worlds in scenes of their own, and adds the priors' derivatives. AOVs are those of
 Mitsuba's `aov` integrator, and caustics are rendered by `ptracer`. It is tuned over samples per pixel and rates on a seed of its own.
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import unrender as ur
-from benchmarks import figures, markdown
+from benchmarks import markdown
 from benchmarks.internals import Lenses, Relief, dr, mi, parts, textures
 from benchmarks.races import TUNING_SEED, search, total_error
 from benchmarks.runner.records import Record
@@ -97,12 +97,12 @@ def displacement() -> ur.Problem:
     return ur.gallery.problem("relief", resolution=32, height_resolution=16)
 
 
-def depth() -> ur.Problem:
-    """The same height map from one map of depths."""
+def depth(name: str = "depth") -> ur.Problem:
+    """The same height map from one map of depths, or of another AOV."""
     scene = mi.load_dict(Relief(resolution=32, height_resolution=16).target())
-    aov = mi.load_dict({"type": "aov", "aovs": "seen:depth"})
-    found = np.array(mi.render(scene, integrator=aov, spp=256))[..., :1]
-    return displacement().replaced(views=[ur.View(found, aov="depth")])
+    aov = mi.load_dict({"type": "aov", "aovs": f"seen:{name}"})
+    found = np.array(mi.render(scene, integrator=aov, spp=256))[..., : 1 if name == "depth" else 3]
+    return displacement().replaced(views=[ur.View(found, aov=name)])
 
 
 class _Gaussian(Lenses):
@@ -119,9 +119,16 @@ def caustic() -> ur.Problem:
     return _Gaussian(resolution=24, mesh_resolution=32).problem("lenses")
 
 
-PROBLEMS: dict[str, Callable[[], ur.Problem]] = {
-    made.__name__: made for made in (ties, expressions, worlds, priors, depth, displacement, caustic)
+def spectra() -> ur.Problem:
+    """The roughness of the gallery's chalice, in the spectral variant from here on, where Mitsuba's colours are no RGB."""
+    ur.use((mi.variant() or "").replace("rgb", "spectral"))
+    return ur.gallery.problem("chalice", resolution=32, texture_resolution=32)
+
+
+PROBLEMS: dict[str, Callable[..., ur.Problem]] = {
+    made.__name__: made for made in (ties, expressions, worlds, priors, displacement, caustic, depth)
 }
+PROBLEMS |= {"normals": lambda: depth("sh_normal"), "positions": lambda: depth("position"), "spectra": spectra}
 
 
 def run(
@@ -170,11 +177,3 @@ def table(record: Record) -> str:
     head = "problem | of the processor | the loop's setting | error of the loop | of `auto` | speed-up"
     text = "Median (least to greatest), relative to the start."
     return markdown.blocks(text, markdown.table(head, rows))
-
-
-def plot(record: Record) -> figures.Figure:
-    panels = {}
-    for name, entry in record["problems"].items():
-        tenths = ((np.arange(10) + 1) / 10 * entry["settings"]["seconds"]).tolist()
-        panels[name] = {side: [(tenths, entry[side])] for side in ("loop", "auto")}
-    return figures.curves(panels, "processor seconds", "error / at the start", log="y")

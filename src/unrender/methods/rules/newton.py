@@ -153,9 +153,11 @@ def _explained(problem: Problem, estimator: GaussNewton) -> float:
     loss = 2.0 * mean - 0.5 * sum(losses)
     hessian = np.mean([arrays.numpy(estimate.require("explained", Hessian).matrix) for estimate in estimates], axis=0)
     one, other = (trees.ravel(estimate.gradient) for estimate in estimates)
-    if loss <= 0.0 or not np.isfinite(hessian).all() or not np.diag(hessian).all():
+    seen = np.diag(hessian) != 0.0  # a light that no view sees must not hide what the others explain
+    if loss <= 0.0 or not np.isfinite(hessian).all() or not seen.any():
         return 0.0
-    return float(0.5 * one @ positive_inverse(hessian, _LEAST_EIGENVALUE) @ other / loss)
+    inverse = positive_inverse(hessian[np.ix_(seen, seen)], _LEAST_EIGENVALUE)
+    return float(0.5 * one[seen] @ inverse @ other[seen] / loss)
 
 
 def _eliminated(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str, ...]:
@@ -199,7 +201,9 @@ def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
     small = all(len(shapes[key]) <= 1 and math.prod(shapes[key]) <= constants.number_size for key in keys)
     infos = [traits.infos[key] for key in keys]
     reached = all(info.perturbable and not (info.rigid and info.viewpoint) for info in infos)
-    costly = elements > constants.few_numbers or elements * traits.problem.pixels > 8 * constants.difference_paths
+    without_paths = any(info.light and info.rigid and not info.differentiable for info in infos)
+    most = constants.moved_lights if without_paths else constants.few_numbers
+    costly = elements > most or elements * traits.problem.pixels > 8 * constants.difference_paths
     return small and reached and not costly
 
 
