@@ -101,7 +101,7 @@ def run(
 
 def table(record: Record) -> str:
     blocks = [
-        "`ajar`, {resolution}², {seconds:g} s, at 16 spp {short_steps} steps, {seeds} seeds, each tuned.".format(
+        "`ajar`, {resolution}², {seconds:g} s, at 16 spp over equal steps, {seeds} seeds, each tuned.".format(
             **record["settings"]
         ),
         markdown.records(
