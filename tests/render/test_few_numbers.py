@@ -121,6 +121,15 @@ def metal() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     return made, truth, {"ball.bsdf.alpha.value": 0.5, "ball.bsdf.specular_reflectance.value": 0.5}, 0.01
 
 
+def cut_out() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
+    """A roughness and a colour below an opacity. By path gradients the roughness ran to 0.02, where the picture hardly depends on it."""
+    made = polished({"type": "roughconductor", "specular_reflectance": rgb(0.9, 0.6, 0.3), "alpha": 0.25})
+    made["ball"]["bsdf"] = {"type": "mask", "opacity": 0.8, "nested": made["ball"]["bsdf"]}
+    colour, alpha = (f"ball.bsdf.nested_bsdf.{name}.value" for name in ("specular_reflectance", "alpha"))
+    truth = {"ball.bsdf.opacity.value": 0.8, alpha: 0.25, colour: [0.9, 0.6, 0.3]}
+    return made, truth, {"ball.bsdf.opacity.value": 0.5, alpha: 0.5, colour: 0.5}, 0.02
+
+
 def sky() -> tuple[Scene, dict[str, Any], dict[str, Any], float]:
     view = camera("perspective", [0, 1, 5])
     view["to_world"] = mi.ScalarTransform4f().look_at([0, -3, 1.5], [0, 0, 0.3], [0, 0, 1])  # the zenith is z
@@ -163,6 +172,7 @@ CASES: dict[str, Callable[[], tuple[Scene, dict[str, Any], dict[str, Any], float
     "glass": glass,
     "plastic": plastic,
     "metal": metal,
+    "cut-out": cut_out,
     "sky": sky,
     "sunlight": sunlight,
     "pose": pose,

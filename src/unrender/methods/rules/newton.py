@@ -190,9 +190,10 @@ def _of_bsdfs(traits: Traits) -> list[str]:
 
 
 def _only_bsdfs_and_brightness(traits: Traits) -> bool:
-    """Return whether some unknowns are parameters of BSDFs, and all others of the brightness of lights."""
+    """Return whether some unknowns shape BSDFs, and all others are colours, opacities, weights of BSDFs, or the brightness of lights."""
     infos = traits.infos.values()
-    return any(info.shapes_bsdf for info in infos) and all(info.shapes_bsdf or bool(info.brightness) for info in infos)
+    others = all(info.shapes_bsdf or info.lobe or bool(info.brightness) for info in infos)
+    return others and any(info.shapes_bsdf for info in infos)
 
 
 def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
