@@ -67,8 +67,8 @@ def run(
         made, scores, shares = problem(name, assets), [], []
         for seed in range(seeds):
             of = with_own_references(made, _spp(name), seed)
-            values = ur.optimize(of, steps=count, seed=seed, progress=False).parameters
-            known = ur.runs.uncertainty(of, values, seed=seed)
+            result = ur.optimize(of, steps=count, seed=seed, progress=False)
+            values, known = result.parameters, ur.runs.uncertainty(of, result, seed=seed)
             for key, error in known.standard_error.items():
                 z = (values[key] - made.truth[key].reshape(error.shape)) / error
                 share = known.data_share.get(key)

@@ -145,6 +145,18 @@ def test_a_solution_with_weights_is_no_distance_from_the_fit(planted: bool):
     assert spread == pytest.approx(1.0, abs=0.35) if not planted else spread < 0.5
 
 
+def test_the_uncertainty_of_a_result_is_that_of_the_fit_with_its_weights():
+    """Half of the pixels have ten times the noise. A fit with equal weights has several times the error."""
+    size = np.where(np.arange(64).reshape(*SHAPE, 1) % 2, 0.2, 0.02)
+    made = problem(MATRIX, reference_noise=0.0, noise=0.01)
+    reference = np.asarray(made.views[0].reference) + size * np.random.default_rng(0).normal(size=(*SHAPE, 3))
+    made = made.replaced(views=[ur.View(reference.astype(np.float32))])
+    values, weights = at(np.array([0.6, 0.3, 0.4, 0.5])), 1.0 / (1.0 + np.square(size / 0.02))
+    result = ur.Result(values, made.initial_values(), [], 1.0, 0.0, "steps", pixel_weights=(weights,))
+    own, equal = (ur.runs.uncertainty(made, of).standard_error for of in (result, values))
+    assert all((own[key] < 0.5 * equal[key]).all() for key in TRUTH)
+
+
 def test_only_runs_with_weights_by_noise_have_them_in_the_test():
     state = GaussNewtonState({}, variances=(np.array([[[1.0], [2.0], [9.0]]]),))
     (weights,) = pixel_weights(ur.GaussNewton(noise_limit=3.0), state)

@@ -25,6 +25,7 @@ from unrender.runs.image_sensitivity import (
     transposed,
 )
 from unrender.runs.least_squares import check_numbers, checked_keys
+from unrender.runs.result import Result
 from unrender.runs.verification import misfit_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render, selected_views
@@ -69,15 +70,15 @@ class Uncertainty:
 
 @exclusive("uncertainty")
 def uncertainty(
-    problem: Problem, values: Mapping[str, np.ndarray], seconds: float = math.inf, seed: int = 0
+    problem: Problem, values: Mapping[str, np.ndarray] | Result, seconds: float = math.inf, seed: int = 0
 ) -> Uncertainty:
     """Estimate the standard error of each texel of a problem's textures, and of each number.
 
     Numbers, 24 elements at most, are tested by least squares at `values`, together with directions of textures and grids that trade off
-    against them. Their standard errors contain the references' noise, and the distance from the least-squares solution. Numbers have none
-    if another unknown is a mesh, has a prior, or is a texture that is too large or has no path gradient, nor if time runs out. `missing`
-    contains the reason for each unknown without errors. No unknown has any if the problem has few numbers and its pictures differ from
-    the references by more than noise, in up to four views.
+    against them. Their standard errors contain the references' noise, and the distance from the least-squares solution, for a `Result` that
+    with `Result.pixel_weights`. Numbers have none if another unknown is a mesh, has a prior, or is a texture that is too large or has no
+    path gradient, nor if time runs out. `missing` contains the reason for each unknown without errors. No unknown has any if the problem
+    has few numbers and its pictures differ from the references by more than noise, in up to four views.
 
     For textures, r is the pictures' residual, J their derivative with respect to the parameters, and H a diagonal element of the
     Gauss-Newton matrix JᵀJ. Elements are independent, and their values are not shrunk towards the start:
@@ -99,7 +100,7 @@ def uncertainty(
 
     Args:
         problem: problem with views and scene.
-        values: {key: array} at the end of a run.
+        values: {key: array} at the end of a run, or its result.
         seconds: time after which no further probe of H and no further test of the numbers is started; H has at least one probe.
         seed: seed of all random numbers.
 
@@ -109,6 +110,7 @@ def uncertainty(
     Raises:
         InputError: `values` have other keys or shapes than the problem's.
     """
+    values, weights = (values.parameters, values.pixel_weights) if isinstance(values, Result) else (values, ())
     as_tree(problem, values)  # refuses other keys and shapes
     until = time.perf_counter() + seconds
     known, maps = Curvature(), Uncertainty()
@@ -123,7 +125,7 @@ def uncertainty(
             known = curvature(problem, values, seconds=seconds, seed=seed, noise=pixel_noise(problem, halves))
             maps = of_residuals(problem, values, halves, known, seed)
     left = until - time.perf_counter()
-    numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity())
+    numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity(), weights)
     errors = {**numbers.standard_errors(values), **maps.standard_error}
     others = _others(problem, keys, {*mapped, *errors, *numbers.unchecked, *numbers.fixed})
     return Uncertainty(errors, maps.data_share, (*maps.missing, *numbers.missing(), *others))

@@ -74,6 +74,8 @@ class Result:
         pictures: {"view0/reference": (H, W, 3), ...}, linear, for reports.
         undetermined: one line for each unknown that the images do not determine, see `runs.determination`; empty for runs without a run
             folder.
+        pixel_weights: weights of each view's pixels in Gauss-Newton steps with a `noise_limit`, (H, W, 1) or (H, W, 3), which
+            `unrender.runs.uncertainty` needs; () if equal, and in results that are read from a run folder.
         meshes: {"KEY/faces": (F, 3), ...} of the parameters that are vertex positions, and the true surfaces, "KEY/true_vertices" and
             "KEY/true_faces", if known.
     """
@@ -104,6 +106,7 @@ class Result:
     data_share: Mapping[str, np.ndarray] = field(default_factory=dict)
     phases: Mapping[str, float] = field(default_factory=dict)
     meshes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    pixel_weights: Sequence[np.ndarray] = ()
     undetermined: Sequence[str] = ()
     without_errors: Sequence[str] = ()
     last: Mapping[str, np.ndarray] = field(default_factory=dict)

@@ -20,6 +20,7 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate, Estimator
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Choosing, Measuring, Optimizer
+from unrender.runs.least_squares import pixel_weights
 from unrender.runs.noise import GradientNoise
 from unrender.runs.number_trace import NumberTrace
 from unrender.runs.result import INTERRUPTED, TERMINATED, Result
@@ -149,6 +150,7 @@ class Run:
             info=to_numpy(self.estimate.info) if info and self.estimate else {},
             adapted=list(optimizer.choices(state)) if isinstance(optimizer, Choosing) else [],
             standard_error=self._standard_errors(),
+            pixel_weights=pixel_weights(self.estimator, self.state.estimator),
             **self.description,
         )
 

@@ -49,7 +49,6 @@ from unrender.runs.folder.schema import (
     TRUTH,
 )
 from unrender.runs.folder.state import not_finite, pack
-from unrender.runs.least_squares import pixel_weights
 from unrender.runs.result import PRUNED, TERMINATED, Result
 from unrender.scene import serialization
 
@@ -179,8 +178,8 @@ class RunWriter(Callback):
                 # Save the long computation and its outcome before the final images take more time.
                 self._save(result, "running" if result.status in ENDED else result.status)
             started = time.perf_counter()
-            weights, complete = pixel_weights(run.estimator, run.state.estimator), isinstance(run.optimizer, Measuring)
-            given = self.final_spp, run.time_left, self._tested, weights, complete
+            complete = isinstance(run.optimizer, Measuring)
+            given = self.final_spp, run.time_left, self._tested, result.pixel_weights, complete
             images = render_final_images(run.problem, result, *given)
             if images.rise:
                 result = at_start(result, images.rise)
