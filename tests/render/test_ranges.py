@@ -84,23 +84,28 @@ def test_mesh_attributes_have_the_range_of_the_slot_that_reads_them() -> None:
     assert found["ball.vertex_idle"] == (None, None)
 
 
-def test_roughness_changes_the_form_of_a_bsdf_and_a_colour_does_not() -> None:
-    """By the slot that reads the values, directly, as a mesh attribute, or together with a colour."""
+def test_roughness_and_media_change_the_form_of_scattering_and_a_colour_does_not() -> None:
+    """By the slot that reads the values, directly or as a mesh attribute."""
     principled = scene(ball={"type": "sphere", "bsdf": {"type": "principled", "roughness": 0.3, "metallic": 0.2}})
     plastic = scene(ball={"type": "sphere", "bsdf": {"type": "roughplastic", "alpha": 0.3}})
     textures = {"base_color": attribute("vertex_color"), "roughness": attribute("vertex_rough")}
-    described = (principled, plastic, sheet(textures, {"vertex_color": 3, "vertex_rough": 1}))
+    fog = {"type": "homogeneous", "phase": {"type": "hg", "g": 0.5}}
+    cloud = scene(ball={"type": "sphere", "bsdf": {"type": "null"}, "interior": fog})
+    described = (principled, plastic, cloud, sheet(textures, {"vertex_color": 3, "vertex_rough": 1}))
     known = {key: info for one in described for key, info in MitsubaRenderer(one, 3).parameters().items()}
     expected = {
-        "ball.bsdf.base_color.value": False,
-        "ball.bsdf.roughness.value": True,
-        "ball.bsdf.metallic.value": True,
-        "ball.bsdf.diffuse_reflectance.value": False,
-        "ball.bsdf.alpha": True,
-        "ball.vertex_color": False,
-        "ball.vertex_rough": True,
+        "ball.bsdf.base_color.value": "",
+        "ball.bsdf.roughness.value": "bsdf",
+        "ball.bsdf.metallic.value": "bsdf",
+        "ball.bsdf.diffuse_reflectance.value": "",
+        "ball.bsdf.alpha": "bsdf",
+        "ball.interior_medium.sigma_t.value.value": "medium",
+        "ball.interior_medium.albedo.value.value": "medium",
+        "ball.interior_medium.phase_function.g": "medium",
+        "ball.vertex_color": "",
+        "ball.vertex_rough": "bsdf",
     }
-    assert {key: known[key].shapes_bsdf for key in expected} == expected
+    assert {key: known[key].scattering for key in expected} == expected
 
 
 def test_an_attribute_of_two_slots_has_the_range_of_both_and_another_mesh_its_own() -> None:

@@ -373,7 +373,7 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     lit = {key: dataclasses.replace(info, nonlinear=True, brightness="light") for key, info in known.items()}
     formed.update(lit)
     assert method("auto").plan(made).estimator == expected, "lights alone are weighted as BSDFs"
-    formed["place"] = dataclasses.replace(lit["place"], shapes_bsdf=True)
+    formed["place"] = dataclasses.replace(lit["place"], scattering="bsdf")
     by_channel = dataclasses.replace(expected, noise_limit=CONSTANTS.bsdf_noise_limit, by_channel=True)
     assert method("auto").plan(made).estimator == by_channel
     formed.update(dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)})
@@ -407,7 +407,7 @@ def test_numbers_of_bsdfs_take_gauss_newton_steps_on_small_films_or_without_path
     else:
         assert isinstance(chosen(made)[0], PathGradient)
     known = dict(renderer.parameters())
-    known["rough"] = dataclasses.replace(known["rough"], shapes_bsdf=True)
+    known["rough"] = dataclasses.replace(known["rough"], scattering="bsdf")
     known["colour"] = dataclasses.replace(known["colour"], brightness="reflectance")
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
     plan = method("auto").plan(made)

@@ -221,6 +221,7 @@ def are_storable(renderer: Any) -> bool:
 def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo:
     """Return the description of an unknown on which these parameters depend."""
     sensors = {info.sensor for info in targets}
+    formed = next((info for info in targets if info.scattering), None)
     return ParameterInfo(
         shape,
         differentiable=all(info.differentiable for info in targets),
@@ -231,7 +232,7 @@ def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo
         viewpoint=any(info.viewpoint for info in targets),
         sensor=sensors.pop() if len(sensors) == 1 else None,
         nonlinear=any(info.nonlinear or info.welded for info in targets),
-        shapes_bsdf=any(info.shapes_bsdf for info in targets),
+        scattering=formed.scattering if formed else "",
         of_expression=True,
     )
 

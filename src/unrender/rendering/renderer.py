@@ -47,7 +47,7 @@ class ParameterInfo:
         role: meaning of the values: numbers, heights, normals or directions. The errors of the last two are angles.
         brightness: quantity that the picture is proportional to: "light" of an emitter, "reflectance" of a surface; else "".
         nonlinear: whether it changes the form of the picture, not its brightness: positions, lenses, skies, indices of refraction.
-        shapes_bsdf: whether it changes the form of a BSDF, such as a roughness, and not its colour.
+        scattering: what it changes the form of: a "bsdf", as a roughness does, not a colour, or a "medium"; else "".
         length: order of magnitude of lengths at the object that it moves, a power of ten; 1 for other values.
         angle: whether its values are angles in radians.
         lobe: whether it decides the probability of a lobe, which is never sampled if all values are at an end of the range.
@@ -74,7 +74,7 @@ class ParameterInfo:
     role: Role = "value"
     brightness: Literal["", "light", "reflectance"] = ""
     nonlinear: bool = False
-    shapes_bsdf: bool = False
+    scattering: Literal["", "bsdf", "medium"] = ""
     angle: bool = False
     lobe: bool = False
     of_expression: bool = False

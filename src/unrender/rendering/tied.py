@@ -93,7 +93,7 @@ class Tie:
             sensor=sensors.pop() if len(sensors) == 1 else None,
             brightness=infos[0].brightness if len({info.brightness for info in infos}) == 1 else "",
             nonlinear=any(info.nonlinear for info in infos),
-            shapes_bsdf=any(info.shapes_bsdf for info in infos),
+            scattering=next((info.scattering for info in infos if info.scattering), ""),
             of_expression=any(info.of_expression for info in infos),
             length=max(info.length for info in infos),
         )

@@ -70,19 +70,20 @@ def cameras_by_paths(traits: Traits) -> Plan | None:
 def few_numbers(traits: Traits) -> Plan | None:
     """Return Gauss-Newton steps if few numbers are unknown, and one is a light's or changes the form of the image; else None.
 
-    Numbers of a BSDF, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses take these steps if
-    derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be combined with other
-    numbers, such as intensities. A light on a plateau takes them too if a better start is found elsewhere.
+    Numbers of a BSDF or medium, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses take these
+    steps if derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be combined
+    with other numbers, such as intensities. A light on a plateau takes them too if a better start is found elsewhere.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
-    nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_bsdfs(traits)
+    nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_scattering(traits)
     shapes = any(not traits.infos[key].light for key in traits.poses)
     mixed = shapes and len(traits.poses) < len(keys)
     if not (nonlinear or traits.lights) or mixed or not traits.newton_suits or not _few(traits, keys):
         return None
     estimator = _estimator(traits, keys, constants.pose_images)
     estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.averaged_values)
-    if _only_bsdfs_and_brightness(traits):
+    media = any(info.scattering == "medium" for info in traits.infos.values())
+    if _only_scattering_and_brightness(traits) and not media:
         estimator = replace(estimator, noise_limit=constants.bsdf_noise_limit, by_channel=True)
     plateau = False
     if traits.poses:
@@ -178,22 +179,22 @@ def _eliminated(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str,
     )
 
 
-def _of_bsdfs(traits: Traits) -> list[str]:
-    """Return the keys of numbers that change the form of a BSDF, on small films; none where path gradients were measured to be as good.
+def _of_scattering(traits: Traits) -> list[str]:
+    """Return the keys of numbers of BSDFs and media, on small films; none where path gradients were measured to be as good.
 
     One number alone is such a case: a roughness ended two to six times as far from the truth (`benchmarks/limit/notes.md`).
     """
-    keys = [key for key, info in traits.infos.items() if info.shapes_bsdf]
+    keys = [key for key, info in traits.infos.items() if info.scattering]
     small = traits.elements > 1 and traits.elements * traits.problem.pixels <= traits.constants.bsdf_pixels
-    measured = traits.problem.loss.linear and _only_bsdfs_and_brightness(traits)
+    measured = traits.problem.loss.linear and _only_scattering_and_brightness(traits)
     return keys if keys and ((small and measured) or traits.unreachable) else []
 
 
-def _only_bsdfs_and_brightness(traits: Traits) -> bool:
-    """Return whether some unknowns shape BSDFs, and all others are colours, opacities, weights of BSDFs, or the brightness of lights."""
+def _only_scattering_and_brightness(traits: Traits) -> bool:
+    """Return whether some unknowns shape BSDFs or media, and all others are colours, opacities, weights, or brightnesses of lights."""
     infos = traits.infos.values()
-    others = all(info.shapes_bsdf or info.lobe or bool(info.brightness) for info in infos)
-    return others and any(info.shapes_bsdf for info in infos)
+    others = all(info.scattering or info.lobe or info.brightness for info in infos)
+    return others and any(info.scattering for info in infos)
 
 
 def _few(traits: Traits, keys: tuple[str, ...]) -> bool:

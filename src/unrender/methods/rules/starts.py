@@ -127,7 +127,7 @@ def _dimensions(problem: Problem, key: str) -> int:
         return 0
     if info.role == "direction":
         return 2 if unknown.shape() == (3,) else 0
-    formed = info.light if info.rigid else info.nonlinear or info.shapes_bsdf
+    formed = info.light if info.rigid else info.nonlinear or info.scattering
     return unknown.initial.size if formed and None not in _range(problem, key) else 0
 
 

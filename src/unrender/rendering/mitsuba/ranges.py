@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import mitsuba as mi
 
@@ -23,7 +23,7 @@ class Range:
         unit: unit of the values; "1" for a dimensionless number, "" for an unknown slot.
         singular: value between `low` and `high` at which images are singular; values stay on one side of it.
         lobe: whether the value decides the probability with which a lobe is sampled. At an end that probability is 0.
-        shapes_bsdf: whether the value changes the form of a BSDF, such as a roughness, and not its colour.
+        scattering: what the value changes the form of: a BSDF, as a roughness does, not a colour, or a medium; "" for neither.
     """
 
     low: float | None = None
@@ -31,7 +31,7 @@ class Range:
     unit: str = "1"
     singular: float | None = None
     lobe: bool = False
-    shapes_bsdf: bool = False
+    scattering: Literal["", "bsdf", "medium"] = ""
 
     def scaled(self, factor: float) -> Range:
         """Return the range of x such that factor · x is in this range."""
@@ -51,8 +51,8 @@ class Range:
         if low is not None and high is not None and low >= high:
             return self
         singular = other.singular if self.singular is None else self.singular
-        lobe, shapes_bsdf = self.lobe or other.lobe, self.shapes_bsdf or other.shapes_bsdf
-        return replace(self, low=low, high=high, singular=singular, lobe=lobe, shapes_bsdf=shapes_bsdf)
+        lobe, scattering = self.lobe or other.lobe, self.scattering or other.scattering
+        return replace(self, low=low, high=high, singular=singular, lobe=lobe, scattering=scattering)
 
 
 UNKNOWN = Range(unit="")
@@ -60,8 +60,8 @@ UNKNOWN = Range(unit="")
 
 _SHARE = Range(0.0, 1.0)
 _LOBE = Range(0.0, 1.0, lobe=True)
-_FORM = Range(0.0, 1.0, shapes_bsdf=True)
-_ROUGHNESS = Range(0.02, 1.0, shapes_bsdf=True)
+_FORM = Range(0.0, 1.0, scattering="bsdf")
+_ROUGHNESS = Range(0.02, 1.0, scattering="bsdf")
 _IOR = Range(0.2, 5.0, "ratio of indices", singular=1.0)
 _COMPLEX_IOR = Range(0.0, None, "index")
 _LENGTH = Range(unit="scene units")
@@ -83,7 +83,7 @@ KINDS: dict[str, dict[str, Range]] = {
             ("metallic", "specular", "anisotropic", "sheen", "clearcoat", "clearcoat_gloss", "flatness"), _FORM
         ),
         **dict.fromkeys(("opacity", "weight"), _LOBE),
-        "spec_trans": replace(_LOBE, shapes_bsdf=True),
+        "spec_trans": replace(_LOBE, scattering="bsdf"),
         **dict.fromkeys(("alpha", "alpha_u", "alpha_v", "roughness"), _ROUGHNESS),
         "eta": _IOR,
         "normalmap": Range(0.0, 1.0, "(direction + 1) / 2"),
@@ -99,11 +99,11 @@ KINDS: dict[str, dict[str, Range]] = {
         "direction": _DIRECTION,
     },
     "Medium": {
-        "sigma_t": Range(0.0, None, "1 / scene unit"),
-        "albedo": _SHARE,
+        "sigma_t": Range(0.0, None, "1 / scene unit", scattering="medium"),
+        "albedo": Range(0.0, 1.0, scattering="medium"),
         "emission": _RADIANCE,
     },
-    "PhaseFunction": {"g": Range(-0.99, 0.99), "weight": _SHARE},
+    "PhaseFunction": {"g": Range(-0.99, 0.99, scattering="medium"), "weight": _SHARE},
     "Sensor": {
         "x_fov": Range(0.1, 179.0, "degrees"),
         "principal_point_offset_x": Range(unit="film widths"),

@@ -331,7 +331,7 @@ class ScenePair:
         """Return `info` with the role, brightness, linearity and file conversion of the parameter."""
         known, limits, described = self.current_parameters, self.physical_range(key), self.description
         form, conversion = is_nonlinear(known, key, info.singular), scene_loading.conversion(known, key, described)
-        info = replace(info, nonlinear=form, lobe=limits.lobe, shapes_bsdf=limits.shapes_bsdf, conversion=conversion)
+        info = replace(info, nonlinear=form, lobe=limits.lobe, scattering=limits.scattering, conversion=conversion)
         return replace(info, role=role(known, key, info.shape), brightness=brightness(known, key))
 
     def _info(self, key: str) -> ParameterInfo:
