@@ -196,6 +196,27 @@ def test_compare_runs_methods_and_then_their_folders(unrender, problem: Path, mi
     assert unrender(*words).error.startswith("unrender: --out both: contains earlier results")
 
 
+def test_compare_takes_equal_steps(unrender, problem: Path, mitsuba_variant: str):
+    words = [
+        "compare",
+        "problem.toml",
+        "--methods",
+        "plain",
+        "--steps",
+        3,
+        "--out",
+        "steps",
+        "--variant",
+        mitsuba_variant,
+    ]
+    answer = unrender(*words, *QUICK)
+    assert answer.status == 0, answer.error
+    record = json.loads((problem.parent / "steps" / "plain-seed0" / "run.json").read_text())
+    assert (record["stopped"], record["steps"]) == ("steps", 3)
+    refused = unrender("compare", "steps", "--steps", 3)
+    assert "--steps does not apply to run folders" in refused.error
+
+
 def test_ctrl_c_keeps_what_was_reached(problem: Path, mitsuba_variant: str):
     source = Path(package.__file__).parents[1]
     command = [

@@ -101,7 +101,11 @@ def test_gradients_of_luminance_are_those_of_the_weighted_channels() -> None:
 @pytest.mark.parametrize(
     ("pixel_format", "shape", "words"),
     [
-        ("rgb", (6, 6, 2), r"expected an array of shape \(H, W, 3\), got \(6, 6, 2\)"),
+        (
+            "rgb",
+            (6, 6, 2),
+            r"shape \(H, W, 3\) with red, green and blue, or \(H, W\) with one value per pixel, got \(6, 6, 2\)",
+        ),
         ("rgb", (6, 6, 5), r"got \(6, 6, 5\)"),
         ("rgba", (6, 6, 7), r"got \(6, 6, 7\)"),
         ("xyz", (6, 6, 1), r"expected an array of shape \(H, W, 3\), got \(6, 6, 1\): the film's pixel_format is xyz"),

@@ -330,7 +330,10 @@ BAD_VIEWS = [
     (View(REFERENCE, weight=0.0), r"weight: expected a number above 0, got 0.0"),
     (View(REFERENCE, weight=float("inf")), r"weight: expected a number above 0, got inf"),
     (View(REFERENCE[:3]), r"view 0: reference: 5x3 pixels \(width x height\), but the sensor's film is 5x4"),
-    (View(np.zeros((HEIGHT, WIDTH, 2))), r"reference: expected an array of shape \(H, W, 3\), got \(4, 5, 2\)"),
+    (
+        View(np.zeros((HEIGHT, WIDTH, 2))),
+        r"reference: expected an array of shape \(H, W, 3\) with red, green and blue, or .*, got \(4, 5, 2\)",
+    ),
     (View(np.zeros((0, WIDTH, 3))), r"reference: expected an array of shape \(H, W, 3\)"),
     (View(nan_at(2, 3)), r"reference: 1 pixels are NaN or infinite, the first in row 2, column 3"),
     (View(np.full((HEIGHT, WIDTH, 3), "a")), r"reference: expected an array of numbers"),

@@ -138,6 +138,23 @@ def test_what_weakens_a_comparison_is_said(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("method", "told"),
+    [("plain", ["max_depth was 6, is 4", "parameter x: initial has changed"]), ("rcv", ["max_depth"])],
+)
+def test_differences_of_two_problems_are_named(tmp_path: Path, method: str, told: list[str]):
+    """A method may change the start of an unknown, so that only counts for one method."""
+    parts = [
+        {"max_depth": depth, "parameter x: initial": f"sha256:{depth}", "estimator": depth} for depth in ("6", "4")
+    ]
+    of = [{"parameters": [KEY], "views": 1, "loss": "L2()", "max_depth": 6, "fingerprint": part} for part in parts]
+    runs = [write_run(tmp_path / "a", "plain", problem=of[0]), write_run(tmp_path / "b", method, 1, problem=of[1])]
+    (line,) = (line for line in compared(tmp_path, runs)["notices"] if "another problem" in line)
+    assert line.startswith("b is of another problem than a: max_depth was 6, is 4")
+    assert all(part in line for part in told)
+    assert line.count(";") == len(told) - 1
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"truth": {"other.data": np.zeros((4, 5, 3))}}, "only one of them recovers"),

@@ -239,7 +239,9 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
     if array.ndim == 2:
         array = array[..., None]
     if array.ndim != 3 or array.shape[2] not in channels or 0 in array.shape:
-        kind = "(H, W, 3)" if 3 in channels else "(H, W) or (H, W, 1)"
+        kind = "(H, W) or (H, W, 1)" if 3 not in channels else "(H, W, 3)"
+        if {1, 3} <= {*channels}:
+            kind += " with red, green and blue, or (H, W) with one value per pixel"
         raise InputError(f"expected an array of shape {kind}, got {array.shape}")
     values = array[..., : 1 if array.shape[2] == 2 else 3]
     if array.dtype in (np.uint8, np.uint16):

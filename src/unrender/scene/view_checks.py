@@ -87,6 +87,10 @@ def read_reference(source: Any, form: PictureFormat) -> Reference:
             "it has three channels and the film's pixel_format is luminance; use an image of one channel, or the pixel_format rgb"
         )
     xyz = form.colour == "xyz"
+    if xyz and values.shape[2] == 1 and not image.notice:
+        raise InputError(
+            "it has one channel, but the film's pixel_format is xyz; use an image of X, Y and Z, or the pixel_format luminance"
+        )
     if xyz and not (image.notice or image.labelled_xyz or _is_of_film(source)):
         raise InputError(
             "the file names its channels R, G and B, but the film's pixel_format is xyz, so either may be meant; "

@@ -48,8 +48,10 @@ _MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
 
 _Seconds = Annotated[
-    float | None, typer.Option(help="Time for each run, with compilation and final pictures. [default: 20]")
+    float | None,
+    typer.Option(help="Time for each run, with compilation and final pictures. [default: 20 without --steps]"),
 ]
+_Steps = Annotated[int | None, typer.Option(help="Steps of each run.")]
 _Methods = Annotated[
     str | None,
     typer.Option(metavar="NAME,NAME", help="The first is the reference of the others. [default: stock,auto]"),
@@ -69,6 +71,7 @@ def compare(
         ),
     ] = None,
     seconds: _Seconds = None,
+    steps: _Steps = None,
     seeds: Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each method.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="The first run's seed.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: a new folder in out/.")] = None,
@@ -81,11 +84,11 @@ def compare(
     no_cache: NoCache = False,
     allow_outside: AllowOutside = False,
 ) -> None:
-    """Compare methods at equal time on one problem, or compare earlier runs.
+    """Compare methods at equal time or steps on one problem, or compare earlier runs.
 
-    Every run has the same time, as in `unrender run`. With workers, several runs are concurrent, each with its share of the machine.
+    Every run has the same budget, as in `unrender run`. With workers, several runs are concurrent, each with its share of the machine.
     """
-    arguments.budget(None, seconds)
+    steps, seconds = arguments.budget(steps, DEFAULT_SECONDS if seconds is None and steps is None else seconds)
     from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
@@ -99,13 +102,12 @@ def compare(
     with Progress(console) as progress:
         chosen, settings_ = _methods_and_settings(methods, typed)
         arguments.check_problem(what[0], options, not no_cache)
-        _, seconds = arguments.budget(None, DEFAULT_SECONDS if seconds is None else seconds)
         folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
         try:
             command = arguments.command_line(context)
             job = _job(what[0], options, not no_cache, command, folder)
             turns = itertools.product(range(seed, seed + seeds), chosen)  # a slow machine affects all methods
-            runs = [_run_task(method.name, settings_[method.name], seconds, n, final_spp) for n, method in turns]
+            runs = [_run_task(method.name, settings_[method.name], steps, seconds, n, final_spp) for n, method in turns]
             with _prepared(console, job, runs, variant, where) as comparison:
                 directories, status = _run_all(console, comparison, progress)
         finally:
@@ -123,11 +125,11 @@ def _job(problem: str, options: Mapping[str, str], cached: bool, command: str, f
 
 
 def _run_task(
-    method: str, settings: Mapping[str, str], seconds: float | None, seed: int, final_spp: int | None
+    method: str, settings: Mapping[str, str], steps: int | None, seconds: float | None, seed: int, final_spp: int | None
 ) -> RunTask:
     from unrender.app.cli.tasks import RunTask
 
-    return RunTask(f"{method}-seed{seed}", method, settings, None, seconds, seed, final_spp)
+    return RunTask(f"{method}-seed{seed}", method, settings, steps, seconds, seed, final_spp)
 
 
 @contextlib.contextmanager
@@ -233,11 +235,16 @@ def _here(console: Console, comparison: _Comparison, progress: Progress) -> list
 
     outcomes: list[RunOutcome] = []
     for run in comparison.runs:
-        console.print(f"[bold]{run.method}[/], seed {run.seed}, {run.seconds:g} s")
+        console.print(f"[bold]{run.method}[/], seed {run.seed}, {_budget(run)}")
         outcomes.append(tasks.carry_out(comparison.job, run, comparison.problem, console, progress))
         if outcomes[-1].status == "interrupted":
             break
     return outcomes
+
+
+def _budget(run: RunTask) -> str:
+    limits = (("steps", run.steps), ("s", run.seconds))
+    return ", ".join(f"{limit:g} {unit}" for unit, limit in limits if limit is not None)
 
 
 def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:

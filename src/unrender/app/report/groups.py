@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import printable
 from unrender.runs.folder.reader import RunFolder
 from unrender.runs.folder.schema import DOUBTFUL
+from unrender.scene.fingerprint import differences, shortened
 
 _NOT_THE_METHOD = {"seed", "seconds", "steps", "out", "run_directory"}
 _TOLERANCE = 0.01
@@ -92,9 +93,9 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
     }.items():
         if len(set(values)) > 1:
             notices.append(f"These runs have different {what}.")
+    notices += filter(None, (_changes(first, run) for run in runs[1:]))
     for of in group(runs):
-        seeds = [run.record.seed for run in of.runs]
-        if len(set(seeds)) < len(seeds):
+        if len({run.record.seed for run in of.runs}) < len(of.runs):
             notices.append(f"{of.label}: some runs share a seed, so the spread over the runs is too small.")
     if first.record.method == "stock" and len({run.record.method for run in runs}) > 1 and _default_rate(first):
         notices.append("stock ran with its default learning rate, not tuned: ratios and times are relative to that.")
@@ -117,6 +118,19 @@ def _default_rate(run: RunFolder) -> bool:
         and rate in options
         and options[rate] == method(run.record.method).options_of({})[rate]
     )
+
+
+def _changes(first: RunFolder, other: RunFolder) -> str:
+    """Return a line with the differences of two runs' problems, see `fingerprint.differences`; "" for none.
+
+    Starts and settings of unknowns count only for runs of one method, because a method changes them.
+    """
+    records = first.record, other.record
+    before, now = (record.problem.fingerprint or {} for record in records)
+    ignored = ("estimator", "optimizer", *(() if records[0].method == records[1].method else ("parameter ",)))
+    parts = ({part: x for part, x in of.items() if not part.startswith(ignored)} for of in (before, now))
+    changes = differences(*parts) if before and now else []
+    return f"{other.path.name} is of another problem than {first.path.name}: {shortened(changes)}." if changes else ""
 
 
 def _relative_difference(a: np.ndarray, b: np.ndarray) -> float:
