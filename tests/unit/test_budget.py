@@ -12,7 +12,9 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
+from unrender.estimators.gauss_newton import GaussNewton
 from unrender.methods.plan import Plan
+from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.protocols import Callback
 from unrender.runs import budget, loop
 from unrender.runs.folder.history import thinned
@@ -93,6 +95,18 @@ def test_advice_on_few_steps_suits_the_run() -> None:
     assert budget.few_steps(4.0, 3, spp=2).endswith("; use more seconds or a smaller picture (resolution)")
     assert not budget.few_steps(4.0, 20, spp=16)
     assert "; use at least 13 seconds or a smaller picture" in budget.few_steps(4.0, 3, enough=12.1)
+
+
+@pytest.mark.parametrize(
+    ("newton", "clock", "told"), [(False, 3.0, "at least 20"), (True, 3.0, ""), (True, 6.0, "at least 16")]
+)
+def test_gauss_newton_steps_need_fewer(newton: bool, clock: float, told: str) -> None:
+    """20 of them were asked for, which take minutes, where a few converge."""
+    parts: Any = (GaussNewton(), AveragedNewton()) if newton else (ur.PathGradient(), ur.optimizers.Adam(0.1))
+    run = loop.prepare(Plan(problem(), *parts), None, 10.0, 0)
+    run.step, run.clock = 3, clock
+    budget._warn_of_few_steps(run)
+    assert [f"use {told} seconds" in line for line in run.warnings] == [True] * bool(told)
 
 
 def test_a_budget_of_few_steps_is_told_after_the_first() -> None:

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 from unrender.backend import cache
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
+from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs.callbacks import Callback
 from unrender.runs.result import NON_FINITE
+from unrender.runs.truth_check import FEW_NEWTON_STEPS
 
 if TYPE_CHECKING:
     from unrender.runs.run import Run
@@ -108,16 +110,17 @@ def _warn_of_few_steps(run: Run) -> None:
     if run.seconds is None or run.clock <= 0.0:
         return
     expected = 0 if run.stopped else int(run.allowed_seconds() * run.step / run.clock)
+    needed = FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else _FEW_STEPS
     spp, large = getattr(run.estimator, "spp", None), run.problem.pixels > _FEW_PIXELS
     spp, steps = spp if isinstance(spp, int) else None, max(expected, run.step)
-    line = few_steps(run.seconds, steps, run.steps, spp, large, _enough(run))
+    line = few_steps(run.seconds, steps, run.steps, spp, large, _enough(run, needed), needed)
     run.warnings[:] = [known for known in run.warnings if known != run.few_steps] + [line] * bool(line)
     run.few_steps = line
 
 
-def _enough(run: Run) -> float:
-    """Return the seconds that 20 steps need, with everything before and after the steps if the budget covers it."""
-    steps = _FEW_STEPS * run.clock / run.step
+def _enough(run: Run, needed: int) -> float:
+    """Return the seconds that `needed` steps need, with everything before and after the steps if the budget covers it."""
+    steps = needed * run.clock / run.step
     if run.deadline is None or run.seconds is None:
         return steps
     before = max(time.perf_counter() - (run.deadline - run.seconds) - run.clock, 0.0)
@@ -131,17 +134,19 @@ def few_steps(
     spp: int | None = None,
     large: bool = False,
     enough: float | None = None,
+    needed: int = _FEW_STEPS,
 ) -> str:
-    """Return a line with advice if a budget allows fewer than 20 steps and fewer than `most`; else "".
+    """Return a line with advice if a budget allows fewer than `needed` steps and fewer than `most`; else "".
 
     Args:
         seconds, steps, most: the budget, the steps that it allows, and the steps that were requested.
         spp: samples per pixel of a step, of which it advises a quarter, at least 2, since gradients without bias need two groups of
             samples; None if unknown.
         large: whether the views have more pixels than the number that it advises per step.
-        enough: seconds that 20 steps need; None if unknown.
+        enough: seconds that the needed steps need; None if unknown.
+        needed: number of steps; Gauss-Newton steps of all unknowns need fewer.
     """
-    if steps >= min(_FEW_STEPS, most or _FEW_STEPS):
+    if steps >= min(needed, most or needed):
         return ""
     ways = ["use more seconds" if enough is None else f"use at least {max(math.ceil(enough), 1)} seconds"]
     if spp is not None and spp > _LEAST_SPP:
