@@ -67,6 +67,19 @@ def test_several_shapes_under_an_even_sky(tmp_path: Path) -> None:
     assert len(found.notices) == 4
 
 
+@pytest.mark.parametrize(("kind", "roughness"), [("plastic", 0.0), ("roughplastic", 0.5)])
+def test_a_plastic_keeps_its_texture(kind: str, roughness: float, tmp_path: Path) -> None:
+    """Mitsuba's α is the square of the roughness."""
+    alpha = '<float name="alpha" value="0.25"/>' if roughness else ""
+    bsdf = f'<bsdf type="{kind}">{textured("diffuse_reflectance")}<float name="int_ior" value="1.6"/>{alpha}</bsdf>'
+    found = read(tmp_path, shape(bsdf))
+    (part,) = found.parts
+    np.testing.assert_allclose(part.material.base_colour.ravel(), np.linspace(0, 1, 96), atol=1e-6)
+    assert float(part.material.roughness) == pytest.approx(roughness)
+    assert (float(part.material.metallic), part.material.ior) == (0.0, pytest.approx(1.6 / 1.000277, rel=1e-4))
+    assert any("becomes a dielectric with its diffuse reflectance as base colour" in line for line in found.notices)
+
+
 def test_a_normal_map_is_found_in_and_under_other_materials(tmp_path: Path) -> None:
     """Whichever wraps the other."""
     for inner in ("diffuse", "principled"):

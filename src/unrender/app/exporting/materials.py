@@ -22,7 +22,12 @@ MOST_TEXELS = 8192
 _WRAPPERS = {"TwoSidedBRDF": "brdf_0.", "NormalMap": "nested_bsdf."}
 _LEFT_OUT = ("anisotropic", "sheen", "clearcoat", "spec_trans", "spec_tint", "flatness")
 _GREY = 0.5
-_DIFFUSE = "SmoothDiffuse"
+_DIFFUSE, _PLASTICS = "SmoothDiffuse", ("SmoothPlastic", "RoughPlastic")
+_NAMES = {
+    _DIFFUSE: {"base_colour": "reflectance"},
+    **{kind: {"base_colour": "diffuse_reflectance"} for kind in _PLASTICS},
+}
+"""{class: {attribute of `Material`: slot of the BSDF}}, other than those of `principled`."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,8 @@ class Material:
 def read_material(bsdf: Any) -> tuple[Material, list[str]]:
     """Return the material of a live BSDF, and a line for each property that is not exported.
 
-    Materials other than `principled` and `diffuse` become grey.
+    Of `plastic` and `roughplastic` the diffuse reflectance, α and the index of refraction are exported. Materials other than these,
+    `principled` and `diffuse` become grey.
 
     Raises:
         InputError: a map is too large, or maps have different `to_uv`.
@@ -76,29 +82,39 @@ def read_material(bsdf: Any) -> tuple[Material, list[str]]:
     if any(key.startswith("brdf_1.") for key in values.keys()):  # noqa: SIM118
         notes.append("the material of its back is not carried over")
     two_sided = "TwoSidedBRDF" in kinds
-    if kind not in ("Principled", _DIFFUSE):
+    if kind not in ("Principled", _DIFFUSE, *_PLASTICS):
         notes.append(f"a {kind} is not carried over: grey in its place")
         grey = Material(np.full(3, _GREY), np.array(1.0), np.array(0.0), None, 1.0, two_sided)
         return grey, notes
-    names = {"base_colour": "reflectance"} if kind == _DIFFUSE else _PRINCIPLED
+    names = _NAMES.get(kind, _PRINCIPLED)
     maps |= {ours: f"{prefix}{theirs}" for ours, theirs in names.items()}
     values_by_name = {ours: _value(values, key, notes) for ours, key in maps.items()}
     to_uv = _to_uv(values, maps.values())
     if kind == "Principled":
         left_out = [name for name in _LEFT_OUT if _is_used(values, f"{prefix}{name}")]
         notes += [f"{', '.join(left_out)}: not carried over"] if left_out else []
+    if kind in _PLASTICS:
+        notes.append(f"a {kind} becomes a dielectric with its diffuse reflectance as base colour")
     normal = values_by_name.get("normal_map")
     if normal is not None and normal.ndim != 3:
         normal = None
     return Material(
         _colour(values_by_name["base_colour"], _GREY, notes),
-        _number(values_by_name.get("roughness"), 1.0 if kind == _DIFFUSE else 0.5),
+        _roughness(values, prefix)
+        if kind in _PLASTICS
+        else _number(values_by_name.get("roughness"), 1.0 if kind == _DIFFUSE else 0.5),
         _number(values_by_name.get("metallic"), 0.0),
         None if normal is None else np.clip(normal, 0, 1),
         1.0 if kind == _DIFFUSE else _ior(values, prefix),
         two_sided,
         to_uv,
     ), notes
+
+
+def _roughness(values: Any, prefix: str) -> np.ndarray:
+    """Return the roughness of a plastic: √α, 0 without α."""
+    key = f"{prefix}alpha"
+    return np.array(math.sqrt(min(float(np.array(values[key]).ravel()[0]), 1.0)) if key in values else 0.0)
 
 
 _PRINCIPLED = {"base_colour": "base_color", "roughness": "roughness", "metallic": "metallic"}
