@@ -93,6 +93,18 @@ def test_on_a_plateau_poses_take_steps_by_a_smoothed_loss() -> None:
     assert chosen == {"near": "GaussNewton", "far": "SmoothedDerivatives"}
 
 
+def test_a_number_without_a_path_gradient_takes_gauss_newton_steps() -> None:
+    """Sixty steps by a smoothed loss took the weight of a blendphase away from the truth."""
+    phase = {"type": "blendphase", "weight": 0.5, "a": {"type": "hg", "g": 0.7}, "b": {"type": "isotropic"}}
+    fog = {"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.9, "phase": phase}
+    box = {"type": "cube", "bsdf": {"type": "null"}, "interior": fog}
+    scene = {"type": "scene", "cam": camera("perspective", [0, 1, 5]), "box": box, "sky": {"type": "constant"}}
+    reference = np.full((SIZE, SIZE, 3), 0.5, np.float32)
+    unknown = [ur.Parameter("box.interior_medium.phase_function.weight.value.value")]
+    plan = method("auto").plan(ur.Problem(scene, unknown, [ur.View(reference)], max_depth=3))
+    assert isinstance(plan.estimator, ur.GaussNewton)
+
+
 @pytest.mark.slow
 def test_the_pose_and_the_lens_of_a_camera_take_gauss_newton_steps_together() -> None:
     made, _, _, _ = lens()

@@ -72,10 +72,12 @@ def few_numbers(traits: Traits) -> Plan | None:
 
     Numbers of a BSDF or medium, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses take these
     steps if derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be combined
-    with other numbers, such as intensities. A light on a plateau takes them too if a better start is found elsewhere.
+    with other numbers, such as intensities. A light on a plateau takes them too if a better start is found elsewhere. So does any number
+    without a path gradient, since a smoothed loss is far noisier.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_scattering(traits)
+    nonlinear = nonlinear or [key for key, info in traits.infos.items() if not info.differentiable]
     shapes = any(not traits.infos[key].light for key in traits.poses)
     mixed = shapes and len(traits.poses) < len(keys)
     if not (nonlinear or traits.lights) or mixed or not traits.newton_suits or not _few(traits, keys):
