@@ -39,17 +39,24 @@ class Paths:
     keys: tuple[str, ...] = ()
 
 
+_MOST_PENDING = 64
+"""Maximum number of launches with unread counts, since each reading waits for all launches before it."""
+_PENDING_SHARE = 8
+"""At most one of so many launches has an unread count, so that short runs report their dropped samples, too."""
+
+
 class DroppedSamples:
     """Samples whose radiance is not finite. They contribute nothing to an image or a gradient, and are counted.
 
     Args:
-        at_once: read each count immediately. Otherwise it is read after the next launch, so that no launch waits for it.
+        at_once: read each count immediately. Otherwise counts of several launches are read together, so that launches overlap.
     """
 
     def __init__(self, at_once: bool) -> None:
         self._report = DropReport()
         self._at_once = at_once
         self._pending: list[tuple[Any, int]] = []
+        self._launches = 0
 
     @property
     def count(self) -> int:
@@ -59,7 +66,9 @@ class DroppedSamples:
 
     def develop(self, radiance: Any, spp: int, groups: int, shape: tuple[int, ...]) -> mi.TensorXf:
         """Return the image that `film.develop` makes of the finite samples, and count the dropped ones."""
-        self.read()
+        self._launches += 1
+        if len(self._pending) > min(_MOST_PENDING, self._launches // _PENDING_SHARE):
+            self.read()
         samples = film_samples(radiance)
         finite, lanes = is_finite(samples), dr.width(samples)
         finite_radiance = mi.Color3f(dr.select(finite, samples, 0))

@@ -269,7 +269,6 @@ class MitsubaSession:
             return gradient, self._gradients(request, weights_previous, previous=True)
         states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
         self.kernel(AdjointPairPass(), request)(*states)
-        self.dropped.read()
         return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
 
     def tangent_moment(
@@ -325,9 +324,7 @@ class MitsubaSession:
         for term in (self._boundary, self._camera):
             if term is not None:
                 term.accumulate(scene, request, weights)
-        gradients = scene.take_gradients()
-        self.dropped.read()
-        return gradients
+        return scene.take_gradients()
 
     # ------------------------------------------------------------------ launches
 

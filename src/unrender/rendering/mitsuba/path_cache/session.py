@@ -166,7 +166,6 @@ class CachingSession(SessionWrapper):
         function = self._function(("backward", tuple(replay), spp, pixels, request.groups), backward)
         states = [self._objects_of(state) for state in replay]
         function(self._pair.clear_gradients, paths.vertices, states, list(replay.values()))
-        self.dropped.read()
 
     def _function(self, kind: tuple[Any, ...], traced: Any) -> FrozenFunction:
         # Each resolution of a texture needs its own recording, as in `MitsubaSession.run`.
