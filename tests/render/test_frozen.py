@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import weakref
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -16,6 +17,7 @@ import pytest
 
 from unrender.rendering.mitsuba import frozen
 from unrender.rendering.mitsuba.frozen import FrozenFunction
+from unrender.rendering.mitsuba.recordable import shapes_are_recordable
 
 
 @pytest.fixture
@@ -231,3 +233,19 @@ def test_later_steps_replay_what_two_have_recorded() -> None:
         functions = [*session._functions.values(), *session._inner._functions.values()]
         recordings.append(sum(getattr(once._frozen, "n_recordings", 0) for once in functions))
     assert recordings[1:] == recordings[1:2] * 5
+
+
+@pytest.mark.parametrize("kind", ["bsplinecurve", "linearcurve"])
+@pytest.mark.parametrize("grouped", [False, True])
+def test_kernels_that_hit_curves_are_not_recorded(kind: str, grouped: bool, tmp_path: Path) -> None:
+    """Four of five runs of Gauss-Newton steps on the roughness of hair ended in a segmentation fault."""
+    (tmp_path / "curve.txt").write_text("".join(f"{x} 0 0 0.1\n" for x in range(5)))
+    shape = {"type": kind, "filename": str(tmp_path / "curve.txt"), "bsdf": {"type": "diffuse"}}
+    scene: dict[str, Any] = {"type": "scene", "camera": {"type": "perspective"}, "sky": {"type": "constant"}}
+    if grouped:
+        scene |= {"group": {"type": "shapegroup", "shape": shape}}
+        scene |= {"placed": {"type": "instance", "group": {"type": "ref", "id": "group"}}}
+    else:
+        scene["shape"] = shape
+    assert not shapes_are_recordable(mi.load_dict(scene))
+    assert shapes_are_recordable(mi.load_dict({"type": "scene", "ball": {"type": "sphere"}}))

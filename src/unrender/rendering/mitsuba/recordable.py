@@ -1,4 +1,4 @@
-"""Sensors that a recorded kernel supports, and emitters that must be prepared for it.
+"""Sensors and shapes that a recorded kernel supports, and emitters that must be prepared for it.
 
 A recording captures an object's state through the members that its plugin declares to Dr.Jit. Mitsuba's thin lens, orthographic and
 batch sensors do not declare all of theirs, so Dr.Jit refuses to record a kernel that samples their rays.
@@ -13,10 +13,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from unrender.rendering.mitsuba.scene_graph import all_shapes
 from unrender.rendering.renderer import SampleRequest
 
 _COMPLETE = frozenset({"PerspectiveCamera", "DistantSensor", "DistantSensorImpl", "RadianceMeter", "IrradianceMeter"})
 """Sensor classes that declare all members in Mitsuba 3.9."""
+_CURVES = frozenset({"BSplineCurve", "LinearCurve"})
+"""Classes of curves."""
 _MANY = 3
 """Number of sensors from which on a scene's sensors share recordings."""
 _LONGEST_GAP = 32
@@ -31,6 +34,14 @@ def are_recordable(sensor: Any, several: bool) -> bool:
     """
     sensors = _registered(mi.SensorPtr) if several else [sensor]  # pyright: ignore[reportAttributeAccessIssue]
     return all(each.class_name() in _COMPLETE for each in sensors)
+
+
+def shapes_are_recordable(scene: Any) -> bool:
+    """Return whether a recording supports all shapes of a `mitsuba.Scene`, those of shape groups included.
+
+    Replays of kernels that hit curves may read memory out of bounds, and end the process with a segmentation fault.
+    """
+    return not any(shape.class_name() in _CURVES for shape in all_shapes(scene))
 
 
 def for_every_sensor(request: SampleRequest, sensors: Sequence[mi.Sensor], count: int) -> SampleRequest:

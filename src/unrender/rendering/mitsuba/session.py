@@ -41,7 +41,7 @@ from unrender.rendering.mitsuba.passes import (
     VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
-from unrender.rendering.mitsuba.recordable import are_recordable, for_every_sensor
+from unrender.rendering.mitsuba.recordable import are_recordable, for_every_sensor, shapes_are_recordable
 from unrender.rendering.mitsuba.rendered_paths import DroppedSamples, Paths
 from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_graph import has_instances
@@ -127,7 +127,7 @@ class MitsubaSession:
         self._light, self._sampler = paths, sampler
         self._traits = [trait for key, trait in traits.items() if key in derivatives]
         # A recording does not capture the parameters of a phase function, and its replay gives no gradient by them.
-        self._recordable = not any(trait.phase for trait in traits.values())
+        self._recordable = not any(trait.phase for trait in traits.values()) and shapes_are_recordable(pair.current)
         self._delta_table = pair.delta_table(self._traits)
         served = [key for key in keys if key in derivatives] if differential_bsdf and derivatives else None
         self._rough = RoughLobes(pair, served, self._geometric)
