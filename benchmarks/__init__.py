@@ -8,3 +8,7 @@ A benchmark is a folder with two files:
 
 `benchmarks.runner` does everything else; the other modules here are measurements that several benchmarks share.
 """
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # threads that wait for one another count as the processor's time

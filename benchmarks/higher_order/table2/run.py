@@ -5,10 +5,10 @@ Mitsuba's projective integrator, and TEXTURE); FR22, the smoothed gradient of Fi
 CMA-ES; L-BFGS on the aggregate gradient; and the paper's: the gradient (OurG) with Adam, the Hessian (OurH) with
 Newton's method, Hessian-vector products element by element (OurHVP) and from the aggregate (OurHVPA) with Newton-CG;
 and, beyond the paper, gradient and products from the same renders (OurJoint), Gauss-Newton by differences of renders
-(OurGN), and on TEXTURE `auto`, which has path gradients as the stock loop has. The others render their perturbations by
-the same launches, with antithetic draws and shared random numbers, and shrink σ as they go. Each but `auto` is tuned on
-each task over a grid (`methods.py`), on starts of its own, for the mean logarithm of its times; then the runs of all
-methods are done in turns.
+(OurGN), and `auto`, which has path gradients on TEXTURE and QUAD, and on the others the method `smoothed`. The others
+render their perturbations by the same launches, with antithetic draws and shared random numbers, and shrink σ as they
+go. Each but `auto` is tuned on each task over a grid (`methods.py`), on starts of its own, for the mean logarithm of its
+times; then the runs of all methods are done in turns.
 """
 
 from __future__ import annotations
@@ -25,20 +25,17 @@ import numpy as np
 import unrender as ur
 from benchmarks import figures, markdown
 from benchmarks.higher_order.table2 import published
-from benchmarks.higher_order.table2.descents import GOALS, Descent, descend, numbers
+from benchmarks.higher_order.table2.descents import Descent, descend, numbers
 from benchmarks.higher_order.table2.methods import LEFT_OUT, METHODS, Config, configurations
 from benchmarks.higher_order.table2.mitsuba_baseline import MITSUBA, mitsuba
 from benchmarks.higher_order.table2.tasks import TASKS, Task, begin
 from benchmarks.internals import dr
-from benchmarks.races import first_at
 from benchmarks.runner.records import Record, command, read
 
 TUNING = 3
 """Starts that a method is tuned on, numbered from 1000; TEXTURE, whose runs are all alike, takes one."""
 _NEVER = 10.0
 """A goal that is not met counts as this many times the budget when methods are tuned."""
-AUTO = ("TEXTURE",)
-"""Where `auto` takes path gradients, as Mitsuba's loop does."""
 ALL_METHODS = ("Mitsuba", *METHODS, "auto", *published.METHODS)
 MERGE = ("tasks.*.methods",)
 QUICK = {"task": ("MUG",), "method": ("FR22", "OurJoint"), "runs": 2, "resolution": 8, "seconds": 0.02}
@@ -95,8 +92,7 @@ def race(name: str, task: Task, runs: int, chosen: tuple[str, ...], known: dict[
     """One task: every method of `chosen` that applies, tuned or as it is `known`, over the runs, in turns."""
     problem = task.problem()
     applies = {m for m in METHODS if (name, m) not in LEFT_OUT} | ({"Mitsuba"} if name in MITSUBA else set())
-    applies |= {"auto"} if name in AUTO else set()
-    applies |= set(published.METHODS) if name in published.SETTINGS else set()
+    applies |= {"auto"} | (set(published.METHODS) if name in published.SETTINGS else set())
     found: dict[str, Any] = {}
     for method in (method for method in ALL_METHODS if method in applies and method in chosen):
         config, tried = known[method] if method in known else tune(name, task, method, problem)
@@ -177,15 +173,13 @@ def table(record: Record) -> str:
         there = " / ".join(map(str, np.isfinite(found)[:, 3:].sum(axis=0))) + f" of {len(found)}"
         cells = (f"{time:.3g}" if math.isfinite(time) else "—" for time in median_times(found))
         rows.append([entry["task"], entry["method"], *cells, there])
-        if _applies(entry, "squared", mean_times):
+        if "squared" in entry["runs"][0]:
             found = _times(entry, "squared")
             pairs = zip(mean_times(found), np.isfinite(found).sum(axis=0), strict=True)
             cells = (f"{time:.3g} ({count})" if count else "—" for time, count in pairs)
             papers.append([entry["task"], entry["method"], *cells, len(found)])
     commands = dict.fromkeys(entry["command"] for entry in entries if "command" in entry)
-    text = (
-        "Random starts, {resolution}²; median seconds of the processor, — where half the runs or more never got there."
-    )
+    text = "Random starts, {resolution}²; median seconds of the processor, — where half the runs never got there."
     return markdown.blocks(
         text.format(**record["settings"]),
         markdown.table(f"task | method | {_HEAD} | runs that got there", rows),
@@ -205,11 +199,7 @@ def table(record: Record) -> str:
 
 
 def _times(entry: dict[str, Any], which: str) -> np.ndarray:
-    """Return the seconds of each run to the goals of the image and of the parameters, (runs, 6), inf where they were not reached; of
-    runs without the paper's goals those of their median curves, (1, 6)."""
-    if which not in entry["runs"][0]:
-        roots = {"image": GOALS, "parameter": np.sqrt(GOALS)}
-        return np.array([[first_at(entry["curves"][kind], goal) for kind, goals in roots.items() for goal in goals]])
+    """Return the seconds of each run to the goals of the image and of the parameters, (runs, 6), inf where they were not reached."""
     return np.array([[*run["image"], *run[which]] for run in entry["runs"]], float)
 
 
@@ -231,9 +221,11 @@ def _ratio_table(tasks: dict[str, Any], which: str, statistic: Statistic, resamp
     """Return a row per pair of methods: the mean ratio on each task and of all, with standard errors by a bootstrap over runs."""
     rows = []
     for name, sides in _PAIRS.items():
+        if statistic is mean_times and len(sides[1]) > 1:
+            continue  # whoever fails most would be the fastest
         cells, every, errors = [], [], []
         for methods in (task["methods"] for task in tasks.values()):
-            known = ([m for n, m in methods.items() if n in side and _applies(m, which, statistic)] for side in sides)
+            known = ([m for n, m in methods.items() if n in side and which in m["runs"][0]] for side in sides)
             times = [[_times(method, which) for method in side] for side in known]
             ratios = _ratios(times, statistic).compressed().tolist() if all(times) else []
             if not ratios:
@@ -252,14 +244,8 @@ def _ratio_table(tasks: dict[str, Any], which: str, statistic: Statistic, resamp
 
 
 def _spread(ratios: Any) -> str:
-    """Write the standard error of the mean ratio from resamples (B, n); nothing where all are alike, those of median curves."""
-    error = ratios.mean(axis=-1).std()
-    return f" ± {error:.2f}" if error > 1e-9 else ""
-
-
-def _applies(method: dict[str, Any], which: str, statistic: Statistic) -> bool:
-    """Return whether a method has times of single runs, or a median curve will do."""
-    return which in method["runs"][0] or statistic is median_times
+    """Write the standard error of the mean ratio from resamples (B, n)."""
+    return f" ± {ratios.mean(axis=-1).std():.2f}"
 
 
 def _ratios(times: list[list[np.ndarray]], statistic: Statistic) -> Any:
