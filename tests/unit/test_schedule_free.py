@@ -77,8 +77,11 @@ def test_the_rate_of_a_constant_gradient_stays_or_grows():
         states[1].of(Iterates).fast["x"][1] - states[0].of(Iterates).fast["x"][1],
     ]
     np.testing.assert_allclose(rises, [0.05, 0.1], rtol=1e-9)
-    _, states = descend(ScheduleFree(0.1, growth=0.2), np.zeros(3), along, 30)
-    assert states[-1].of(Agreement).log_rate["x"] == pytest.approx(29 * 0.2 * (1 - 2 / math.sqrt(27)))
+    _, states = descend(ScheduleFree(0.1, growth=0.1), np.zeros(3), along, 12)
+    expected = sum(0.1 * (1 - 2 * 0.8**step / math.sqrt(27)) for step in range(1, 12))
+    assert states[-1].of(Agreement).log_rate["x"] == pytest.approx(expected)
+    _, states = descend(ScheduleFree(0.1), np.zeros(1), lambda step, x: np.ones(1), 24)
+    assert states[-1].of(Agreement).factors["x"] > 3.0  # a single number's, too
 
 
 def test_the_rate_grows_no_further_than_the_parameter():
@@ -100,18 +103,18 @@ def test_steps_that_gradients_contradict_become_shorter():
 
 
 def test_single_numbers_that_agree_by_chance_do_not_speed_up(monkeypatch: pytest.MonkeyPatch):
-    """The gradients of forty numbers are noise: without the standard error of their correlation most rates grow, with it hardly any."""
+    """The gradients of forty numbers are noise: without the standard error of their correlation many rates grow by half, with it hardly any."""
 
     def grown() -> int:
         found = (
             descend(ScheduleFree(0.1, decay=0.0), np.zeros(1), lambda step, x, n=n: noise(100 * n + step, x), 60)[1]
             for n in range(40)
         )
-        return sum(max(state.of(Agreement).log_rate["x"] for state in states) > 0.15 for states in found)
+        return sum(max(state.of(Agreement).log_rate["x"] for state in states) > 0.4 for states in found)
 
     assert grown() <= 2
     monkeypatch.setattr(agreement_rate, "_PAIRS", math.inf)
-    assert grown() >= 20
+    assert grown() >= 8
 
 
 def test_the_rate_of_uncorrelated_gradients_falls_by_its_power():

@@ -68,12 +68,12 @@ class Agreement(TransformState):
 class AgreementRate(StepTransform):
     """Adapt each parameter's learning rate to the mean correlation ρ of its successive gradients.
 
-        log η_{t+1} = log η_t + q_t max(0, 2 (ρ − s) − 1) − 2 q max(0, −ρ − s) − min(p (1 − max(0, ρ)), 0.6) / (t + τ)
+        log η_{t+1} = log η_t + q_t max(0, 2 (ρ − s_ρ) − 1) − 2 q max(0, −ρ − s) − min(p (1 − max(0, ρ)), 0.6) / (t + τ)
 
     with q_t = q min(1, T / t), T = 160 and τ = 10. The rate grows while gradients agree, shrinks where they oppose each other, as after too
     long steps, and decays as t^-0.6 once they are noise. After T steps it grows at most as a power of t. ρ is multiplied by the fraction
     of the agreement that is not reused noise (`SmoothingChange.confirmed` and `lasting`). s = 1/(3 √n) is the standard error of ρ for
-    random gradients of n elements.
+    random gradients of n elements, and s_ρ = s max(1 − ρ², 0.8^t) that of correlated ones; 0.8^t is the weight of the initial ρ = 1.
 
     Agreement that does not last comes from steps back and forth around the minimum, and what it added to the rate is taken back: the factor
     of the rate is f η + (1 − f) η', where f is the lasting fraction plus two standard errors, 2/√n, and η' follows the same rule with
@@ -144,7 +144,8 @@ class AgreementRate(StepTransform):
         """Return the change of the rate's logarithm in one step."""
         power = min(self.decay * (1.0 - max(0.0, correlation)), _STEEPEST)
         error = 1.0 / math.sqrt(_PAIRS * max(1, math.prod(shape)))
-        rise = max(0.0, 2.0 * (correlation - error) - 1.0) * min(1.0, _EARLY / made)
+        agreement = correlation - error * max(1.0 - correlation**2, _MEMORY**made)
+        rise = max(0.0, 2.0 * agreement - 1.0) * min(1.0, _EARLY / made)
         change = self.growth * (rise - 2.0 * max(0.0, -correlation - error))
         return change - power / (made + _DELAY)
 
