@@ -103,7 +103,7 @@ def test_steps_that_gradients_contradict_become_shorter():
 
 
 def test_single_numbers_that_agree_by_chance_do_not_speed_up(monkeypatch: pytest.MonkeyPatch):
-    """The gradients of forty numbers are noise: without the standard error of their correlation many rates grow by half, with it hardly any."""
+    """The gradients of forty numbers are noise: without the standard error of their correlation many rates grow by half, with it few."""
 
     def grown() -> int:
         found = (
