@@ -116,3 +116,15 @@ def test_a_mask_says_what_counts():
     assert debiased.rmse(first, second, black, 0.0 * mask) == (0.0, 0.0)
     with pytest.raises(InputError, match="mask"):
         debiased.rmse(first, second, black, mask[:5])
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_error_of_a_single_pixel_is_not_zero(masked: bool) -> None:
+    """A pixel has no spread over pixels, so its noise comes from its two renderings alone."""
+    rng, scores = np.random.default_rng(4), []
+    shape, mask = ((2, 2, 3), np.array([[1.0, 0.0], [0.0, 0.0]])) if masked else ((1, 1, 3), None)
+    for _ in range(400):
+        first, second = (0.5 + rng.normal(0.0, 0.05, shape) for _ in range(2))
+        value, error = debiased.rmse(first, second, np.zeros(shape), mask)
+        scores.append(abs(value - 0.5) / error)
+    assert np.quantile(scores, 0.5) < 2.0

@@ -48,7 +48,9 @@ def rmse(
     with np.errstate(over="ignore", invalid="ignore"):
         products = np.sum((a - r) * (b - r), axis=2)
         square = float(np.sum(weight * products)) / count
-        bounds = np.sum(((a + b) / 2 - r) * (a - b), axis=2), products - square * a.shape[2]
+        bounds = [np.sum(((a + b) / 2 - r) * (a - b), axis=2)]
+        if np.count_nonzero(weight) > 1:  # a single pixel has no spread
+            bounds.append(products - square * a.shape[2])
         error = math.sqrt(min(float(np.sum((weight * bound) ** 2)) for bound in bounds)) / count
     if not (math.isfinite(square) and math.isfinite(error)):
         return math.inf, math.inf
