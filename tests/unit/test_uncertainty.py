@@ -164,6 +164,27 @@ def test_one_noise_for_all_pixels_would_be_wrong_in_both_halves(monkeypatch: pyt
     assert loud > 1.25
 
 
+def limits(converged: float, error: float = 0.0, noise: float = NOISE) -> list[tuple[str, ...]]:
+    """Return the lines of four problems; values have an own error of this size in each element."""
+    found = []
+    for seed in range(4):
+        made = problem(seed, noise=noise)
+        values = estimate(made, converged)["wall"]
+        values += (error * np.random.default_rng(seed + 9).normal(size=values.shape)).astype(np.float32)
+        found.append(uncertainty(made, {"wall": values}).limited)
+    return found
+
+
+def test_a_line_says_that_the_references_noise_limits_a_texture() -> None:
+    """Texels with the noise of four pixels. An own error of the same size adds to it, and so does the rest of an early end."""
+    own = 0.5 * NOISE / np.sqrt(np.mean(np.square(1.0 - 0.06 * np.arange(SIZE - 2))))
+    for lines in limits(1.0):
+        assert len(lines) == 1
+        assert "now limit it (100% of its squared error)" in lines[0]
+    for lines in (*limits(1.0, own), *limits(0.9), *limits(0.0), *limits(1.0, noise=0.0), *limits(1.0, own, 0.0)):
+        assert not lines
+
+
 def test_what_no_pixel_sees_has_the_spread_of_the_seen_and_no_share_of_the_data() -> None:
     made = problem()
     found = uncertainty(made, estimate(made))

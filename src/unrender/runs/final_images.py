@@ -155,7 +155,15 @@ def render_final_images(
     else:
         warnings += _no_improvement(problem, result, chosen, ends)
     return FinalImages(
-        pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share, maps.missing
+        pictures,
+        errors,
+        samples,
+        sensitivities,
+        (*lines, *maps.limited),
+        warnings,
+        deviations,
+        maps.data_share,
+        maps.missing,
     )
 
 

@@ -47,6 +47,9 @@ _SIGNS = ((1.0, -1.0, -1.0, 1.0), (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)
 """Cells of all blocks of 2 × 2, and signs of their three details (Haar wavelets)."""
 _BLOCK = 16
 """Number of cells of the blocks whose means have followed the references' noise, also after strong smoothing."""
+_OF_NOISE, _SURE, _LEAST_FOLLOWED = 0.7, 2.0, 0.5
+"""Share of an error's square by the references' noise from which on a line says so, standard errors added to the rest of it, and least
+fraction f of the solution's detail."""
 _NEARBY, _LEAST_NOISE = 5, 0.02
 """Side of the squares of pixels that share a variance, and least variance relative to the mean."""
 
@@ -61,11 +64,13 @@ class Uncertainty:
         data_share: {key: array} of the textures' shapes, in [0, 1]: weight of the references in each element. The rest of its value was
             decided by the start, by smoothing, or by a prior.
         missing: one line for each reason why an unknown has no standard error.
+        limited: one line for each texture of whose squared error the references' noise is at least 0.7.
     """
 
     standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
     data_share: Mapping[str, np.ndarray] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
+    limited: tuple[str, ...] = ()
 
 
 @exclusive("uncertainty")
@@ -128,7 +133,7 @@ def uncertainty(
     numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity(), weights)
     errors = {**numbers.standard_errors(values), **maps.standard_error}
     others = _others(problem, keys, {*mapped, *errors, *numbers.unchecked, *numbers.fixed})
-    return Uncertainty(errors, maps.data_share, (*maps.missing, *numbers.missing(), *others))
+    return Uncertainty(errors, maps.data_share, (*maps.missing, *numbers.missing(), *others), maps.limited)
 
 
 def _others(problem: Problem, tested: Sequence[str], explained: Collection[str]) -> list[str]:
@@ -187,7 +192,7 @@ def of_residuals(
     one, other = (
         transposed(problem, values, of, _PASSES, Key(seed, half, _STREAM)) for half, of in enumerate(weighted)
     )
-    errors, shares = {}, {}
+    errors, shares, limited = {}, {}, []
     for key in keys:
         own = _Cells.of(values[key], problem.unknowns[key].initial, known.squares[key], known.noise[key], known.probes)
         prior = 0.0 if (of := problem.unknowns[key].prior) is None else of.diagonal(values[key])
@@ -195,9 +200,13 @@ def of_residuals(
         if posterior is None:
             reasons[key] = "the pictures have too few samples to tell their differences from the references from noise"
             continue
-        variance, share = posterior
-        errors[key], shares[key] = np.sqrt(variance).astype(np.float32), share.astype(np.float32)
-    return Uncertainty(errors, shares, no_maps(reasons))
+        errors[key], shares[key] = np.sqrt(posterior.variance).astype(np.float32), posterior.share.astype(np.float32)
+        if noise.is_known and posterior.of_noise >= _OF_NOISE:
+            limited.append(
+                f"{key}: differences of single pixels, such as the references' noise, now limit it ({posterior.of_noise:.0%} of its "
+                "squared error): more steps gain little"
+            )
+    return Uncertainty(errors, shares, no_maps(reasons), tuple(limited))
 
 
 def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
@@ -222,6 +231,22 @@ def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
 def no_maps(reasons: Mapping[str, str]) -> tuple[str, ...]:
     """Return a line for each texture or grid that has no map for a reason other than ""."""
     return tuple(f"{key}: no map of standard errors: {reason}" for key, reason in reasons.items() if reason)
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Uncertainty of one parameter.
+
+    Attributes:
+        variance: variance of each element, (..., C).
+        share: share of the data in each element, (..., C).
+        of_noise: lower estimate of the fraction of the squared error by the references' noise, f² σ² over the mean of m + (2 f − 1) σ²; 0
+            if the parameter lacks most of the solution's detail.
+    """
+
+    variance: np.ndarray
+    share: np.ndarray
+    of_noise: float
 
 
 @dataclass(frozen=True)
@@ -252,8 +277,8 @@ class _Cells:
 
     def posterior(
         self, gradients: tuple[np.ndarray, np.ndarray], smooth: float, noise_is_known: bool, prior: np.ndarray | float
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the variance and the share of the data of each element, (..., C); None if samples are too few to tell the residual.
+    ) -> _Posterior | None:
+        """Return variances and shares of the data; None if samples are too few to tell the residual.
 
         Args:
             gradients: two independent Jᵀr, (..., C).
@@ -279,7 +304,10 @@ class _Cells:
         )
         precision = (self.curvature / c)[..., None] * np.ones(channels)
         others = 1.0 / max(before, 1e-12) + prior
-        return 1.0 / np.maximum(precision, others), precision / (precision + others)
+        noise = float(self.noise[counted].mean())
+        total = max(m.value + _SURE * m.error + (2.0 * f - 1.0) * noise, f**2 * noise, 1e-12)
+        of_noise = f**2 * noise / total if f >= _LEAST_FOLLOWED else 0.0
+        return _Posterior(1.0 / np.maximum(precision, others), precision / (precision + others), of_noise)
 
     def _difference(self, gradient: np.ndarray, smooth: float) -> np.ndarray:
         """Return the parameters minus the least-squares solution, (..., C), from Jᵀr; 0 at cells that do not count."""
