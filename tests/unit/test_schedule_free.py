@@ -237,6 +237,19 @@ def test_steps_are_shorter_where_reused_noise_adds_up(monkeypatch: pytest.Monkey
     assert inflated < 0.88 * errors_under_reused_noise(512, 3.0, 0.75)[0][-1]
 
 
+def test_steps_are_longer_where_noise_hides_a_signal_that_lasts(monkeypatch: pytest.MonkeyPatch):
+    """A flat bowl under independent noise, which successive gradients hardly share: errors of 0.25 and 0.54."""
+
+    def error() -> float:
+        rng = np.random.default_rng(0)
+        seen, _ = descend(ScheduleFree(0.03), np.zeros(500), lambda _, x: 0.2 * (x - 1.0) + rng.normal(size=500), 600)
+        return float(np.sqrt(np.mean((seen[-1] - 1.0) ** 2)))
+
+    longer = error()
+    monkeypatch.setattr(lasting_agreement, "_PERSISTENT", 2.0)
+    assert longer < 0.55 * error()
+
+
 def test_parameters_at_a_bound_leave_it_as_soon_as_the_gradient_turns():
     """50 steps into the bound are no debt: 5 back lead as far from it as 5 from a start there."""
 

@@ -189,6 +189,17 @@ def test_the_inflation_of_noise_is_that_of_its_mean_over_a_block() -> None:
     assert inflation(0.0, 0.0) < 1.15
 
 
+def growth(signal: float, memory: float) -> float:
+    return reused(memory, signal, 600, (FittedSobolev(), LastingAgreement())).of(GradientBlocks).growths["map"]
+
+
+def test_the_rate_grows_where_blocks_agree_and_not_with_noise() -> None:
+    """Of the squared means over 48 to 100 steps a signal of 0.15 is a half to 0.7, while successive gradients correlate by 0.02."""
+    assert growth(0.0, 0.0) == 0.0
+    assert growth(0.0, 0.9) < 0.1
+    assert 2.0 < growth(0.15, 0.0) < 5.0
+
+
 def test_the_rate_decays_although_gradients_reuse_noise() -> None:
     with_it, without = (
         reused(0.95, 0.0, 900, parts).of(Agreement).log_rate["map"]

@@ -31,7 +31,8 @@ _MEMORY = 0.8
 _PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
 """Number of independent pairs of gradients with the same variance in a plain mean."""
 _LASTING_ERRORS = 2.0
-"""Standard errors 1/√n of the lasting fraction that are added to it before growth is taken back."""
+"""Standard errors 1/√n of the lasting fraction that are added to it before growth is taken back; share of the rate that other growth
+leaves."""
 _MOST_GROWTH = 3.0
 """Largest rate relative to the first one, and relative to the growth of the parameters."""
 _FALL = 0.75
@@ -79,7 +80,8 @@ class AgreementRate(StepTransform):
     of the rate is f η + (1 − f) η', where f is the lasting fraction plus two standard errors, 2/√n, and η' follows the same rule with
     min(ρ, 0) in place of ρ since the last change of smoothing. Directions that no pixel determines would otherwise follow a random walk
     with long steps. The rate is also multiplied by f + (1 − f) I^(-1/4) for the inflation I of the noise (`SmoothingChange.inflation`),
-    since gradients are scaled by the noise of single steps, and reused noise adds up.
+    since gradients are scaled by the noise of single steps, and reused noise adds up. `SmoothingChange.growth` multiplies it where a signal
+    lasts that noise hides from successive gradients, less for few elements, whose agreement is uncertain.
 
     Where the rate falls by more than a quarter from one step to the next, the averaged iterate restarts. With shorter steps it would keep
     the displacement that noise has given it with the longer ones, and the average would move there.
@@ -127,7 +129,9 @@ class AgreementRate(StepTransform):
                 least = log_least[key] = min(least, most) if fit.gain == 1.0 else most
                 share = min(1.0, fit.lasting + _LASTING_ERRORS / math.sqrt(max(1, math.prod(shape))))
                 log_rate[key] = math.log((1.0 - share) * math.exp(least) + share * math.exp(most))
-                factors[key] = math.exp(log_rate[key]) * (share + (1.0 - share) * fit.inflation**-_INFLATION)
+                factor = math.exp(log_rate[key]) * (share + (1.0 - share) * fit.inflation**-_INFLATION)
+                few = min(1.0, _LASTING_ERRORS / math.sqrt(max(1, math.prod(shape))))
+                factors[key] = max(factor, min(factor * (few + (1.0 - few) * fit.growth), math.exp(limit)))
             falls = {key for key, q in factors.items() if q < _FALL * state.factors[key]}
             falls = {key for key in falls if update.smoothing.get(key, SMOOTHING_UNCHANGED).gain == 1.0}
             update = replace(update, restarted=update.restarted | falls)

@@ -26,6 +26,7 @@ class SmoothingChange:
         confirmed: Fraction of the agreement of successive gradients that independent samples confirm, in (0, 1].
         lasting: Fraction of that agreement that gradients of much later steps confirm, in (0, 1].
         inflation: Variance of the sum of many steps' noise, relative to that of independent noise of the same size, >= 1.
+        growth: Factor of the learning rate, because gradients of much later steps agree, >= 1.
         vertices: Number of mesh vertices that carry the parameter; 0 for textures, grids and numbers.
     """
 
@@ -35,6 +36,7 @@ class SmoothingChange:
     confirmed: float = 1.0
     lasting: float = 1.0
     inflation: float = 1.0
+    growth: float = 1.0
     vertices: int = 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -24,6 +25,8 @@ _PARTS = 6
 """Ratio of the number of steps so far to the length of a block."""
 _LEAST = 0.02
 """Smallest lasting fraction."""
+_PERSISTENT = 0.1
+"""Fraction of the squared mean gradient of a block that the block before the last confirms, from which on the rate grows."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class GradientBlocks(TransformState):
         blocks: Number of complete blocks.
         fractions: {key: lasting fraction, unclamped; 1 before it is known}.
         inflations: {key: inflation of the noise; 1 before it is known}.
+        growths: {key: logarithm of `SmoothingChange.growth`}.
     """
 
     total: Tree = field(metadata=GRADIENTS)
@@ -50,10 +54,11 @@ class GradientBlocks(TransformState):
     blocks: int
     fractions: dict[str, float]
     inflations: dict[str, float]
+    growths: dict[str, float]
 
     def upsampled(self, upsampler: Upsampler) -> GradientBlocks:
         """Interpolate the gradients, and restart the blocks, whose products have another unit."""
-        return replace(super().upsampled(upsampler), count=0, blocks=0)
+        return replace(super().upsampled(upsampler), count=0, blocks=0, growths=dict.fromkeys(self.growths, 0.0))
 
 
 @register
@@ -77,6 +82,13 @@ class LastingAgreement(StepTransform):
 
     whose average over blocks, at least 1, becomes `SmoothingChange.inflation`.
 
+    Noise hides a signal from successive gradients, not from means of blocks. The sum over blocks of
+
+        m_k · m_{k-2} / |m_k|² - 0.1,
+
+    set to 0 where it becomes negative, is the logarithm of `SmoothingChange.growth`. Blocks oppose each other where steps are too long
+    (Pflug 1990).
+
     Gradients are unchanged. Needs a `FittedSobolev` before it, which stores the last gradient.
 
     Args:
@@ -92,13 +104,14 @@ class LastingAgreement(StepTransform):
         del learning_rates
         total, last, earlier = (trees.zeros_like(parameters) for _ in range(3))
         zeros, ones = {key: arrays.total(x) for key, x in total.items()}, dict.fromkeys(parameters, 1.0)
-        return GradientBlocks(total, last, earlier, zeros, dict(zeros), 0, 0, ones, dict(ones))
+        growths = dict.fromkeys(parameters, 0.0)
+        return GradientBlocks(total, last, earlier, zeros, dict(zeros), 0, 0, ones, dict(ones), growths)
 
     def update(self, update: StepUpdate, state: GradientBlocks) -> tuple[StepUpdate, GradientBlocks]:
-        """Set the lasting fractions and inflations. Waits for the device at the end of a block."""
+        """Set the lasting fractions, inflations and growths. Waits for the device at the end of a block."""
         gradient, previous = update.gradient, update.require_previous("LastingAgreement")
         if any(change.gain != 1.0 for change in update.smoothing.values()):
-            state = replace(state, count=0, blocks=0)
+            state = replace(state, count=0, blocks=0, growths=dict.fromkeys(state.growths, 0.0))
         if update.made > 0:
             products = inner_products([pair for key, g in gradient.items() for pair in ((g, previous[key]), (g, g))])
             agreement, squares = (dict(zip(gradient, products[part::2], strict=True)) for part in (0, 1))
@@ -111,7 +124,8 @@ class LastingAgreement(StepTransform):
         smoothing = dict(update.smoothing)
         for key, fraction in state.fractions.items():
             change, inflation = smoothing.get(key, SMOOTHING_UNCHANGED), state.inflations[key]
-            smoothing[key] = replace(change, lasting=max(fraction, _LEAST), inflation=inflation)
+            growth = math.exp(state.growths[key])
+            smoothing[key] = replace(change, lasting=max(fraction, _LEAST), inflation=inflation, growth=growth)
         return replace(update, smoothing=smoothing), state
 
     def choices(self, state: GradientBlocks, made: int) -> tuple[str, ...]:
@@ -125,18 +139,20 @@ def _completed(state: GradientBlocks) -> GradientBlocks:
     """Return the state after the end of a block."""
     mean = trees.map(lambda x: x * arrays.scalar(1.0 / state.count, x), state.total)
     arrays.evaluate(mean, state.agreement, state.squares)
-    fractions, inflations = state.fractions, state.inflations
+    fractions, inflations, growths = state.fractions, state.inflations, state.growths
     if state.blocks >= 2:
         products = inner_products([pair for key, m in mean.items() for pair in ((m, state.earlier[key]), (m, m))])
         arrays.evaluate(products)
         numbers = [arrays.number(product) for product in products]
         weight = 1.0 if state.blocks == 2 else 0.5  # of this block, relative to all earlier ones
-        fractions, inflations = {}, {}
+        fractions, inflations, growths = {}, {}, {}
         for key, lasting, square in zip(mean, numbers[::2], numbers[1::2], strict=True):
             new = _fraction(lasting, arrays.number(state.agreement[key]) / state.count)
             fractions[key] = (1.0 - weight) * state.fractions[key] + weight * new
             new = _inflation(lasting, square, arrays.number(state.squares[key]) / state.count, state.count)
             inflations[key] = (1.0 - weight) * state.inflations[key] + weight * new
+            persistent = min(max(lasting / square, -1.0), 1.0) if square > 0.0 else 0.0
+            growths[key] = max(0.0, state.growths[key] + persistent - _PERSISTENT)
     return replace(
         state,
         last=mean,
@@ -145,6 +161,7 @@ def _completed(state: GradientBlocks) -> GradientBlocks:
         blocks=state.blocks + 1,
         fractions=fractions,
         inflations=inflations,
+        growths=growths,
     )
 
 
