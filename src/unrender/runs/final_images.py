@@ -150,20 +150,12 @@ def render_final_images(
     if differs:
         deviations = {}
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
-        if differs not in result.warnings:
-            warnings = (*warnings, differs)
+        warnings += () if differs in result.warnings else (differs,)
     else:
         warnings += _no_improvement(problem, result, chosen, ends)
+    lines += maps.limited
     return FinalImages(
-        pictures,
-        errors,
-        samples,
-        sensitivities,
-        (*lines, *maps.limited),
-        warnings,
-        deviations,
-        maps.data_share,
-        maps.missing,
+        pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share, maps.missing
     )
 
 
