@@ -48,8 +48,7 @@ _SIGNS = ((1.0, -1.0, -1.0, 1.0), (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)
 _BLOCK = 16
 """Number of cells of the blocks whose means have followed the references' noise, also after strong smoothing."""
 _OF_NOISE, _SURE, _LEAST_FOLLOWED = 0.7, 2.0, 0.5
-"""Share of an error's square by the references' noise from which on a line says so, standard errors added to the rest of it, and least
-fraction f of the solution's detail."""
+"""Share of the squared error by the references' noise that has a line, standard errors added to the rest of it, and least f."""
 _NEARBY, _LEAST_NOISE = 5, 0.02
 """Side of the squares of pixels that share a variance, and least variance relative to the mean."""
 
@@ -240,8 +239,7 @@ class _Posterior:
     Attributes:
         variance: variance of each element, (..., C).
         share: share of the data in each element, (..., C).
-        of_noise: lower estimate of the fraction of the squared error by the references' noise, f² σ² over the mean of m + (2 f − 1) σ²; 0
-            if the parameter lacks most of the solution's detail.
+        of_noise: lower estimate of the fraction of the squared error by the references' noise, f² σ² / (m + (2 f − 1) σ²); 0 for small f.
     """
 
     variance: np.ndarray
