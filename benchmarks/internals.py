@@ -24,11 +24,11 @@ from unrender.estimators.base import Estimate, Estimator
 from unrender.estimators.loss_values import BlackBox
 from unrender.estimators.sample_groups import GradientRequest, leave_one_out_groups
 from unrender.gallery import parts, textures, volumes
+from unrender.gallery.analytic import RATE
+from unrender.gallery.heights import Lenses, Relief
 from unrender.gallery.indirect_room import IndirectRoom
-from unrender.gallery.lenses import Lenses
-from unrender.gallery.relief import Relief
-from unrender.gallery.smoke import Smoke
 from unrender.gallery.specification import build_problem
+from unrender.gallery.volumes import Smoke
 from unrender.images import denoising
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.images.plain import PlainState
@@ -43,7 +43,6 @@ from unrender.rendering.mitsuba.ranges import Range, SlotReaders
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.mitsuba.scene_loading import load as load_scene
 from unrender.rendering.mitsuba.scene_loading import media
-from unrender.rendering.numpy.one_pixel import RATE
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.renderer import RenderSession, SampleRequest, Space, with_differential_bsdf
 from unrender.rendering.tied import TiedRenderer

@@ -17,7 +17,7 @@ from scripts.coverage import coverage_page, ranges_page
 from scripts.coverage.cli import RECORD
 from unrender import gallery
 from unrender.app import distributed, exporting
-from unrender.app.capture import conventions, formats, unknowns
+from unrender.app.capture import capture, formats, unknowns
 from unrender.app.capture.formats import lights
 from unrender.app.stages import stages_file
 from unrender.core import registry
@@ -139,7 +139,7 @@ FILES = {
     "Run folders": schema,
     "Values from files": parameter_values,
     "Photographs": formats,
-    "Axes of cameras": conventions,
+    "Axes of cameras": capture,
     "Photographs under known lights": lights,
     "Turntable lights": turntable_light,
     "Unknowns of photographs": unknowns,

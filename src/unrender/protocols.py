@@ -23,12 +23,12 @@ from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
 from unrender.losses.base import Loss
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, TransformState
-from unrender.parameterisations.base import Parameterisation, Transform
+from unrender.parameterisations import Parameterisation, Transform
 from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.renderer import ParameterInfo, Renderer, Rendering, RenderSession, SampleRequest
 from unrender.runs.callbacks import Callback
-from unrender.schedules.functions import Schedule
+from unrender.schedules import Schedule
 
 __all__ = [
     "Callback",

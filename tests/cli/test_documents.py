@@ -54,7 +54,7 @@ GIVEN = {
         problem = ur.gallery.problem("indirect-room", resolution=16, texture_resolution=8)
         result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(), 2, run_directory="out/indirect-room-auto")
     """,
-    "unrender.gallery.catalogue.problem": "from unrender.gallery import problem",
+    "unrender.gallery.problem": "from unrender.gallery import problem",
     "unrender.own_loop.renderer.Renderer": """
         import unrender as ur
         ur.use("llvm_ad_rgb")

@@ -14,7 +14,7 @@ import pytest
 
 from conftest import KEY, Unrender
 from unrender.app.cli import stages
-from unrender.app.stages import run_folders, stages_file
+from unrender.app.stages import stages_file
 from unrender.app.stages.stage_problem import StagedProblem
 from unrender.core.errors import InputError
 from unrender.runs.folder import checkpoint, method_file
@@ -80,7 +80,7 @@ def test_each_stage_begins_where_the_one_before_it_ended_and_a_killed_one_comes_
 ) -> None:
     answer = unrender(*RUN)
     assert answer.status == 0, answer.error
-    folders = run_folders.listed(Path("result"))
+    folders = stages_file.run_folders(Path("result"))
     assert [folder.name for folder in folders] == ["1-colour", "2-light", "3-all"]
     records = [json.loads((folder / "run.json").read_text()) for folder in folders]
     assert [(record["status"], record["steps"], record["seed"]) for record in records] == [
@@ -112,7 +112,7 @@ def test_each_stage_begins_where_the_one_before_it_ended_and_a_killed_one_comes_
     assert answer.status == 0, answer.error
     assert "finished: killed/1-colour" in answer.out
     assert json.loads((folder / "run.json").read_text())["resumed"] == [2]
-    for mine, whole in zip(run_folders.listed(killed), folders, strict=True):
+    for mine, whole in zip(stages_file.run_folders(killed), folders, strict=True):
         for key, value in values(whole).items():
             assert np.array_equal(values(mine)[key], value), f"{mine}: {key}"
     # Each is an ordinary run folder.
@@ -139,7 +139,7 @@ def test_a_stage_is_judged_with_what_earlier_ones_found(unrender: Unrender, stag
     (staged / "held-out.toml").write_text(held_out)
     (staged / "stages.toml").write_text(STAGES.partition('[[stages]]\nname = "all"')[0])
     assert unrender(*RUN[:-2]).status == 0
-    folders = run_folders.listed(Path("result"))
+    folders = stages_file.run_folders(Path("result"))
     # Nobody asked for pictures of the first stage: one sample for each pixel, and no page.
     assert [method_file.read(folder / "method.toml").final_spp for folder in folders] == [1, None]
     assert [(folder / "report.html").is_file() for folder in folders] == [False, True]
@@ -246,8 +246,8 @@ def test_a_folder_that_holds_the_users_own_file_is_no_run(unrender: Unrender, st
         assert (answer.status, answer.error.count("\n")) == (2, 1)
         assert line in answer.error
     assert "other: not a run in stages" in unrender("resume", "other").error
-    assert run_folders.listed(staged / "other") == [staged / "other"]
-    assert run_folders.stage_of(staged / "other" / "1-colour") is None
+    assert stages_file.run_folders(staged / "other") == [staged / "other"]
+    assert stages_file.stage_of(staged / "other" / "1-colour") is None
     assert (staged / "stages.toml").read_text() == STAGES
     assert (staged / "scenes").is_dir()
     assert sorted(path.name for path in (staged / "other").iterdir()) == ["stages.toml"]

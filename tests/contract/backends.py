@@ -13,8 +13,8 @@ import numpy as np
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.core import arrays
+from unrender.gallery.analytic import ExponentialRenderer, QuadraticRenderer
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.numpy.one_pixel import ExponentialRenderer, QuadraticRenderer
 from unrender.rendering.renderer import Renderer, SampleRequest
 
 TEXTURE, LAMP = "back.bsdf.reflectance.data", "light.emitter.radiance.value"

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import unrender as ur
-from unrender.gallery import catalogue
+from unrender import gallery
 from unrender.methods import method
 
 pytestmark = pytest.mark.mitsuba
@@ -61,11 +61,11 @@ def line(name: str, problem: ur.Problem) -> str:
 
 
 def small(name: str) -> ur.Problem:
-    options = {option.name for option in catalogue.options(name)}
+    options = {option.name for option in gallery.options(name)}
     return ur.gallery.problem(name, **{key: value for key, value in SMALL.items() if key in options})
 
 
-def lines(names: Sequence[str] = catalogue.names()) -> Iterator[tuple[str, str]]:
+def lines(names: Sequence[str] = gallery.names()) -> Iterator[tuple[str, str]]:
     """(name, line) of problems of the gallery, some with another loss."""
     for name in names:
         try:
@@ -96,7 +96,7 @@ def test_auto_plans_some_problems_as_recorded() -> None:
 
 @pytest.mark.slow
 def test_auto_plans_each_problem_of_the_gallery_as_recorded() -> None:
-    names = catalogue.names()
+    names = gallery.names()
     assert not differing(names)
     assert known().keys() == set(names) | {f"{name} L1" for name in WITH_L1}
 

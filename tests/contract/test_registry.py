@@ -151,7 +151,7 @@ def test_two_of_one_name_are_refused_with_both_modules() -> None:
     with pytest.raises(InputError) as caught:
         ur.register(elsewhere("Adam", "elsewhere", Cubic))
     assert "two components are called Adam" in str(caught.value)
-    assert "unrender.optimizers.adam" in str(caught.value)
+    assert "unrender.optimizers.recipes" in str(caught.value)
     assert "elsewhere" in str(caught.value)
     assert registry.components("optimizer")["Adam"] is optimizers.Adam
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from unrender.rendering.mitsuba.rendered_paths import DroppedSamples
+from unrender.rendering.mitsuba.camera_paths import DroppedSamples
 
 pytestmark = pytest.mark.mitsuba
 _LAUNCHES = 400

@@ -12,7 +12,7 @@ import pytest
 import unrender as ur
 from unrender.app.exporting import scene_folder as exporting
 from unrender.rendering.mitsuba import poses
-from unrender.rendering.mitsuba.described import load_described
+from unrender.rendering.mitsuba.description import load_described
 from unrender.rendering.mitsuba.poses import Pose
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 

@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from unrender.rendering.mitsuba import frozen
-from unrender.rendering.mitsuba.frozen import FrozenFunction
-from unrender.rendering.mitsuba.recordable import shapes_are_recordable
+from unrender.rendering.mitsuba.frozen import FrozenFunction, shapes_are_recordable
 
 
 @pytest.fixture

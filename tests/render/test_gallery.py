@@ -14,10 +14,10 @@ import unrender as ur
 from tiers import quick, slow
 from unrender.backend import cache
 from unrender.gallery import boxes, meshes, specification, textures
+from unrender.gallery.analytic import QuadraticRenderer
 from unrender.gallery.sunlit_vase import SunlitVase
 from unrender.methods import method
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.numpy.one_pixel import QuadraticRenderer
 from unrender.rendering.renderer import SampleRequest
 
 NAMES = ur.gallery.names()

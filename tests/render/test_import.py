@@ -20,7 +20,7 @@ import made_capture as made
 from tiers import quick
 from unrender.app.capture import formats, importing
 from unrender.app.capture.cameras import FISHEYE, Lens, project
-from unrender.app.capture.conventions import reinterpreted
+from unrender.app.capture.capture import reinterpreted
 from unrender.app.capture.importing import ImportOptions
 from unrender.app.capture.views import prepare
 from unrender.io import images

@@ -10,7 +10,7 @@ import pytest
 
 import unrender as ur
 from unrender.estimators.base import as_numpy
-from unrender.gallery.relief import Relief, _heights
+from unrender.gallery.heights import Relief, _heights
 from unrender.rendering.mitsuba.scene_loading import load
 
 pytestmark = pytest.mark.mitsuba

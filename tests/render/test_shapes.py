@@ -18,7 +18,7 @@ from tiers import quick
 from unrender.core.random import Key
 from unrender.gallery import meshes
 from unrender.methods.base import method
-from unrender.rendering.mitsuba.boundary_term import BoundaryTerm
+from unrender.rendering.mitsuba.geometry_terms import BoundaryTerm
 from unrender.rendering.mitsuba.integrators.boundary_paths import Picture
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.session import MitsubaSession

@@ -12,7 +12,7 @@ import pytest
 import unrender as ur
 from kernels import recorded
 from unrender.app.evaluation import scenes
-from unrender.rendering.mitsuba import film, recordable, turntable_light
+from unrender.rendering.mitsuba import film, frozen, turntable_light
 
 ANGLE = 60.0
 MAP = (np.random.default_rng(0).uniform(0, 1, (8, 16, 3)) ** 4 * 5).astype(np.float32)
@@ -78,7 +78,7 @@ def three_views() -> ur.Problem:
 @pytest.mark.parametrize("sharing", [True, False])
 def test_views_of_a_turntable_share_their_kernels(sharing: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """In one recording, or in one for each view whose time is an input."""
-    monkeypatch.setattr(recordable, "_MANY", 3 if sharing else 4)
+    monkeypatch.setattr(frozen, "_MANY", 3 if sharing else 4)
     given = three_views()
     pictures = [ur.render(given, view=0, spp=4)]
     with recorded() as new:

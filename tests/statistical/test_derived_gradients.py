@@ -15,7 +15,7 @@ import unrender as ur
 from tests.render import test_expressions, test_ties
 from unrender.core.random import Key
 from unrender.estimators.base import as_numpy
-from unrender.gallery.lenses import Lenses
+from unrender.gallery.heights import Lenses
 from unrender.rendering.mitsuba.scene_loading import load
 
 pytestmark = [pytest.mark.slow, pytest.mark.mitsuba]

@@ -9,8 +9,7 @@ import pytest
 
 import unrender as ur
 from tiers import quick
-from unrender.estimators.smoothing.options import SamplingOptions
-from unrender.estimators.smoothing.sampling import SmoothedFunction
+from unrender.estimators.smoothing.sampling import SamplingOptions, SmoothedFunction
 
 N = 6
 RNG = np.random.default_rng(4)

@@ -20,11 +20,10 @@ pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrende
 import unrender
 from unrender.app.capture import atlas, formats, hull, importing, pictures, views
 from unrender.app.capture.cameras import Lens, project, rigid
-from unrender.app.capture.capture import Capture, CapturedView, Photograph
-from unrender.app.capture.conventions import AXES, pose, reinterpreted
+from unrender.app.capture.capture import AXES, Capture, CapturedView, Photograph, pose, reinterpreted
 from unrender.app.capture.formats import colmap, files, lights
 from unrender.app.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs
-from unrender.app.capture.undistortion import Resampling, pinhole
+from unrender.app.capture.views import Resampling, pinhole
 from unrender.core.errors import InputError
 
 LENS = Lens(64, 64, 80.0, 80.0, 32.0, 32.0)

@@ -15,7 +15,7 @@ import pytest
 import unrender as ur
 from tests.contract import analytic
 from tests.local_hosts import LocalHosts
-from unrender.app.cli.distribution import variant_again
+from unrender.app.cli.run import variant_again
 from unrender.app.distributed import assignment
 from unrender.app.distributed.assignment import assign, total
 from unrender.app.distributed.cluster import Workers, share

@@ -9,7 +9,7 @@ import pytest
 
 import unrender as ur
 from unrender.core.dropped import DropReport
-from unrender.estimators.smoothing.joint import joint
+from unrender.estimators.smoothing.function import joint
 
 
 def slope(x: np.ndarray) -> np.ndarray:

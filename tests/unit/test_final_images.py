@@ -17,11 +17,10 @@ from unrender.core import phases
 from unrender.estimators.path import PathGradient
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.runs import final_images, least_squares
-from unrender.runs.callbacks import Callback
+from unrender.runs.callbacks import RUN_PHASES, Callback
 from unrender.runs.image_sensitivity import Curvature
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
-from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.result import Result
 from unrender.runs.run import Run
 from unrender.runs.verification import DIFFERS

@@ -10,15 +10,15 @@ from unrender.estimators.base import Estimate
 from unrender.optimizers import ScheduleFree
 from unrender.optimizers.transforms.fitted_sobolev import FittedSobolevState
 from unrender.optimizers.transforms.wiener_shrinkage import signal_share
-from unrender.preconditioners import Sobolev, grid, grid_pyramid
-from unrender.preconditioners.grid_pyramid import GridPyramid
+from unrender.preconditioners import Sobolev, grid
+from unrender.preconditioners.grid import GridPyramid
 
 
 def shrink(monkeypatch: pytest.MonkeyPatch) -> None:
     """Grids of more than 256 cells count as large."""
-    monkeypatch.setattr(grid_pyramid, "LARGEST_EXACT", 256)
-    monkeypatch.setattr(grid_pyramid, "_COARSEST", 256)
-    monkeypatch.setattr(grid_pyramid, "pyramid", GridPyramid)
+    monkeypatch.setattr(grid, "LARGEST_EXACT", 256)
+    monkeypatch.setattr(grid, "_COARSEST", 256)
+    monkeypatch.setattr(grid, "pyramid", GridPyramid)
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_a_pattern_of_noise_and_detail_is_recovered_as_with_transforms(monkeypat
             estimate = Estimate(0.0, {"x": x["x"] - truth + 0.3 * normal(step, shape)})
             steps, state = optimizer.update(estimate, state, x)
             x = {"x": x["x"] + steps["x"]}
-        assert bool(len(state.of(FittedSobolevState).strengths["x"].last)) == (grid_pyramid.LARGEST_EXACT == 256)
+        assert bool(len(state.of(FittedSobolevState).strengths["x"].last)) == (grid.LARGEST_EXACT == 256)
         return float(np.sqrt(np.mean((x["x"] - truth) ** 2)))
 
     exact = error()

@@ -18,8 +18,7 @@ from unrender.losses import Huber
 from unrender.methods import method
 from unrender.methods.smoothed import SmoothedMethod
 from unrender.rendering.renderer import ParameterInfo
-from unrender.runs.components import resolve
-from unrender.runs.optimize import estimate, optimize
+from unrender.runs.optimize import estimate, optimize, resolve
 from unrender.runs.watches import remarks
 from unrender.scene.key_hints import instead_of, near_key
 from unrender.scene.parameter import Parameter

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unrender.statistics.halves import normal_equations
+from unrender.statistics.debiased import normal_equations
 
 
 def test_the_normal_equations_are_those_of_weighted_least_squares() -> None:

@@ -19,13 +19,12 @@ from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import Sobolev
 from unrender.rendering.parameter_errors import ErrorMeasure
-from unrender.runs.mesh_guard import guarded
 from unrender.runs.watches import MeshWatch
 from unrender.scene import remeshing
 from unrender.scene.mesh_checks import check_regularizer, check_self_intersection, check_surfaces, mesh_notices
 from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.remeshing import Remeshing
-from unrender.scene.surfaces import Surface, crossing_triangles, folds, surface_error
+from unrender.scene.surfaces import Surface, crossing_triangles, folds, guarded, surface_error
 from unrender.scene.unknown import Unknown
 
 POINTS, FACES = meshes.icosphere(2)

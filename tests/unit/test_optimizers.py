@@ -11,8 +11,9 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Variance
-from unrender.optimizers import SGD, Adam, MetaAdam, ScheduleFree
-from unrender.schedules.functions import Constant, Cosine, Exponential, Steps, Warmup
+from unrender.optimizers import SGD, Adam, Chain, MetaAdam, ScheduleFree
+from unrender.optimizers.transforms import ClipDirection, ScaleByDeviation
+from unrender.schedules import Constant, Cosine, Exponential, Steps, Warmup
 
 OPTIMIZERS = [
     SGD(0.1),
@@ -165,7 +166,7 @@ def test_a_changing_python_number_would_be_noticed(gradients, monkeypatch):
         (lambda: Adam(epsilon=0.0), "Adam: epsilon must be a finite number > 0, got 0.0"),
         (
             lambda: Adam(schedule="cosine"),  # type: ignore
-            "Adam: schedule must be one of unrender.schedules.functions or None, got 'cosine'",
+            "Adam: schedule must be one of unrender.schedules or None, got 'cosine'",
         ),
         (lambda: SGD(float("nan")), "SGD: learning_rate must be a finite number > 0, got nan"),
         (lambda: SGD(momentum=1), "SGD: momentum must be a finite number >= 0 and < 1, got 1"),
@@ -217,9 +218,9 @@ def test_meta_adams_first_step_is_the_learning_rate_whatever_the_scale(scale):
     np.testing.assert_allclose(step["a"], [-0.25, 0.25, 0.0], rtol=1e-9)
 
 
-def test_meta_adams_longest_step():
+def test_meta_adams_steps_may_be_limited():
     gradient, variance = {"a": np.array([3.0, -2.0, 0.1])}, {"a": np.array([1e-4, 1.0, 1.0])}
-    (step,) = meta_take(MetaAdam(0.1, longest=5.0), [gradient], [variance])
+    (step,) = meta_take(Chain((ScaleByDeviation(), ClipDirection(5.0)), 0.1), [gradient], [variance])
     np.testing.assert_allclose(step["a"], [-0.5, 0.2, -0.01])
 
 
@@ -242,7 +243,7 @@ def test_meta_adam_is_the_same_on_the_device_and_compiles_nothing(gradients):
 
 @pytest.mark.parametrize(
     ("options", "field"),
-    [({"learning_rate": 0}, "learning_rate"), ({"epsilon": 0.0}, "epsilon"), ({"longest": -1}, "longest")],
+    [({"learning_rate": 0}, "learning_rate"), ({"epsilon": 0.0}, "epsilon")],
 )
 def test_meta_adam_refuses(options, field):
     with pytest.raises(InputError, match=f"MetaAdam: {field}"):

@@ -17,8 +17,8 @@ import unrender as ur
 from tests.analytic import AnalyticRenderer
 from tiers import slow
 from unrender.core.errors import InputError
+from unrender.gallery.analytic import ExponentialRenderer
 from unrender.own_loop.stream import Rendered
-from unrender.rendering.numpy.one_pixel import ExponentialRenderer
 
 CV = ur.images.RecursiveControlVariate
 Uniform, Adaptive = ur.pixels.Uniform, ur.pixels.Adaptive

@@ -16,7 +16,7 @@ from report_folders import write_run
 import unrender as ur
 from browser import chromium
 from unrender.app import report
-from unrender.app.report import shapes
+from unrender.app.report import pages
 from unrender.gallery import meshes
 from unrender.io import mesh_files
 from unrender.runs import reopen
@@ -84,7 +84,7 @@ def test_arrays_that_make_no_mesh_are_one_line(tmp_path: Path, name: str, value:
 
 def test_the_page_holds_meshes_and_a_picture_of_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = written(tmp_path / "run")
-    shown = shapes.panel(reader.read(path), KEY)
+    shown = pages.shape_panel(reader.read(path), KEY)
     assert [solid.label for solid in shown.solids] == ["Start", "Recovered", "Truth"]
     sizes = []
     for solid in shown.solids:
@@ -97,8 +97,8 @@ def test_the_page_holds_meshes_and_a_picture_of_them(tmp_path: Path, monkeypatch
     assert text.count("<canvas") == 1
     assert shown.picture in text
     assert "http" not in text.split("<main")[0].replace("http-equiv", "")  # nothing is fetched
-    monkeypatch.setattr(shapes, "MOST_FACES", 100)
-    large = shapes.panel(reader.read(path), KEY)
+    monkeypatch.setattr(pages, "MOST_FACES", 100)
+    large = pages.shape_panel(reader.read(path), KEY)
     assert (large.solids, large.picture) == ((), "")
     assert "too large to be shown" in large.note
 

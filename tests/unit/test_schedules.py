@@ -5,7 +5,7 @@ import math
 import pytest
 
 from unrender.core.errors import InputError
-from unrender.schedules.functions import Constant, Cosine, Exponential, Inverse, InverseRoot, Steps, Warmup
+from unrender.schedules import Constant, Cosine, Exponential, Inverse, InverseRoot, Steps, Warmup
 
 
 @pytest.mark.parametrize(

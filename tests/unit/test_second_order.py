@@ -17,7 +17,7 @@ from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capability, Hessian, HessianProduct, LossFunction, Smoothing
 from unrender.optimizers import CMAES, LBFGS, Adam, Newton, NewtonCG
 from unrender.optimizers.cma_es import CMAESState
-from unrender.schedules.functions import Constant, Exponential
+from unrender.schedules import Constant, Exponential
 
 LIKE = {"a": np.zeros((2, 2)), "b": np.zeros(2)}
 FIRST_STEPS = [Newton(), NewtonCG(), LBFGS()]

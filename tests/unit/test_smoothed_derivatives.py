@@ -12,7 +12,7 @@ import pytest
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
-from unrender.schedules.functions import Exponential
+from unrender.schedules import Exponential
 from unrender.statistics import hessian_updates
 
 

@@ -12,9 +12,18 @@ import numpy as np
 import pytest
 
 from unrender.app.cli.sweep_driver import equally_good, run_command
-from unrender.app.sweeps import folders, pruning
+from unrender.app.sweeps import pruning
 from unrender.app.sweeps.axes import Axis, parse_axes
-from unrender.app.sweeps.record import RunOutcome, SweepPlan, SweepRecord, TrialRecord, read_sweep, write_sweep
+from unrender.app.sweeps.record import (
+    RunOutcome,
+    SweepPlan,
+    SweepRecord,
+    TrialRecord,
+    best_folders,
+    read_sweep,
+    watched_folders,
+    write_sweep,
+)
 from unrender.app.sweeps.search import Grid, Random, Search
 from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.core.errors import InputError
@@ -251,11 +260,11 @@ def test_a_record_is_read_as_it_was_written_and_a_malformed_one_is_one_line(tmp_
     write_sweep(tmp_path, record)
     assert read_sweep(tmp_path) == record
     folder = tmp_path.name
-    assert [str(path.relative_to(tmp_path.parent)) for path in folders.watched(tmp_path)] == [
+    assert [str(path.relative_to(tmp_path.parent)) for path in watched_folders(tmp_path)] == [
         f"{folder}/trial-{i:03d}-seed{seed}" for i in range(2) for seed in (5, 6)
     ]
-    assert folders.watched(tmp_path / "trial-000-seed5") == [tmp_path / "trial-000-seed5"]
-    assert folders.best(tmp_path, record) == [tmp_path / "f"]
+    assert watched_folders(tmp_path / "trial-000-seed5") == [tmp_path / "trial-000-seed5"]
+    assert best_folders(tmp_path, record) == [tmp_path / "f"]
     given = json.loads((tmp_path / "sweep.json").read_text())
     for change, message in [
         ({"plan": 3}, "plan"),

@@ -67,8 +67,8 @@ KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         _kind("loss", "unrender.losses", "unrender.losses.base.Loss", "value derivative"),
-        _kind("schedule", "unrender.schedules", "unrender.schedules.functions.Schedule", "__call__"),
-        _kind("parameterisation", "unrender.parameterisations", "unrender.parameterisations.base.Parameterisation", "transform"),
+        _kind("schedule", "unrender.schedules", "unrender.schedules.Schedule", "__call__"),
+        _kind("parameterisation", "unrender.parameterisations", "unrender.parameterisations.Parameterisation", "transform"),
         _kind("preconditioner", "unrender.preconditioners", "unrender.preconditioners.base.Preconditioner", "check apply"),
         _kind("pixel sampler", "unrender.pixels", "unrender.pixels.base.PixelSampler", "init draw observe"),
         _kind("image estimator", "unrender.images", "unrender.images.base.ImageEstimator", "init estimate advance"),
@@ -274,7 +274,7 @@ def _load(kind: str) -> None:
             _loaded.add(package)
             try:
                 home = importlib.import_module(package)
-                for module in pkgutil.iter_modules(home.__path__, f"{package}."):
+                for module in pkgutil.iter_modules(getattr(home, "__path__", ()), f"{package}."):
                     importlib.import_module(module.name)
             except BaseException:
                 _loaded.discard(package)

@@ -1,10 +1,14 @@
-"""Rotation matrices."""
+"""Rotation matrices, and conversion of camera axes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+
+MITSUBA_TO_OPENGL = np.diag([-1.0, 1.0, -1.0, 1.0])
+"""Right factor that converts a camera-to-world matrix (4, 4) from one convention to the other. It is its own inverse."""
+MITSUBA_TO_OPENGL.setflags(write=False)
 
 
 def rotation(axis: Sequence[float] | np.ndarray, angle: float) -> np.ndarray:

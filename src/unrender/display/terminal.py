@@ -57,6 +57,6 @@ def columns(*headings: str) -> Table:
     return table
 
 
-def echo(text: Any) -> None:
-    """Print text to standard output, without markup and with control characters escaped."""
-    typer.echo(visible(str(text), _UNESCAPED))
+def echo(text: Any, err: bool = False) -> None:
+    """Print text to standard output, or to standard error, without markup and with control characters escaped."""
+    typer.echo(visible(str(text), _UNESCAPED), err=err)

@@ -26,18 +26,18 @@ from unrender.estimators.capabilities import (
     Smoothing,
     Variance,
 )
+from unrender.estimators.coordinates import PreconditionedPerturbations
 from unrender.estimators.loss_values import BlackBox
-from unrender.estimators.preconditioned_perturbations import PreconditionedPerturbations
 from unrender.estimators.smoothing.function import (
     estimate_gradient,
     estimate_gradient_and_product,
     estimate_hessian,
     estimate_hvp,
 )
-from unrender.estimators.smoothing.options import SamplingOptions
+from unrender.estimators.smoothing.sampling import SamplingOptions
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
-from unrender.schedules.functions import Schedule
+from unrender.schedules import Schedule
 from unrender.statistics import hessian_updates
 
 _MAX_STORED = 4096
@@ -104,7 +104,7 @@ class SmoothedDerivatives:
             smooth losses the remaining bias is of fourth order in the noise. Takes two launches, and at least 2 samples.
         epsilon: ε of products by differences, in units of σ, > 0 (see `unrender.smoothed.hvp`): images are discontinuous at edges, so
             it is larger than the default there.
-        schedule: factor of σ by step, e.g. `schedules.Exponential(100)`; see `unrender.schedules.functions`.
+        schedule: factor of σ by step, e.g. `schedules.Exponential(100)`; see `unrender.schedules`.
         adaptive_annealing: advance the schedule of σ by convergence instead of steps. A step advances it by the mean over the root
             mean square, if positive, of the losses at the perturbed points minus the loss at the parameters, which the gradient has
             evaluated already. This measure is near 1 at a minimum of the smoothed loss (0.6 to 0.8 for one parameter, less with noise),

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, parts, staging
+from unrender.gallery import fields, parts
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
@@ -98,7 +98,7 @@ def _scene(squares: tuple[_Square, ...], half: float, resolution: int) -> dict[s
     return {
         "type": "scene",
         "camera": parts.camera((0, 0, _FAR), (0, 0, 0), 2 * np.degrees(np.arctan(1 / _FAR)), resolution),
-        "sun": staging.sun((0, 0, 1), 1.0),
+        "sun": parts.sun((0, 0, 1), 1.0),
         "wall": parts.rectangle((0, 0, 0), (1.5, 0, 0), (0, 1.5, 0), parts.diffuse(_GREY)),
         **{
             f"box_{number}": parts.rectangle(
@@ -116,7 +116,7 @@ def _parameters(squares: tuple[_Square, ...], half: float) -> tuple[Parameter, .
         truth = _place(square.truth)
         for axis, here, there in zip("xy", truth, _place(square.start), strict=True):
             bounds = (-reach - here, reach - here)
-            unknowns += staging.unknown(f"box_{number}", "translation", {axis: there - here}, bounds)
+            unknowns += parts.unknown_pose(f"box_{number}", "translation", {axis: there - here}, bounds)
     return tuple(unknowns)
 
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, staging, textures
+from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
@@ -47,8 +47,8 @@ class Camera:
         return {
             "type": "scene",
             **{name: parts.camera(place, _TARGET, 54.0, self.resolution) for name, place in _PLACES.items()},
-            "sun": staging.sun((0.5, 1.0, 0.6), 0.9),
-            "fill": staging.sun((-0.7, 0.8, 0.5), 0.35),
+            "sun": parts.sun((0.5, 1.0, 0.6), 0.9),
+            "fill": parts.sun((-0.7, 0.8, 0.5), 0.35),
             "floor": parts.rectangle((0, 0, 0), (3, 0, 0), (0, 0, -3), floor),
             "wall": parts.rectangle((0, 1.5, -1.6), (3, 0, 0), (0, 1.5, 0), wall),
             "tower": _block((-0.75, 0.6, -0.2), (0.2, 0.6, 0.2), 25.0, parts.diffuse(0.7, 0.25, 0.2)),

@@ -13,8 +13,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.rotations import rotation
 from unrender.rendering.mitsuba import mesh_layout
-from unrender.rendering.mitsuba.described import load_described
-from unrender.rendering.mitsuba.description import load
+from unrender.rendering.mitsuba.description import load, load_described
 from unrender.scene.surfaces import Surface
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.core.rotations import rotation
-from unrender.gallery import fields, meshes, parts, staging, textures
+from unrender.gallery import fields, meshes, parts, textures
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
@@ -60,7 +60,7 @@ class Mug:
         return {
             "type": "scene",
             "camera": parts.camera((0, 1.5, 3.6), (0, 0.42, 0), 30.0, self.resolution),
-            "sun": staging.sun((0, 0.5, 1), 1.0),
+            "sun": parts.sun((0, 0.5, 1), 1.0),
             "table": parts.rectangle((0, 0, 0), (6, 0, 0), (0, 0, -4), parts.diffuse(0.3, 0.35, 0.4)),
             "wall": parts.rectangle((0, 2, -4), (6, 0, 0), (0, 2, 0), parts.diffuse(0.5, 0.5, 0.45)),
             "mug": meshes.sheets("mug", turned, parts.twosided(glaze)),
@@ -68,7 +68,7 @@ class Mug:
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the angle relative to the truth, and the label, initially grey."""
-        angle = staging.unknown("mug", "rotation", {"y": _HIDDEN - _SIDE})
+        angle = parts.unknown_pose("mug", "rotation", {"y": _HIDDEN - _SIDE})
         return (*angle, Parameter(_LABEL, initial=0.4)) if self.label else tuple(angle)
 
 

@@ -1,4 +1,4 @@
-"""Shared parts of gallery scenes, as Mitsuba dictionaries: camera, surfaces, lights."""
+"""Shared parts of gallery scenes, as Mitsuba dictionaries: camera, surfaces, lights; and unknown coordinates of poses."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+
+from unrender.scene.parameter import Parameter
 
 Vector = Sequence[float] | np.ndarray
 
@@ -167,3 +169,29 @@ def picture(
 def environment(values: np.ndarray) -> dict[str, Any]:
     """Return an environment map, with the y axis upwards, as a Mitsuba dictionary."""
     return {"type": "envmap", "bitmap": mi.Bitmap(values), "to_world": mi.ScalarTransform4f()}
+
+
+def sun(towards: Vector, *rgb: float) -> dict[str, Any]:
+    """Return light from one direction.
+
+    Args:
+        towards: direction towards the light, of any length.
+        rgb: radiance of a white surface that faces it; one number is grey.
+    """
+    direction = -np.asarray(towards, float)
+    irradiance = [np.pi * value for value in rgb]
+    return {"type": "directional", "direction": direction.tolist(), "irradiance": colour(*irradiance)}
+
+
+def unknown_pose(
+    shape: str, part: str, start: dict[str, float], bounds: tuple[float, float] | None = None
+) -> list[Parameter]:
+    """Return coordinates of the pose of a shape or light, which are 0 in the true scene.
+
+    Args:
+        shape: id of the shape or light.
+        part: "translation" or "rotation".
+        start: {"x" | "y" | "z": initial value}; other coordinates are known.
+        bounds: bounds of each coordinate.
+    """
+    return [Parameter(f"{shape}.{part}.{axis}", initial=value, bounds=bounds) for axis, value in start.items()]

@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 
 from unrender.core.registry import register
-from unrender.gallery import fields, parts, staging, textures
+from unrender.gallery import fields, parts, textures
 from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
@@ -78,5 +78,5 @@ class StageLights:
         """Return the lights' poses, initially a rough guess."""
         unknowns: list[Parameter] = []
         for light, (part, start) in _START.items():
-            unknowns += staging.unknown(light, part, start)
+            unknowns += parts.unknown_pose(light, part, start)
         return tuple(unknowns)

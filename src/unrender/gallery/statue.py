@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.registry import register
-from unrender.gallery import fields, meshes, parts, staging, textures
+from unrender.gallery import fields, meshes, parts, textures
 from unrender.gallery.specification import views_of
 from unrender.losses import L2, Loss
 from unrender.rendering.mitsuba.scene_loading import load
@@ -72,7 +72,7 @@ class Statue:
             "type": "scene",
             **parts.cameras_around(angles, 3.6, (0.3, 1.8), (0, 0, 0), 34.0, self.resolution),
             "sky": {"type": "constant", "radiance": parts.colour(0.3, 0.33, 0.4)},
-            "sun": staging.sun((0.6, 0.9, 0.7), 0.6),
+            "sun": parts.sun((0.6, 0.9, 0.7), 0.6),
         }
 
 

@@ -18,10 +18,10 @@ from unrender.backend import variant
 from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.io import files
 from unrender.losses import L1, Loss
-from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.scene.parameter import Parameter
 
 SUN = np.array([-0.55, 0.62, 0.56]) / np.linalg.norm([-0.55, 0.62, 0.56])

@@ -1,13 +1,25 @@
-"""Shared parts of problems with participating media: grids, cameras around the origin, a cube with invisible faces."""
+"""Problems `smoke` and `nerf-volume`, and parts of problems with media: grids, cameras around the origin, a cube with invisible faces.
+
+`smoke` is after Nicolet et al. 2023, Figs 5 and 11. Most of the cube is empty, and some of it dense, with multiple scattering. In a voxel
+that the optimisation has emptied, collisions alone would never show that smoke is missing. `nerf-volume`, an object with surfaces, is
+fitted by a volume that emits and absorbs. After Balint et al. 2023, Figs 7 and 8; `balls` has small balls far from each other, as Fig. 8.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
-from unrender.gallery import parts
+from unrender.core.registry import register
+from unrender.gallery import fields, parts, textures
+from unrender.gallery.specification import views_of
+from unrender.losses import L1, L2, Loss
+from unrender.rendering.mitsuba.scene_loading import load
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
 
 
 def grid(values: np.ndarray) -> dict[str, Any]:
@@ -68,3 +80,142 @@ def noise(resolution: int, octaves: int, seed: int) -> np.ndarray:
         place = [(c + 1) / 2 * cells for c in (z, y, x)]
         total += map_coordinates(values, place, order=1) * 0.5**octave
     return total / (2 - 0.5 ** (octaves - 1))
+
+
+@register(name="smoke", position=24)
+@dataclass(frozen=True)
+class Smoke:
+    """Density and colour of a cloud of smoke under a bright sky, seen from all sides.
+
+    Several views. The unknowns are extinction (grid_resolution³, 1) and albedo (grid_resolution³, 3), initially a thin grey fog.
+    """
+
+    resolution: int = fields.resolution(32)
+    grid_resolution: int = fields.integer(16, "voxels along a side of each unknown grid", at_least=2)
+    views: int = fields.integer(8, "cameras, at equal angles around the smoke", at_least=1, at_most=64)
+    reference_spp: int = fields.reference_spp(512)
+    max_depth: int = fields.max_depth(6, at_least=2)
+    loss: Loss = field(default=L1(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the smoke in the cube [-1, 1]³."""
+        density, colour = _smoke(self.grid_resolution)
+        medium = {
+            "type": "heterogeneous",
+            "sigma_t": grid(density),
+            "albedo": grid(colour),
+            "phase": {"type": "isotropic"},
+        }
+        return {
+            "type": "scene",
+            **around(self.views, self.resolution, fov=30.0),
+            "sky": {"type": "envmap", "bitmap": mi.Bitmap(_sky()), "to_world": mi.ScalarTransform4f()},
+            "smoke": cube(medium),
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return both grids; extinction has the wider range, and larger steps."""
+        return (
+            Parameter("smoke.interior_medium.sigma_t.data", initial=0.4, learning_rate=0.1),
+            Parameter("smoke.interior_medium.albedo.data", initial=0.6),
+        )
+
+
+def _smoke(resolution: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return extinction (Z, Y, X, 1), from 0 to about 6, and albedo (Z, Y, X, 3): a rising and spreading plume, ochre below, blue
+    above."""
+    x, y, z = positions(resolution)
+    lean = 0.25 * np.sin(2 * y)
+    radius = np.hypot(x - lean, z) / (0.55 + 0.25 * y)
+    plume = textures.ramp(1.1 - radius, 0, 0.5) * textures.ramp(0.95 - np.abs(y), 0, 0.3)
+    billows = textures.ramp(noise(resolution, 4, seed=1), 0.35, 0.75)
+    density = 6 * plume * billows
+    mix = textures.ramp(y + 0.6 * (noise(resolution, 2, seed=2) - 0.5), -0.6, 0.6)[..., None]
+    colour = np.array([0.9, 0.7, 0.45]) * (1 - mix) + np.array([0.5, 0.7, 0.92]) * mix
+    return density[..., None].astype(np.float32), colour.astype(np.float32)
+
+
+def _sky() -> np.ndarray:
+    """Return a latitude-longitude image with the zenith in its first row: bright and warm on one side, dim and blue on the other."""
+    rows = 32
+    theta = np.pi * (np.arange(rows)[:, None] + 0.5) / rows
+    phi = 2 * np.pi * (np.arange(2 * rows)[None, :] + 0.5) / (2 * rows)
+    towards = np.sin(theta) * np.cos(phi - 1.0) * 0.6 + np.cos(theta) * 0.8
+    glow = np.exp(5 * (towards - 1))[..., None]
+    return (np.array([0.16, 0.2, 0.28]) + glow * np.array([5.0, 4.2, 3.0])).astype(np.float32)
+
+
+@register(name="nerf-volume", position=25)
+@dataclass(frozen=True)
+class NerfVolume:
+    """A toy of coloured balls and blocks, seen from all sides, fitted by a volume that emits and absorbs.
+
+    Several views. The unknowns are extinction (grid_resolution³, 1) and emitted radiance (grid_resolution³, 3), initially a thin grey
+    glow. There is no true value: the toy has surfaces, and its appearance depends on the direction.
+    """
+
+    resolution: int = fields.resolution(32)
+    grid_resolution: int = fields.integer(16, "voxels along a side of each unknown grid", at_least=2)
+    views: int = fields.integer(16, "cameras, at equal angles around the toy", at_least=1, at_most=64)
+    reference_spp: int = fields.reference_spp(256)
+    max_depth: int = fields.max_depth(4, at_least=2)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+    balls: int = fields.integer(
+        0, "number of small coloured balls in place of the toy, a sparse volume; 0 for the toy", 0, 512
+    )
+
+    def scene(self) -> dict[str, Any]:
+        """Return the initial volume in the cube [-1, 1]³."""
+        size = (self.grid_resolution,) * 3
+        density, glow = grid(np.full((*size, 1), 0.5)), grid(np.full((*size, 3), 0.4))
+        return self._stage() | {"volume": cube({"type": "emissive", "sigma_t": density, "emission": glow})}
+
+    def target(self) -> dict[str, Any]:
+        """Return the toy, or the balls, in place of the volume, in the sun."""
+        return self._stage() | (_balls(self.balls) if self.balls else _toy()) | {"sun": parts.sun((0.5, 0.8, 0.4), 0.9)}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return both grids; extinction has the wider range, and larger steps."""
+        return (
+            Parameter("volume.interior_medium.sigma_t.data", learning_rate=0.2),
+            Parameter("volume.interior_medium.emission.data"),
+        )
+
+    def problem(self, name: str) -> Problem:
+        """Return the problem: the volume's scene, with direct emission only, and references of the toy by Mitsuba's `path` integrator."""
+        return Problem(self.scene, self.parameters(), views_of(load(self.target), self), self.loss, 1, name=name)
+
+    def _stage(self) -> dict[str, Any]:
+        sky = {"type": "constant", "radiance": parts.colour(0.3, 0.35, 0.4)}
+        return {"type": "scene", **around(self.views, self.resolution), "sky": sky}
+
+
+def _toy() -> dict[str, Any]:
+    import mitsuba as mi
+
+    to = mi.ScalarTransform4f()
+    red, blue, gold, green = ([0.75, 0.15, 0.1], [0.1, 0.25, 0.7], [0.8, 0.6, 0.15], [0.15, 0.55, 0.2])
+    return {
+        "base": {"type": "cube", "to_world": to.translate([0, -0.55, 0]).scale([0.6, 0.12, 0.6]), "bsdf": parts.diffuse(*blue)},
+        "body": {"type": "sphere", "center": [0.0, -0.1, 0.0], "radius": 0.36, "bsdf": parts.diffuse(*red)},
+        "head": {"type": "sphere", "center": [0.1, 0.4, 0.05], "radius": 0.22, "bsdf": parts.diffuse(*gold)},
+        "arm": {"type": "cube", "to_world": to.translate([-0.35, 0.05, 0.2]).rotate([0, 0, 1], 35).scale([0.3, 0.08, 0.08]),
+                "bsdf": parts.diffuse(*green)},
+    }  # fmt: skip
+
+
+def _balls(count: int) -> dict[str, Any]:
+    """Return balls that fill a hundredth of the cube for any count; the toy fills about a thirteenth."""
+    random = np.random.default_rng(8)
+    radius = float((0.01 * 8 / (count * np.pi * 4 / 3)) ** (1 / 3))
+    reach = min(0.85, 0.98 - radius)
+    centers, colours = random.uniform(-reach, reach, (count, 3)), random.uniform(0.08, 0.8, (count, 3))
+    return {
+        f"ball_{n}": {
+            "type": "sphere",
+            "center": [float(x) for x in center],
+            "radius": radius,
+            "bsdf": parts.diffuse(*colour),
+        }
+        for n, (center, colour) in enumerate(zip(centers, colours.tolist(), strict=True))
+    }

@@ -1,6 +1,6 @@
 """Image estimators, which estimate the image at which the loss is evaluated."""
 
-from unrender.images.denoised import Denoised
+from unrender.images.denoising import Denoised
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 

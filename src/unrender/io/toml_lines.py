@@ -1,14 +1,20 @@
-"""TOML parsing, and the line of each field, which `tomllib` does not report."""
+"""TOML parsing, the line of each field, which `tomllib` does not report, and tables as pydantic models with one-line errors."""
 
 from __future__ import annotations
 
 import re
 import sys
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pydantic
+from pydantic import BaseModel, ConfigDict
 
 from unrender.core.checks import encode_text
 from unrender.core.errors import InputError
+from unrender.core.text import did_you_mean
+from unrender.io import bounded_files
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -195,3 +201,70 @@ def _through_arrays(path: Place, counts: dict[Place, int]) -> Place:
         if through in counts and number < len(path) - 1:
             through = (*through, counts[through])
     return through
+
+
+class Table(BaseModel):
+    """Fields of one table. Each field's description states the expected value."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+_M = TypeVar("_M", bound=Table)
+
+
+def read(file: Path, model: type[_M], tables: Mapping[str, type[Table]]) -> tuple[_M, str]:
+    """Return a file's content, and its text with Unix line ends for `error_at`.
+
+    Args:
+        file: file of at most `toml_lines.LARGEST` bytes.
+        model: model of the top level.
+        tables: models of the fields that are a table or a list of tables.
+
+    Raises:
+        InputError: the file is missing, or "problem.toml:12: parameters[0].bounds: expected ..., got ...".
+    """
+    text = bounded_files.read_text(file, LARGEST).replace("\r\n", "\n")
+    try:
+        return model.model_validate(parse(text, str(file))), text
+    except pydantic.ValidationError as error:
+        # Report an unknown field first: if a name is misspelt, the correct one is missing too.
+        details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+        raise error_at(file, text, *_explain(details[0], model, tables)) from error
+
+
+def error_at(file: Path, text: str, place: Place, what: str) -> InputError:
+    """Return the error for one field of a file."""
+    return InputError(f"{file}:{find(text, place)}: {dotted(place)}: {what}")
+
+
+def _explain(detail: Any, model: type[Table], tables: Mapping[str, type[Table]]) -> tuple[Place, str]:
+    """Return the place and message of one of pydantic's errors, without pydantic's additions for unions and tuples."""
+    location = detail["loc"]
+    place: Place = location[:1]
+    if len(location) >= 2 and location[0] in tables:
+        model, place = tables[location[0]], location[: 3 if isinstance(location[1], int) else 2]
+    name = str(place[-1]) if place else ""
+    fields = {field.alias or own: field for own, field in model.model_fields.items()}
+    if detail["type"] == "extra_forbidden" and name not in fields:
+        names = ", ".join(fields)
+        return place, f"no such field{did_you_mean(name, fields) or f'; there are {names}'}"
+    expected = fields[name].description if name in fields else "a table"
+    if detail["type"] == "missing" and len(location) == len(place):
+        return place, f"missing, expected {expected}"
+    got = repr(detail["input"])
+    return place, f"expected {expected}, got {got if len(got) <= 80 else got[:77] + '...'}"
+
+
+class FieldError(InputError):
+    """An invalid field of a problem.
+
+    Args:
+        place: path of the field, e.g. ("parameters", 0, "bounds").
+        what: what is wrong and what was expected, in one line.
+        owner: name of the field in the message, e.g. "parameter wall.data: bounds"; None for the dotted path.
+    """
+
+    def __init__(self, place: Place, what: str, owner: str | None = None):
+        super().__init__(f"{owner or dotted(place)}: {what}")
+        self.place = place
+        self.what = what

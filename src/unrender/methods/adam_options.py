@@ -10,10 +10,10 @@ from unrender.estimators.base import Estimator
 from unrender.estimators.emitter_selection import EmitterSelection
 from unrender.estimators.path import PathGradient
 from unrender.images.base import ImageEstimator
-from unrender.images.denoised import Denoised
+from unrender.images.denoising import Denoised
 from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
+from unrender.optimizers.recipes import Adam
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 

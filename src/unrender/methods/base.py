@@ -17,7 +17,7 @@ from unrender.estimators.base import Estimator
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.scene.problem import Problem
-from unrender.schedules.functions import Schedule
+from unrender.schedules import Schedule
 
 SCHEDULE_HELP = "schedule of the learning rate: cosine(300), exponential(100), steps(100, 0.5), warmup(20)"
 _TOO_LARGE = 1 << 31

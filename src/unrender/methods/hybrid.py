@@ -22,9 +22,8 @@ from unrender.methods.adam_options import AdamOptions
 from unrender.methods.base import parse_schedule
 from unrender.methods.plan import Plan
 from unrender.methods.smoothed import SIGMA_HELP, WIDTH, parse_widths, widths_of
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
-from unrender.optimizers.meta_adam import MetaAdam
+from unrender.optimizers.recipes import Adam, MetaAdam
 from unrender.pixels.base import PixelSampler
 from unrender.scene.problem import Problem
 

@@ -12,9 +12,8 @@ from unrender.estimators.meta import MetaEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.base import SCHEDULE_HELP, Options, parse_schedule
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
-from unrender.optimizers.meta_adam import MetaAdam
+from unrender.optimizers.recipes import Adam, MetaAdam
 from unrender.statistics import meta
 
 

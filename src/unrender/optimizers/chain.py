@@ -17,7 +17,7 @@ from unrender.estimators.capabilities import Capabilities, Gradient
 from unrender.optimizers import rates
 from unrender.optimizers.transforms.base import StepTransform, StepUpdate, checked_transforms
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
-from unrender.schedules.functions import Schedule
+from unrender.schedules import Schedule
 
 S = TypeVar("S")
 
@@ -114,7 +114,7 @@ class Chain(Recipe):
     Args:
         transforms: Transforms in order; see `unrender.optimizers.transforms`.
         learning_rate: η, in units of the parameter for a direction of size 1, > 0; or {key: rate, "*": rate of the others}.
-        schedule: Factor of every learning rate by step; see `unrender.schedules.functions`.
+        schedule: Factor of every learning rate by step; see `unrender.schedules`.
     """
 
     transforms: tuple[StepTransform, ...] = ()

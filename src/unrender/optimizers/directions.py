@@ -17,10 +17,10 @@ from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Smoothing
 from unrender.optimizers import rates
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.chain import ChainState
+from unrender.optimizers.recipes import Adam
 from unrender.scene.upsampling import NotCarried, Upsampler
-from unrender.schedules.functions import Schedule
+from unrender.schedules import Schedule
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.directions import NewtonState, apply_direction, check_options, coordinate_scales, init_state
-from unrender.schedules.functions import Schedule
+from unrender.optimizers.recipes import Adam
+from unrender.schedules import Schedule
 
 _FIRST_STEP = 0.1
 """Length of a step without curvature information, as a fraction of the trust radius."""
@@ -57,15 +57,10 @@ class LBFGS:
     that it "almost never converges" there), which a `schedule` delays. B is biased even if the gradients are not.
 
     Args:
-        learning_rate: η, in units of the parameter, > 0, for the parameters without their own. With 1 the trust region is in units of σ,
-            or of the parameters; with learning rates that suit Adam, radii of 10 to 100 are usual.
         trust_radius: Δ, largest Euclidean length of a step over all elements of u, > 0.
         history: number of pairs, >= 1.
         curvature: smallest cosine between s and y of a pair, in (0, 1).
-        step_scale: γ, factor of the step, in (0, 1]; no effect with `inner_optimizer`.
-        inner_optimizer: an Adam whose gradient is the negated step; its own learning rate, or the parameter's, determines the length.
-            None takes the step itself.
-        schedule: final factor of the step, by step; see `unrender.schedules.functions`.
+        learning_rate, step_scale, inner_optimizer, schedule: as in `Newton`.
     """
 
     learning_rate: float = 1.0

@@ -13,8 +13,8 @@ from unrender.core.text import listed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate, Capabilities, FreshGradient, Gradient
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Choosing, Optimizer, averaged_by
+from unrender.optimizers.recipes import Adam
 from unrender.optimizers.transforms.base import checked_keys
 from unrender.scene.upsampling import Upsampler, restarted, upsampled
 

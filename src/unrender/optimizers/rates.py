@@ -9,7 +9,7 @@ from typing import Any
 from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
-from unrender.schedules.functions import Schedule
+from unrender.schedules import Schedule
 
 
 def check(owner: str, learning_rate: Any, schedule: Any) -> None:
@@ -25,7 +25,7 @@ def check(owner: str, learning_rate: Any, schedule: Any) -> None:
     else:
         checks.number(owner, "learning_rate", learning_rate, above=0.0)
     if schedule is not None and not callable(schedule):
-        raise InputError(f"{owner}: schedule must be one of unrender.schedules.functions or None, got {schedule!r}")
+        raise InputError(f"{owner}: schedule must be one of unrender.schedules or None, got {schedule!r}")
 
 
 def per_parameter(

@@ -20,7 +20,7 @@ from unrender.optimizers.transforms.scale import ScaleByRms
 from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
 from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
 from unrender.preconditioners.base import Preconditioner
-from unrender.schedules.functions import Schedule
+from unrender.schedules import Schedule
 
 
 @register
@@ -59,7 +59,7 @@ class ScheduleFree(Recipe):
         averaging: r, >= 0.
         growth: q of `AgreementRate`, >= 0; 0 for a rate that never grows.
         decay: p of `AgreementRate`, >= 0; 0 for a rate that never decays.
-        schedule: additional factor of every learning rate by step; see `unrender.schedules.functions`.
+        schedule: additional factor of every learning rate by step; see `unrender.schedules`.
         preconditioner: S, applied to the gradients and to the steps of z for the parameters in `preconditioned`. It replaces the
             preconditioner of a `Parameter`, which would optimise u = S⁻¹ x without knowledge of the bounds. The strength of `Sobolev` is
             an upper limit; it is fitted to the gradients, see `StrengthFit`.

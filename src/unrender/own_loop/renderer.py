@@ -22,7 +22,7 @@ from unrender.own_loop import saved
 from unrender.own_loop.options import Options, open_scene, problem_of
 from unrender.own_loop.saved import RendererState
 from unrender.own_loop.stream import Batch, Rendered, Stream
-from unrender.own_loop.values import Exchange, LoopParameters
+from unrender.own_loop.values import Exchange, LoopParameters, with_drjit, with_torch
 from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
 from unrender.scene.bounds import off_ends
@@ -144,9 +144,7 @@ class Renderer:
             case "numpy":
                 attached = images
             case "drjit":
-                from unrender.own_loop import graph_operations
-
-                attached = graph_operations.with_drjit(backward, images, self._exchange.attached(inputs))
+                attached = with_drjit(backward, images, self._exchange.attached(inputs))
             case "torch":
                 attached = self._with_torch(inputs, images, backward)
         return attached[0] if self._alone(sensor) else attached
@@ -331,8 +329,6 @@ class Renderer:
     def _with_torch(
         self, inputs: LoopParameters, images: tuple[Any, ...], backward: Callable[..., Tree]
     ) -> tuple[Any, ...]:
-        from unrender.own_loop import graph_operations
-
         tensors = {key: value for key, value in inputs.values.items() if frameworks.is_torch(value)}
         detached = LoopParameters("torch", {key: value.detach() for key, value in tensors.items()})
         device = images[0].device
@@ -341,7 +337,7 @@ class Renderer:
             return [x.to("cpu") for x in self._exchange.gradient(backward(derivatives), detached).values()]
 
         on_host = tuple(image.to("cpu") for image in images)
-        return tuple(x.to(device) for x in graph_operations.with_torch(gradients, on_host, list(tensors.values())))
+        return tuple(x.to(device) for x in with_torch(gradients, on_host, list(tensors.values())))
 
     # ------------------------------------------------------------------ sensors
 

@@ -1,9 +1,8 @@
 """Pixel samplers, which choose the pixels that a step renders: all, or a mini-batch."""
 
-from unrender.pixels.adaptive import Adaptive
+from unrender.pixels.adaptive import Adaptive, LossProportional
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
-from unrender.pixels.loss_proportional import LossProportional
 from unrender.pixels.uniform import Uniform
 from unrender.pixels.views import Views
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,9 +29,28 @@ def default_count(problem: Problem) -> int:
     return min(problem.pixels, max(problem.pixels // 4, _FEWEST))
 
 
+class _Guided(ABC):
+    """A sampler whose options define a `GuidedSampler`."""
+
+    @abstractmethod
+    def _sampler_for(self, problem: Problem) -> GuidedSampler: ...
+
+    def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
+        del parameters
+        return self._sampler_for(problem).init(problem)
+
+    def draw(
+        self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
+    ) -> tuple[MiniBatch, GuidedSamplerState]:
+        return self._sampler_for(problem).draw(problem, parameters, state, key)
+
+    def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
+        return self._sampler_for(problem).redraw(problem, state, key)
+
+
 @register
 @dataclass(frozen=True)
-class Adaptive:
+class Adaptive(_Guided):
     """Importance sampling of pixels, p_j = λ u_j + (1 - λ) q_j with uniform u_j and q_j ∝ sqrt(E[(∂L/∂I_j)²] · Σ_k E[(∂I_j/∂θ_k)²] / c_j)
     (Eq. 12).
 
@@ -96,18 +116,6 @@ class Adaptive:
     def _sampler_for(self, problem: Problem) -> GuidedSampler:
         return self._sampler(default_count(problem) if self.count is None else self.count)
 
-    def init(self, problem: Problem, parameters: Tree) -> GuidedSamplerState:
-        del parameters
-        return self._sampler_for(problem).init(problem)
-
-    def draw(
-        self, problem: Problem, parameters: Tree, state: GuidedSamplerState, key: Key
-    ) -> tuple[MiniBatch, GuidedSamplerState]:
-        return self._sampler_for(problem).draw(problem, parameters, state, key)
-
-    def redraw(self, problem: Problem, state: GuidedSamplerState, key: Key) -> MiniBatch:
-        return self._sampler_for(problem).redraw(problem, state, key)
-
     def learn(
         self, problem: Problem, state: GuidedSamplerState, sample: PixelSample, draws: DrawStatistics
     ) -> GuidedSamplerState:
@@ -139,3 +147,50 @@ class _GradientVariance(ImportanceRule):
             mass = float((density * tiles.sizes).sum())
             total += density / mass if mass > 0 else 0.0
         return total
+
+
+@register
+@dataclass(frozen=True)
+class LossProportional(_Guided):
+    """Importance sampling of pixels, p_j = λ u_j + (1 - λ) q_j with uniform u_j and q_j ∝ E|∂L/∂I_j|, summed over the channels. Unbiased.
+
+    This is Eq. 5 of the paper of `Adaptive`. Unlike `Adaptive` it ignores noise and parameter derivatives.
+
+    Args:
+        count, refresh, samples, uniform, stratified, denoiser: see `Adaptive`.
+    """
+
+    count: int
+    refresh: int = 20
+    samples: int | None = None
+    uniform: float = 0.1
+    stratified: bool = True
+    denoiser: MapDenoiser = "auto"
+
+    def __post_init__(self):
+        checks.flags(self)
+        self._sampler_for(None).check()
+
+    def _sampler_for(self, problem: Problem | None) -> GuidedSampler:
+        del problem
+        own = self.count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser
+        return GuidedSampler("LossProportional", GuidedOptions(*own), _LossDerivative())
+
+    def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
+        """Return the state unchanged."""
+        del problem, gradient
+        return state
+
+
+@dataclass(frozen=True)
+class _LossDerivative(ImportanceRule):
+    """Importance of Eq. 5."""
+
+    def maps(self, statistics: PixelStatistics) -> Maps:
+        """Return the mean magnitude of the loss derivative."""
+        return (statistics.magnitudes[0],)
+
+    def density(self, tiles: Tiles, maps: Maps, denoised: Maps) -> np.ndarray:
+        """Return the sum over the channels."""
+        del tiles, maps
+        return denoised[0].sum(axis=1)

@@ -1,6 +1,7 @@
-"""Sobolev gradients of textures, grids and values at mesh vertices.
+"""Sobolev gradients and large steps: powers of (I + λ L)^-1 on textures, grids and meshes.
 
-Descent along the gradient of the H¹ inner product in place of L²: Neuberger 1997, "Sobolev Gradients and Differential Equations".
+Descent along the gradient of the H¹ inner product in place of L²: Neuberger 1997, "Sobolev Gradients and Differential Equations". Large
+steps: Nicolet, Jacobson and Jakob 2021, "Large Steps in Inverse Rendering of Geometry".
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from unrender.core import arrays, checks, periodic
 from unrender.core.arrays import Array
 from unrender.core.registry import register
-from unrender.preconditioners import grid, grid_pyramid
+from unrender.preconditioners import grid
 from unrender.preconditioners.base import Around, around_axis
 from unrender.preconditioners.mesh import MeshSpectrum, MeshTopology
 
@@ -154,17 +155,17 @@ class Sobolev:
         """Return whether an array of this shape stays on the device, as large textures and grids do."""
         return self._pyramid(shape) is not None
 
-    def _pyramid(self, shape: tuple[int, ...]) -> grid_pyramid.GridPyramid | None:
+    def _pyramid(self, shape: tuple[int, ...]) -> grid.GridPyramid | None:
         """Return the pyramid that replaces transforms of a large grid; None for small grids and meshes."""
         if self._spectrum is not None or self._around(shape) is not None:
             return None
-        if math.prod(shape[:-1]) <= grid_pyramid.LARGEST_EXACT or any(self._wraps(shape)):
+        if math.prod(shape[:-1]) <= grid.LARGEST_EXACT or any(self._wraps(shape)):
             return None
-        return grid_pyramid.pyramid(shape[:-1])
+        return grid.pyramid(shape[:-1])
 
     def _around(self, shape: tuple[int, ...]) -> Around[Sobolev] | None:
         """Return the preconditioner of an environment map that is small enough for transforms; None for anything else."""
-        if not self._columns or math.prod(shape[:2]) > grid_pyramid.LARGEST_EXACT:
+        if not self._columns or math.prod(shape[:2]) > grid.LARGEST_EXACT:
             return None
         return Around(replace(self, wrap=around_axis(self.wrap)), self._columns)
 
@@ -179,3 +180,53 @@ class Sobolev:
 
     def _wraps(self, shape: tuple[int, ...]) -> tuple[bool, ...]:
         return grid.per_axis(self.wrap, len(shape) - 1)
+
+
+@register
+@dataclass(frozen=True)
+class LargeSteps:
+    """S = (I + λ L)^-1 with the graph Laplacian L of the texture's grid or of the mesh, for each channel or coordinate separately.
+
+    S blurs gradient noise and steps over about √λ texels (its kernel falls by e over √λ). Constants are preserved, and S has full rank,
+    so the minima are the same and all detail is reachable. S is symmetric with eigenvalues in [1/(1 + 4 d λ), 1] on d axes.
+
+    Supports textures (H, W, C), grids (Z, Y, X, C), and values at mesh vertices (n V,). For vertex positions use `Adam(uniform=True)` as
+    in the paper: one step scale for all vertices keeps smooth steps smooth. Mesh vertices at the same position move together. Computed on
+    the host in float32. The result has the argument's type. For Dr.Jit arrays it waits for the device, and copies to and from a GPU.
+
+    Args:
+        strength: λ, >= 0; 0 is the identity. Usual values are 1 to 100.
+        wrap: whether opposite borders are neighbours, as in a tiling texture: one truth value, or one per axis. An environment map (H, W,
+            C) wraps as (False, True).
+    """
+
+    strength: float = 10.0
+    wrap: bool | tuple[bool, ...] = False
+    _mesh: MeshTopology | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        checks.number("LargeSteps", "strength", self.strength, above=0.0, inclusive=True)
+        object.__setattr__(self, "wrap", grid.wraps("LargeSteps", self.wrap))
+
+    def on_mesh(self, topology: MeshTopology) -> LargeSteps:
+        bound = LargeSteps(self.strength, self.wrap)
+        object.__setattr__(bound, "_mesh", topology)
+        return bound
+
+    def on_repeated(self, columns: int) -> Around:
+        """Return the preconditioner of an environment map."""
+        return Around(replace(self, wrap=around_axis(self.wrap)), columns)
+
+    def check(self, key: str, shape: tuple[int, ...]) -> None:
+        if self._mesh is not None:
+            return
+        grid.check("LargeSteps", key, shape, self.wrap)
+
+    def apply(self, x: Array) -> Array:
+        """Return S x, with the shape and type of `x`. Raises `InputError` for an unsupported shape."""
+        if self._mesh is not None:
+            return arrays.like(self._mesh.solver(float(self.strength)).solve(arrays.numpy(x)), x)
+        shape = arrays.shape(x)
+        self.check("parameter", shape)
+        solver = grid.solver(float(self.strength), shape[:-1], grid.per_axis(self.wrap, len(shape) - 1))
+        return arrays.like(solver.solve(arrays.numpy(x)), x)

@@ -1,6 +1,6 @@
 """Renderer protocols: everything that the methods may use of a renderer.
 
-`rendering/mitsuba/` implements them with Mitsuba, `rendering/numpy/` with known integrals and gradients. Arrays are the renderer's own
+`rendering/mitsuba/` implements them with Mitsuba, `gallery/analytic.py` with known integrals and gradients. Arrays are the renderer's own
 (`mi.TensorXf`, `np.ndarray`). Parameters are dictionaries {key: array} and are never changed in place.
 """
 

@@ -1,10 +1,11 @@
-"""Callbacks: receivers of the events of a run, both parts of the run itself and user code."""
+"""Callbacks: receivers of the events of a run, both parts of the run itself and user code; and the times of its phases."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -182,3 +183,40 @@ class TensorBoard(Callback):
             if view < _VIEWS and shown.shape == reference.shape:
                 colours = srgb(reduced(shown, _LARGEST) * exposure(reference))
                 self._writer.add_image(f"view/{view}", quantized(colours), step, dataformats="HWC")
+
+
+COMPILING, STEPS, ASIDE = "compiling", "steps", "checkpoints and callbacks"
+VERIFYING, PICTURES = "verification", "final pictures"
+"""Phases of a run in order: before the first step; the steps; what happens between and after them."""
+
+RUN_PHASES = (COMPILING, STEPS, ASIDE, VERIFYING, PICTURES)
+
+
+class PhaseTimes(Callback):
+    """Callback that records the seconds of each phase in `Result.phases`. It is the first callback, so that saved results contain them.
+
+    Compiling between steps, after a change of resolution or of a mesh, counts as compiling.
+
+    Args:
+        earlier: {phase: seconds} before the run, such as loading.
+    """
+
+    def __init__(self, earlier: Mapping[str, float] | None = None):
+        self._earlier = dict(earlier or {})
+        self._made = self._started = time.perf_counter()
+        self._clock = self._warm = 0.0
+
+    def on_start(self, run: Run) -> None:
+        self._started, self._clock, self._warm = time.perf_counter(), run.clock, run.warmup_seconds
+
+    def on_result(self, run: Run, result: Result) -> Result:
+        steps = run.clock - self._clock
+        between = run.warmup_seconds - self._warm
+        aside = time.perf_counter() - self._started - steps - between
+        run_phases = {COMPILING: self._started - self._made + between, STEPS: steps, ASIDE: max(aside, 0.0)}
+        return replace(result, phases={**self._earlier, **run_phases})
+
+
+def with_phase(result: Result, name: str, seconds: float) -> Result:
+    """Return the result with an additional phase."""
+    return replace(result, phases={**result.phases, name: seconds})

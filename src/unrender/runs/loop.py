@@ -20,12 +20,12 @@ from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Measuring, Optimizer
-from unrender.runs.mesh_guard import guarded
+from unrender.runs.callbacks import COMPILING
 from unrender.runs.noise import GradientNoise
-from unrender.runs.phase_times import COMPILING
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, interruptible
 from unrender.scene.problem import Problem
+from unrender.scene.surfaces import guarded
 
 _ERRORS_PER_SECOND = 10.0
 _ERROR_PAUSE = 20.0

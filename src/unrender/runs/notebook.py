@@ -14,8 +14,7 @@ from unrender.display.pictures import shown_image, shown_map
 from unrender.display.plots import Line, chart
 from unrender.rendering import parameter_errors
 from unrender.rendering.parameter_errors import ErrorMeasure
-from unrender.runs.callbacks import Callback
-from unrender.runs.phase_times import COMPILING
+from unrender.runs.callbacks import COMPILING, Callback
 
 if TYPE_CHECKING:
     from unrender.runs.result import Result

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,6 +13,7 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
+from unrender.runs.folder.state import parts
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
@@ -264,15 +264,6 @@ class HasControlVariates(Protocol):
 
 def control_variates(state: Any) -> Iterator[tuple[Tree, Sequence[Array]]]:
     """Yield the control variates in all parts of an estimator's state."""
-    if isinstance(state, HasControlVariates):
-        if (images := state.control_variates()) is not None:
+    for part in parts(state):
+        if isinstance(part, HasControlVariates) and (images := part.control_variates()) is not None:
             yield images
-    elif dataclasses.is_dataclass(state) and not isinstance(state, type):
-        for field in dataclasses.fields(state):
-            yield from control_variates(getattr(state, field.name))
-    elif isinstance(state, Mapping):
-        for part in state.values():
-            yield from control_variates(part)
-    elif isinstance(state, (list, tuple)):
-        for part in state:
-            yield from control_variates(part)

@@ -15,7 +15,7 @@ from unrender.core import phases
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
 from unrender.optimizers.averaged_newton import AveragedNewton
-from unrender.runs import phase_times
+from unrender.runs import callbacks
 from unrender.runs.callbacks import Callback
 from unrender.runs.earlier_image import (
     FIRST_CANDIDATE,
@@ -77,7 +77,7 @@ class Verify(Callback):
     def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
         """Render the start, which also compiles the kernels of fresh pictures, so that nothing compiles after the last step."""
         del fresh, warm
-        with phases.phase(phase_times.COMPILING):
+        with phases.phase(callbacks.COMPILING):
             self._small = FreshPictures(run.problem, run.seed, 0, _SMALL)
             if _other_meshes(run.problem):
                 self._small.images(run.full())
@@ -105,9 +105,9 @@ class Verify(Callback):
         if result.stopped in (INTERRUPTED, TERMINATED, PRUNED) or not result.steps:
             return result
         started = time.perf_counter()
-        with phases.phase(phase_times.VERIFYING):
+        with phases.phase(callbacks.VERIFYING):
             result = unit_directions(run.problem, self._verified(run, result))
-        return phase_times.with_phase(result, phase_times.VERIFYING, time.perf_counter() - started)
+        return callbacks.with_phase(result, callbacks.VERIFYING, time.perf_counter() - started)
 
     def _verified(self, run: Run, result: Result) -> Result:
         problem = run.problem

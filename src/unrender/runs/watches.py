@@ -10,9 +10,8 @@ from unrender.core import arrays, memory
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import BlockEstimate
 from unrender.optimizers import rates
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
-from unrender.optimizers.meta_adam import MetaAdam
+from unrender.optimizers.recipes import Adam, MetaAdam
 from unrender.runs.callbacks import Callback
 from unrender.scene.problem import Problem
 from unrender.scene.surfaces import crossing_triangles, folds

@@ -13,7 +13,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.core.trees import Tree
-from unrender.parameterisations.base import Bounds
+from unrender.parameterisations import Bounds
 from unrender.rendering.renderer import ParameterInfo
 
 MARGIN = 1e-4

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from unrender.core import arrays, periodic, trees
 from unrender.core.trees import Tree
-from unrender.parameterisations.base import Transform
+from unrender.parameterisations import Transform
 from unrender.preconditioners.base import Preconditioner
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
+from unrender.io.toml_lines import FieldError
 from unrender.scene import remeshing
-from unrender.scene.errors import FieldError
 from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.remeshing import Remeshing
 from unrender.scene.surfaces import Surface, area_normals

@@ -11,12 +11,12 @@ import numpy as np
 
 from unrender.core import checks
 from unrender.core.errors import InputError, KeyedError
-from unrender.parameterisations.base import Parameterisation
+from unrender.io.toml_lines import FieldError
+from unrender.parameterisations import Parameterisation
 from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.renderer import Renderer
 from unrender.rendering.tied import Tie, with_ties
 from unrender.scene.coarse_to_fine import CoarseToFine
-from unrender.scene.errors import FieldError
 from unrender.scene.mesh_regularizer import MeshRegularizer
 from unrender.scene.prior import Prior
 from unrender.scene.remeshing import Remeshing

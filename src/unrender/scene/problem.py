@@ -15,6 +15,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError, KeyedError
 from unrender.core.exclusive import exclusive
 from unrender.core.trees import Tree
+from unrender.io.toml_lines import FieldError
 from unrender.losses import L2, Loss
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.expressions import are_storable, with_expressions
@@ -23,7 +24,6 @@ from unrender.rendering.renderer import Renderer
 from unrender.scene import notebook
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.coordinates import Coordinates
-from unrender.scene.errors import FieldError
 from unrender.scene.executor import LOCAL, Executor
 from unrender.scene.mesh_checks import check_surfaces
 from unrender.scene.parameter import Parameter, ParameterSettings, members_of, scene_keys, tied, ties_of

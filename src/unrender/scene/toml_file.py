@@ -40,11 +40,10 @@ from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
 from unrender.core import tables
 from unrender.core.errors import InputError
-from unrender.io import bounded_files, confinement, toml_models
-from unrender.io.toml_models import Table
+from unrender.io import bounded_files, confinement, toml_lines
+from unrender.io.toml_lines import FieldError, Table
 from unrender.rendering.picture_format import AOVS
 from unrender.scene import coarse_to_fine
-from unrender.scene.errors import FieldError
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
@@ -137,7 +136,7 @@ def read(path: str | Path, partial: bool = False) -> Problem:
         if place[0] == "truth":  # a file lists it with the parameter
             keys = [parameter.key or next(iter(parameter.keys or [""])) for parameter in model.parameters]
             place = ("parameters", keys.index(str(place[1])), "truth")
-        raise toml_models.error_at(file, text, place, error.what) from error
+        raise toml_lines.error_at(file, text, place, error.what) from error
 
 
 def check(path: str | Path) -> None:
@@ -146,11 +145,11 @@ def check(path: str | Path) -> None:
     model, text = _read_model(file)
     scene = file.parent / model.scene
     if not scene.exists():
-        raise toml_models.error_at(file, text, ("scene",), f"{scene}: {bounded_files.no_file(scene)}")
+        raise toml_lines.error_at(file, text, ("scene",), f"{scene}: {bounded_files.no_file(scene)}")
 
 
 def _read_model(file: Path) -> tuple[_Problem, str]:
-    return toml_models.read(file, _Problem, {"parameters": _Parameter, "views": _View})
+    return toml_lines.read(file, _Problem, {"parameters": _Parameter, "views": _View})
 
 
 def _build(model: _Problem, file: Path, partial: bool) -> Problem:

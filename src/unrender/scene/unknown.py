@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
-from unrender.parameterisations.base import Bounds, Parameterisation, Transform
+from unrender.parameterisations import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.scene.bounds import open_scale, project

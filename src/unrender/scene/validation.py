@@ -15,8 +15,9 @@ from unrender.core import arrays, tables
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean, shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
+from unrender.io.toml_lines import FieldError
 from unrender.losses import FunctionLoss, Loss
-from unrender.parameterisations.base import Bounds, Parameterisation, Transform
+from unrender.parameterisations import Bounds, Parameterisation, Transform
 from unrender.preconditioners.base import Preconditioner, bound_to
 from unrender.preconditioners.mesh import MeshTopology
 from unrender.rendering.parameter_errors import ErrorMeasure
@@ -25,7 +26,6 @@ from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene import coarse_to_fine
 from unrender.scene.bounds import angle_notice, check_bounds, move_inside, open_scale, project, truth_notice
 from unrender.scene.coarse_to_fine import CoarseToFine
-from unrender.scene.errors import FieldError
 from unrender.scene.key_hints import instead_of, near_key
 from unrender.scene.mesh_checks import check_regularizer, check_remeshing, check_self_intersection, mesh_notices
 from unrender.scene.parameter import Parameter, ParameterSettings

@@ -29,11 +29,11 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.io import images, parameter_values
 from unrender.io.stored_pictures import PictureStore, StoredPicture
+from unrender.io.toml_lines import FieldError
 from unrender.losses import Censored, Loss
 from unrender.rendering.picture_format import PictureFormat, format_of
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.scene.bounds import angle_notice
-from unrender.scene.errors import FieldError
 from unrender.scene.references import ON_DEVICE
 from unrender.scene.validation import is_number
 from unrender.scene.view import View

@@ -13,11 +13,11 @@ from unrender.core import arrays, checks
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.io import parameter_values
+from unrender.io.toml_lines import FieldError
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.picture_format import AOVS, AovRenderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.rendering.worlds import World, with_worlds
-from unrender.scene.errors import FieldError
 from unrender.scene.view import View
 from unrender.scene.view_checks import check_sensor
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unrender.app.capture.cameras import Lens, project
-from unrender.app.capture.capture import Capture, CapturedView, CapturedViews
-from unrender.app.capture.conventions import AXES, reinterpreted
+from unrender.app.capture.capture import AXES, Capture, CapturedView, CapturedViews, reinterpreted
 from unrender.app.capture.mesh import Mesh, decimate, smooth, without_crumbs
 from unrender.app.capture.silhouettes import Silhouettes, overlap
 from unrender.app.capture.stored import StoredArrays

@@ -14,16 +14,15 @@ from unrender.app.capture import (
     field_folder,
     formats,
     hull,
-    overlays,
     photometric_folder,
     pictures,
     problem_folder,
+    silhouettes,
     turntable,
     writing,
 )
 from unrender.app.capture import mesh as meshes
-from unrender.app.capture.capture import Capture
-from unrender.app.capture.conventions import reinterpreted
+from unrender.app.capture.capture import Capture, reinterpreted
 from unrender.app.capture.formats import lights
 from unrender.app.capture.mesh import Mesh
 from unrender.app.capture.silhouettes import Silhouettes, overlap
@@ -66,7 +65,7 @@ class ImportOptions:
         mesh: a PLY or OBJ file in the world space of the cameras; None for a hull of the masks.
         masks: a folder of masks with the names of the photographs; None for the masks of the capture.
         kind: a key of `formats.FORMATS`, or "lights"; None to detect it.
-        axes: a key of `conventions.AXES`, if the files differ from their format; None for the convention of the format.
+        axes: a key of `capture.AXES`, if the files differ from their format; None for the convention of the format.
         world_to_camera: whether matrices are inverse poses; None for the convention of the format.
         resolution: maximum pixels along the longer side of a view, >= 8.
         scale: a scale factor of the photographs in (0, 1], instead of `resolution`; None for `resolution`.
@@ -206,7 +205,10 @@ def import_capture(
             views = data.views, mesh, data.silhouettes
             problem_folder.write(place, name, *views, options.texture, chosen, options.band, data.turntable)
             (place / SHEET).write_bytes(
-                _sheet(data, [overlays.thumbnail(_overlay(data, index)) for index in overlays.chosen(len(data.views))])
+                _sheet(
+                    data,
+                    [silhouettes.thumbnail(_overlay(data, index)) for index in silhouettes.chosen(len(data.views))],
+                )
             )
 
     _write_folder(out, fill)
@@ -292,12 +294,12 @@ def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, st
     def fill(place: Path) -> None:
         with phases.phase("pictures"):
             (place / CHECK).mkdir()
-            shown, thumbnails = set(overlays.chosen(len(data.views))), []
+            shown, thumbnails = set(silhouettes.chosen(len(data.views))), []
             for index, view in enumerate(data.views):
                 picture = _overlay(data, index)
                 name = f"{index:04d}-{file_name(Path(view.name).stem)}.png"
                 (place / CHECK / name).write_bytes(png(picture))
-                thumbnails += [overlays.thumbnail(picture)] if index in shown else []
+                thumbnails += [silhouettes.thumbnail(picture)] if index in shown else []
             (place / SHEET).write_bytes(_sheet(data, thumbnails))
 
     _write_folder(out, fill)
@@ -366,15 +368,15 @@ def _has_masks(capture: Capture) -> bool:
 
 
 def _overlay(data: _Read, index: int) -> np.ndarray:
-    return overlays.overlay(data.views[index], data.silhouettes)
+    return silhouettes.overlay(data.views[index], data.silhouettes)
 
 
 def _sheet(data: _Read, thumbnails: list[Image.Image]) -> bytes:
-    """Return the contact sheet of the views of `overlays.chosen`."""
+    """Return the contact sheet of the views of `silhouettes.chosen`."""
     overlaps = [f"IoU {value:.3f}  " for value in data.overlaps] or [""] * len(data.views)
     names = [view.name for view in data.views.bare()]
-    labels = [f"{overlaps[index]}{printable(names[index])}" for index in overlays.chosen(len(names))]
-    return overlays.contact_sheet(thumbnails, labels)
+    labels = [f"{overlaps[index]}{printable(names[index])}" for index in silhouettes.chosen(len(names))]
+    return silhouettes.contact_sheet(thumbnails, labels)
 
 
 def _imported(data: _Read, out: Path, mesh: Mesh) -> Imported:

@@ -24,7 +24,7 @@ from scipy import ndimage
 from unrender.app.capture import pictures
 from unrender.app.capture.cameras import Lens
 from unrender.app.capture.formats.lights import LitCapture
-from unrender.app.capture.undistortion import Resampling, pinhole
+from unrender.app.capture.views import Resampling, pinhole
 from unrender.app.capture.writing import (
     MASKS,
     PROBLEM,

@@ -31,9 +31,9 @@ from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
 from unrender.core.errors import InputError
+from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.core.text import printable
 from unrender.io import images
-from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 from unrender.rendering.mitsuba import turntable_light
 
 MESH = "asset.ply"

@@ -13,11 +13,9 @@ from unrender.app.cli.export import export
 from unrender.app.cli.gallery import gallery
 from unrender.app.cli.import_ import import_
 from unrender.app.cli.methods import methods
-from unrender.app.cli.report import report
-from unrender.app.cli.resume import resume
-from unrender.app.cli.run import run
+from unrender.app.cli.report import report, watch
+from unrender.app.cli.run import resume, run
 from unrender.app.cli.sweep import sweep_command
-from unrender.app.cli.watch import watch
 
 app = typer.Typer(
     help="Recover the parameters of a scene (textures, materials, lights) from images.",

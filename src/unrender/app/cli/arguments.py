@@ -335,9 +335,9 @@ def command_line(context: typer.Context) -> str:
 
 def finished_run(directory: Path) -> Path:
     """Return the folder itself or, for a run in stages, the run folder of the last stage that has started. Raise `InputError`."""
-    from unrender.app.stages import run_folders
+    from unrender.app.stages import stages_file
 
-    return run_folders.last_result(directory)
+    return stages_file.last_result(directory)
 
 
 def remove_if_empty(directory: Path) -> None:

@@ -16,12 +16,11 @@ from unrender.display.terminal import Console, columns
 from unrender.methods import Method
 from unrender.methods.plan_file import PlanFile
 from unrender.runs import watches
-from unrender.runs.callbacks import Callback
+from unrender.runs.callbacks import RUN_PHASES, Callback
 from unrender.runs.final_images import image_name
 from unrender.runs.image_sensitivity import seen_cells
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
-from unrender.runs.phase_times import RUN_PHASES
 from unrender.runs.progress import Progress
 from unrender.runs.result import Result
 from unrender.scene.notebook import describe_views

@@ -1,14 +1,16 @@
-"""`unrender run`: recover one problem's parameters by one method."""
+"""`unrender run` recovers one problem's parameters by one method, and `unrender resume` continues a run from its last checkpoint."""
 
 from __future__ import annotations
 
+import contextlib
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from unrender.app.cli import arguments, distribution, stages
+from unrender.app.cli import arguments, stages
 from unrender.app.cli.arguments import (
     AllowOutside,
     CheckpointEvery,
@@ -23,18 +25,67 @@ from unrender.app.cli.arguments import (
     Variant,
     WorkersOption,
 )
-from unrender.app.cli.distribution import Compress
 from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
 from unrender.core import phases
 from unrender.core.errors import InputError
 
 if TYPE_CHECKING:
+    from unrender.app.distributed.cluster import Workers
     from unrender.display.terminal import Console
     from unrender.methods import Method
     from unrender.methods.plan_file import PlanFile
+    from unrender.runs.folder.schema import RunRecord
     from unrender.runs.progress import Progress
     from unrender.runs.result import Result
     from unrender.scene.problem import Problem
+
+Compress = Annotated[
+    bool,
+    typer.Option(
+        "--compress",
+        help="With --workers: send parameters as 16-bit differences and gradients in single precision, half the bytes.",
+        show_default=False,
+    ),
+]
+
+
+def check_workers(workers: str | None, compress: bool, insecure: bool = False) -> Workers | None:
+    """Return `arguments.workers`. Raise `InputError` also for --compress without other processes."""
+    if compress and workers is None:
+        raise InputError("--compress: requires --workers")
+    parsed = arguments.workers(workers, insecure)
+    if compress and parsed is None:
+        raise InputError("--compress: requires other processes, but --workers 1 is this process; use more workers")
+    return parsed
+
+
+def variant_again(typed: str | None, record: RunRecord) -> str:
+    """Return the Mitsuba variant of the workers of a resumed run: the typed one, else the run's, else `auto`."""
+    from unrender.backend.variant import VARIANTS
+
+    before = record.problem.description.get("workers")
+    return typed or (before if before in VARIANTS else "auto")
+
+
+@contextlib.contextmanager
+def distributed(
+    problem: Problem, workers: Workers | None, compress: bool, variant: str, threads: int | None, console: Console
+) -> Iterator[Problem]:
+    """Yield the problem with its views distributed to workers; the problem itself for None. See `unrender.app.distribute`."""
+    if workers is None:
+        yield problem
+        return
+    from rich.markup import escape
+
+    from unrender.app.distributed.distribute import distribute
+
+    def tell(line: str) -> None:
+        console.print(f"[yellow]workers[/] {escape(line)}", soft_wrap=True)
+
+    with contextlib.ExitStack() as stack:
+        with phases.phase("workers"):
+            inner = stack.enter_context(distribute(problem, workers, compress, variant, threads, tell))
+        yield inner
 
 
 _MethodName = Annotated[
@@ -86,7 +137,7 @@ def run(
 
     console, command = Console(highlight=False), arguments.command_line(context)
     with Progress(console) as progress:  # options are refused before the slow imports of "loading"
-        chosen, processes = _method(method_name), distribution.check(workers, compress, insecure)
+        chosen, processes = _method(method_name), check_workers(workers, compress, insecure)
         if stages.is_stages(problem):
             stages.refuse_settings(method_name, values, options, workers, no_cache)
             first = seed if "--seed" in arguments.typed_options(context) else None
@@ -104,7 +155,7 @@ def run(
             running = arguments.use_variant(variant, threads)
             opened = arguments.open_problem(problem, options, not no_cache)
             introduce(console, opened, running)
-            with distribution.distributed(opened, processes, compress, variant, threads, console) as shared:
+            with distributed(opened, processes, compress, variant, threads, console) as shared:
                 task = RunOrder(chosen, values, *budget, seed, final_spp, command, options, checkpoint_every)
                 with execution(shared, task, folder, console, progress) as order:
                     result = optimize(**order)
@@ -184,3 +235,63 @@ def _budget_settings(
             except ValueError as error:
                 raise InputError(f"--set {name}={text}: expected {expected}") from error
     return budget["steps"], budget["seconds"]
+
+
+def resume(
+    context: typer.Context,
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="A run folder, or the folder of a run in stages.")],
+    steps: Annotated[
+        int | None, typer.Option(help="Stop after this number of steps from the run's start. [default: the run's]")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after this many seconds from the run's start.")] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Continue even if the problem, its files or versions have changed.")
+    ] = False,
+    variant: Annotated[str | None, typer.Option(help="Mitsuba's variant. [default: the run's]")] = None,
+    threads: Threads = None,
+    workers: WorkersOption = None,
+    compress: Compress = False,
+    allow_outside: AllowOutside = False,
+    insecure: Insecure = False,
+) -> None:
+    """Continue an interrupted or killed run, or extend a finished one.
+
+    It continues from its last checkpoint and gives the result of an uninterrupted run up to rounding; with --threads 1 and the same
+    number of workers, bit for bit. For a run in stages, --steps and --seconds are a new budget of all stages.
+    """
+    from unrender.display.terminal import Console
+    from unrender.runs.progress import Progress
+
+    console = Console(highlight=False)
+    if steps is not None or seconds is not None:
+        steps, seconds = arguments.budget(steps, seconds)
+    if (directory / "stages.toml").is_file() and not (directory / "run.json").is_file():
+        if force:
+            raise InputError(f"{directory}: --force applies to the run folder of a stage; give that instead")
+        stages.refuse_workers(workers)
+        check_workers(None, compress, insecure)  # options of workers
+        command = arguments.command_line(context)
+        with Progress(console) as progress:
+            return stages.run_remaining(
+                stages.reopen(directory, (steps, seconds), variant, threads, command), console, progress
+            )
+    with Progress(console) as progress:
+        with phases.phase("loading"):
+            from unrender.app.cli.execute import introduce
+            from unrender.runs import reopen
+            from unrender.runs.live import Live
+            from unrender.runs.resume import load_run, resume_run
+
+            processes = check_workers(workers, compress, insecure)
+            stored = load_run(directory, steps, seconds)
+            alone = 1 if stored.method.threads == 1 else None  # such a run is reproducible bit for bit
+            running = arguments.use_variant(variant or stored.record.variant or "auto", threads or alone)
+            problem = reopen.problem_of(directory)
+        introduce(console, problem, running)
+        live = Live(directory, problem.name, stored.record.method, stored.record.command)
+        theirs = variant_again(variant, stored.record)
+        with distributed(problem, processes, compress, theirs, threads or alone, console) as shared:
+            listeners, spent = [progress, live], progress.seconds
+            result = resume_run(stored, shared, force, listeners, earlier=spent, began=progress.budget_began)
+        live.clear()
+        conclude(console, problem, result, directory, progress)

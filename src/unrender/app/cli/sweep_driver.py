@@ -22,8 +22,17 @@ from unrender.app.cli.signals import FAILED, INTERRUPTED, TERMINATED
 from unrender.app.cli.task_display import TaskDisplay
 from unrender.app.cli.tasks import Job, RunTask
 from unrender.app.distributed.cluster import Ended, Executor, InProcess, OnWorkers, Workers, connect
-from unrender.app.sweeps import folders
-from unrender.app.sweeps.record import SWEEP, RunOutcome, SweepPlan, SweepRecord, TrialRecord, write_sweep
+from unrender.app.sweeps.record import (
+    RUN_FOLDERS,
+    SWEEP,
+    RunOutcome,
+    SweepPlan,
+    SweepRecord,
+    TrialRecord,
+    best_folders,
+    run_name,
+    write_sweep,
+)
 from unrender.app.sweeps.search import Search
 from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.backend.variant import check_threads
@@ -203,7 +212,7 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
     lock.acquire()
     try:
         if session.fresh:
-            for path in session.folder.glob(folders.PATTERN):
+            for path in session.folder.glob(RUN_FOLDERS):
                 files.remove(path)
         if not trials.done:
             with _executor(console, session, record) as (executor, job, problem, running):
@@ -338,7 +347,7 @@ def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
     """Return the runs of a trial. Only the first one may be pruned."""
     return [
         RunTask(
-            folders.name(started.number, plan.seed + i),
+            run_name(started.number, plan.seed + i),
             plan.method,
             {**plan.settings, **started.settings},
             plan.steps,
@@ -353,6 +362,6 @@ def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
 
 def _page(console: Console, folder: Path, state: _State) -> None:
     """Write a page that compares the best trials."""
-    if folders.best(folder, state.record):
+    if best_folders(folder, state.record):
         page = report.write_page(folder, state.record)
         console.say(f"page: {page}")

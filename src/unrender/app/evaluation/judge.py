@@ -13,11 +13,22 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from unrender.app.evaluation import pictures, scenes
-from unrender.app.evaluation.measures import Albedo, Measures, best_factors, compare_albedo, mean, measure
-from unrender.app.evaluation.pictures import names_of
+from unrender.app.evaluation import scenes
+from unrender.app.evaluation.measures import (
+    FOLDER,
+    SHEET,
+    Albedo,
+    Measures,
+    best_factors,
+    compare_albedo,
+    environment_picture,
+    mean,
+    measure,
+    names_of,
+    write_pictures,
+)
 from unrender.app.exporting.asset import read_environment
-from unrender.app.stages import run_folders, stages_file
+from unrender.app.stages import stages_file
 from unrender.backend import variant
 from unrender.core import arrays, phases
 from unrender.core.errors import InputError
@@ -40,7 +51,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import render
 
 RECORD, LIGHT = "judge.json", "environment"
-_OWN = {RECORD, pictures.SHEET, pictures.FOLDER, f"{LIGHT}.png", f"{LIGHT}.exr"}
+_OWN = {RECORD, SHEET, FOLDER, f"{LIGHT}.png", f"{LIGHT}.exr"}
 _ALBEDO = ("base_color", "reflectance")
 
 
@@ -115,7 +126,7 @@ def judge(
         if measured:
             images = _photographed(target, images, of_camera, exposed)
         measures = _measure(target, images) if measured else []
-        pictures.write(folder, target, images, relit, measures)
+        write_pictures(folder, target, images, relit, measures)
         record = _record(target, measures, albedo, held_out_file, environment, spp, notices)
         (folder / RECORD).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         return measures, albedo
@@ -138,7 +149,7 @@ def _recovered(run: Path, problem: Problem, result: RunFolder) -> tuple[dict[str
     """
     full = problem.full(result.parameters)
     values, truth = (member_values(problem.renderer, each) for each in (full, result.truth))
-    staged = run_folders.stage_of(run)
+    staged = stages_file.stage_of(run)
     if staged is None:
         return values, truth
     stages, last = staged
@@ -218,7 +229,7 @@ def _render(
     path = scenes.export_scene(problem, values, scratch / "scene")
     own, _ = read_environment(scenes.load_scene(path), [])
     if own is not None:
-        (folder / f"{LIGHT}.png").write_bytes(pictures.environment_picture(own))
+        (folder / f"{LIGHT}.png").write_bytes(environment_picture(own))
         write_image(own, folder / f"{LIGHT}.exr")
     relit = []
     if light is not None:

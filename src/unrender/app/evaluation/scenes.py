@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.app.exporting.scene_folder import export
-from unrender.app.stages import run_folders
+from unrender.app.stages import stages_file
 from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.rendering.mitsuba.description import load
@@ -26,7 +26,7 @@ def find(run: Path, problem: Problem) -> Path:
     Raises:
         InputError: the file does not exist.
     """
-    staged = run_folders.stage_of(run)
+    staged = stages_file.stage_of(run)
     origin = problem.origin.get("file", problem.origin.get("scene")) if staged is None else staged[0].problem
     candidate = None if origin is None else Path(origin).parent / HELD_OUT
     if candidate is None or not candidate.is_file():

@@ -17,8 +17,8 @@ import numpy as np
 from unrender.app.exporting import textures
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.core.errors import InputError
+from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.display.pictures import png
-from unrender.rendering.camera_axes import MITSUBA_TO_OPENGL
 
 if TYPE_CHECKING:
     import pygltflib

@@ -18,7 +18,7 @@ from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.io.volumes import write_grid
 from unrender.rendering.mitsuba import mesh_layout
-from unrender.rendering.mitsuba.described import Recorded, recorded_descriptions
+from unrender.rendering.mitsuba.description import Recorded, recorded_descriptions
 
 BITMAPS, VOLUMES, MESHES = "textures", "volumes", "meshes"
 """Names of the sub-folders of the files of a scene."""
@@ -77,7 +77,7 @@ class FilesOnly:
         if description is None:
             raise InputError(
                 f"{'.'.join(place)}: a ready-made {value.class_name()}, which has no description; give its dictionary, or "
-                "make it by unrender.rendering.mitsuba.described.load_described inside the function that returns the scene"
+                "make it by unrender.rendering.mitsuba.description.load_described inside the function that returns the scene"
             )
         return self.dictionary(description, place)
 

@@ -12,10 +12,10 @@ from unrender.app.report.curves import Series
 from unrender.display import formatting, plots
 from unrender.display.plots import Chart, Line
 from unrender.rendering import parameter_errors
+from unrender.runs.callbacks import COMPILING
 from unrender.runs.folder.reader import RunFolder, root_mean_square
 from unrender.runs.folder.schema import DOUBTFUL, RunRecord
 from unrender.runs.image_sensitivity import seen_cells
-from unrender.runs.phase_times import COMPILING
 from unrender.statistics import debiased
 
 

@@ -31,9 +31,9 @@ import tomli_w
 from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files, files, toml_lines, toml_models
-from unrender.io.toml_lines import Place
-from unrender.io.toml_models import Table
+from unrender.io import bounded_files, files, toml_lines
+from unrender.io.toml_lines import Place, Table
+from unrender.runs.folder import schema
 
 FILE = "stages.toml"
 """Name of the file in the folder of an import, and in that of a run in stages."""
@@ -171,7 +171,7 @@ def read(path: str | Path) -> Stages:
         InputError: "stages.toml:12: stages[0].share: ...": the file, the line, the field, the expected value.
     """
     file = Path(path)
-    model, content = toml_models.read(file, _Stages, {"stages": _Stage, "run": _Run})
+    model, content = toml_lines.read(file, _Stages, {"stages": _Stage, "run": _Run})
     known: set[str] = set()
     for index, stage in enumerate(model.stages):
         place: Place = ("stages", index, "name")
@@ -183,7 +183,7 @@ def read(path: str | Path) -> Stages:
         elif len(set(stage.unknowns)) < len(stage.unknowns):
             place, what = ("stages", index, "unknowns"), "a key is given twice"
         if what:
-            raise toml_models.error_at(file, content, place, what)
+            raise toml_lines.error_at(file, content, place, what)
         known.add(stage.name)
     stages = tuple(
         Stage(s.name, tuple(s.unknowns), float(s.share), s.coarser, s.method, s.settings or None) for s in model.stages
@@ -241,3 +241,42 @@ def split(stages: Stages) -> list[tuple[int | None, float | None]]:
 def folder_of(stages: Stages, index: int, out: Path) -> Path:
     """Return the run folder of a stage in the folder `out`: 1-NAME, 2-NAME, ..."""
     return out / f"{index + 1}-{stages.stages[index].name}"
+
+
+def run_folders(directory: Path) -> list[Path]:
+    """Return the run folders of a folder of stages, including stages that have not started; any other folder is returned alone.
+
+    Raises:
+        InputError: the file of stages is malformed.
+    """
+    if not (directory / FILE).is_file():
+        return [directory]
+    stages = read(directory / FILE)
+    if not is_of_run(directory / FILE):
+        return [directory]
+    return [folder_of(stages, index, directory) for index in range(len(stages.stages))]
+
+
+def last_result(directory: Path) -> Path:
+    """Return the run folder of the last started stage of a folder of stages; any other folder is returned as it is.
+
+    Raises:
+        InputError: the file of stages is malformed.
+    """
+    if (directory / schema.RECORD).is_file():
+        return directory
+    return next((run for run in reversed(run_folders(directory)) if (run / schema.RECORD).is_file()), directory)
+
+
+def stage_of(run: Path) -> tuple[Stages, int] | None:
+    """Return the stages of a run folder and its index among them; None for a folder without stages.
+
+    Raises:
+        InputError: the file of stages is malformed.
+    """
+    out, name = run.resolve().parent, run.resolve().name
+    if not is_of_run(out / FILE):
+        return None
+    stages = read(out / FILE)
+    names = [folder_of(stages, index, out).name for index in range(len(stages.stages))]
+    return (stages, names.index(name)) if name in names else None

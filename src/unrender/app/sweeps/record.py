@@ -1,4 +1,4 @@
-"""sweep.json: the plan of a sweep and its results so far."""
+"""sweep.json: the plan of a sweep and its results so far; and its run folders."""
 
 from __future__ import annotations
 
@@ -171,3 +171,38 @@ def write_sweep(folder: Path, record: SweepRecord) -> None:
         files.write(folder / SWEEP, data)
     except OSError as error:
         raise InputError(f"sweep {folder}: cannot be written: {error.strerror or error}") from error
+
+
+RUN_FOLDERS = "trial-*-seed*"
+_MOST_WATCHED = 64
+
+
+def run_name(trial: int, seed: int) -> str:
+    """Return the name of a run folder within the folder of its sweep."""
+    return f"trial-{trial:03d}-seed{seed}"
+
+
+def best_folders(folder: Path, record: SweepRecord, most: int = 1) -> list[Path]:
+    """Return the run folders of the `most` finished trials with the least error, the best trial first."""
+    known = [(trial.error, trial) for trial in record.trials if trial.status == "finished" and trial.error is not None]
+    ordered = sorted(known, key=lambda entry: (entry[0], entry[1].number))[:most]
+    return [folder / run.folder for _, trial in ordered for run in trial.runs]
+
+
+def watched_folders(folder: Path) -> list[Path]:
+    """Return the run folders to watch: those of a sweep, or the folder itself if it is no sweep.
+
+    Folders of trials that have not started yet are included, up to `_MOST_WATCHED` folders.
+    """
+    if not (folder / SWEEP).is_file():
+        return [folder]
+    try:
+        record = read_sweep(folder)
+    except InputError:
+        return [folder]
+    plan = record.plan
+    numbers = range(min(plan.trials or len(record.trials) or 1, _MOST_WATCHED))
+    run_folders = [
+        folder / run_name(number, plan.seed + i) for number in numbers for i in range(min(plan.seeds, _MOST_WATCHED))
+    ]
+    return run_folders[:_MOST_WATCHED]

@@ -26,10 +26,8 @@ import numpy as np
 from unrender.core import checks, conjugate_gradients
 from unrender.core.errors import InputError
 from unrender.core.random import Key
-from unrender.estimators.smoothing.function import estimate_gradient, estimate_hvp
-from unrender.estimators.smoothing.joint import JointDerivatives, joint
-from unrender.estimators.smoothing.options import SamplingOptions
-from unrender.estimators.smoothing.sampling import Function
+from unrender.estimators.smoothing.function import JointDerivatives, estimate_gradient, estimate_hvp, joint
+from unrender.estimators.smoothing.sampling import Function, SamplingOptions
 
 # PyTorch is an optional dependency, and absent if types are checked without the extra.
 try:

@@ -1,9 +1,10 @@
-"""Sampling of the smoothing kernels, evaluation of the function, and the mean with its standard error."""
+"""Options of a smoothed derivative, sampling of the kernels, evaluation of the function, and the mean with its standard error."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,34 @@ import numpy as np
 from unrender.core import checks
 from unrender.core.dropped import DropReport
 from unrender.core.errors import InputError
-from unrender.estimators.smoothing.options import SamplingOptions
+
+
+@dataclass(frozen=True)
+class SamplingOptions:
+    """Options of an estimate of a smoothed derivative; see `smoothed.gradient` and `smoothed.hvp`.
+
+    Attributes:
+        samples: evaluations of f: for all elements together with `aggregate`, for each element otherwise.
+        seed: random seed of the perturbations.
+        aggregate: one sample from the mixture over all elements serves all of them.
+        antithetic: samples in pairs z, −z.
+        baseline: f(θ) is subtracted if this reduces variance.
+        low_discrepancy: samples from scrambled Sobol sequences.
+        product: every dimension from its own gradient kernel at once, instead of `aggregate`; gradients only.
+        orthogonal: standard normals with orthogonal directions, as many as there are dimensions, instead of the mixtures.
+        epsilon: half the distance of a central difference in units of σ, > 0; products only.
+    """
+
+    samples: int
+    seed: int = 0
+    aggregate: bool = True
+    antithetic: bool = True
+    baseline: bool = True
+    low_discrepancy: bool = False
+    product: bool = False
+    orthogonal: bool = False
+    epsilon: float = 0.1
+
 
 Function = Callable[[np.ndarray], np.ndarray]
 """Function from points (B, n) to values (B,)."""

@@ -12,7 +12,7 @@ from unrender.core.errors import InputError
 from unrender.methods.rules.constants import Constants
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
-from unrender.statistics.halves import normal_equations
+from unrender.statistics.debiased import normal_equations
 
 _SEEDS = (11, 12)
 """Seeds of two independent halves."""

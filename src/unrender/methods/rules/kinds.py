@@ -11,8 +11,8 @@ from unrender.core.text import grouped, listed
 from unrender.methods.rules.brightness import start_factors
 from unrender.methods.rules.first_rates import logarithms
 from unrender.methods.rules.traits import Traits
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.base import Optimizer
+from unrender.optimizers.recipes import Adam
 from unrender.preconditioners import LargeSteps, grid
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.parameter import ParameterSettings

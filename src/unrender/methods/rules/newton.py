@@ -22,9 +22,9 @@ from unrender.methods.rules import sampling
 from unrender.methods.rules.starts import best_start
 from unrender.methods.rules.traits import Traits
 from unrender.methods.smoothed import widths_of
-from unrender.optimizers.adam import Adam
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.partitioned import Partitioned
+from unrender.optimizers.recipes import Adam
 from unrender.scene.problem import Problem
 from unrender.schedules import Exponential
 from unrender.statistics.scores import positive_inverse

@@ -13,10 +13,10 @@ from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.methods.plan import Plan
 from unrender.methods.rules.traits import Traits
-from unrender.parameterisations.base import Bounds
+from unrender.parameterisations import Bounds
 from unrender.scene.parameter import ParameterSettings
 from unrender.scene.problem import Problem
-from unrender.statistics.halves import normal_equations
+from unrender.statistics.debiased import normal_equations
 from unrender.statistics.paired_losses import difference, mean_and_error
 
 _PER_DIMENSION, _MOST_PLACES = 16, 24

@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -273,3 +274,31 @@ class _PrintableLog(mi.Appender):
 
     def log_progress(self, progress: float, name: str, formatted: str, eta: str, ptr: Any = None) -> None:
         """Ignore the progress of loading."""
+
+
+Recorded = list[tuple[Any, dict[str, Any]]]
+
+_recorded: ContextVar[Recorded | None] = ContextVar("recorded", default=None)
+
+
+def load_described(description: dict[str, Any]) -> Any:
+    """Return `mitsuba.load_dict(description)`. Inside `recorded_descriptions`, record the object with its description."""
+    result = mi.load_dict(description)
+    recorded = _recorded.get()
+    if recorded is not None:
+        recorded.append((result, description))
+    return result
+
+
+@contextmanager
+def recorded_descriptions() -> Iterator[Recorded]:
+    """Yield a list of (object, description), which collects every object that `load_described` makes inside the context.
+
+    The list keeps the objects alive; discard it early. Mitsuba objects outside the scenes of a run prevent Dr.Jit from freezing kernels.
+    """
+    recorded: Recorded = []
+    token = _recorded.set(recorded)
+    try:
+        yield recorded
+    finally:
+        _recorded.reset(token)

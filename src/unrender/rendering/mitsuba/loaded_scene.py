@@ -24,14 +24,13 @@ from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import gpu, spectral_colours
-from unrender.rendering.mitsuba.frozen import FrozenFunction
+from unrender.rendering.mitsuba.edges import meshed
+from unrender.rendering.mitsuba.frozen import FrozenFunction, build_distributions
 from unrender.rendering.mitsuba.parameters import is_one_direction, normals_key
 from unrender.rendering.mitsuba.ranges import SlotReaders
-from unrender.rendering.mitsuba.recordable import build_distributions
 from unrender.rendering.mitsuba.rigid_motions import RigidMotions
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph, refusal, replace_meshes
 from unrender.rendering.mitsuba.scene_loading import SceneDescription, is_loaded, load_resolved
-from unrender.rendering.mitsuba.sphere_meshes import meshed
 from unrender.rendering.mitsuba.tensors import from_tensor, native_shape, to_tensor
 from unrender.rendering.renderer import ReplacedMesh
 

@@ -81,7 +81,7 @@ class Pass:
         return tables
 
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
-        return {"delta": delta}
+        return {**pair.tables(), "delta": delta} if self.pair else {"delta": delta}
 
     def function(
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
@@ -154,9 +154,6 @@ class ImagePairPass(Pass):
     """Radiance of both states per lane, on the current state's paths."""
 
     pair: ClassVar[bool] = True
-
-    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
-        return {**pair.tables(), "delta": delta}
 
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         return paths.primal()
@@ -235,9 +232,6 @@ class AdjointPairPass(Pass):
 
     both: bool = True
     pair: ClassVar[bool] = True
-
-    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
-        return {**pair.tables(), "delta": delta}
 
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         """Replay the paths backward. `own`: radiance and weights of the current, then of the previous state, without its weights unless

@@ -16,10 +16,17 @@ from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import gpu, poses
-from unrender.rendering.mitsuba.boundary_term import moved_shape, obstacles
-from unrender.rendering.mitsuba.camera_term import lens_parameters, moved_sensor, sensor_obstacle, translation_obstacle
+from unrender.rendering.mitsuba.edges import moving_targets
 from unrender.rendering.mitsuba.equal_objects import merge_notices
 from unrender.rendering.mitsuba.film_response import is_spectral
+from unrender.rendering.mitsuba.geometry_terms import (
+    lens_parameters,
+    moved_sensor,
+    moved_shape,
+    obstacles,
+    sensor_obstacle,
+    translation_obstacle,
+)
 from unrender.rendering.mitsuba.light_paths import LightPaths, mask_notices, null_notices
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
@@ -29,7 +36,6 @@ from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_loading import SceneDescription
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
-from unrender.rendering.mitsuba.sphere_meshes import moving_targets
 from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.picture_format import PictureFormat
 from unrender.rendering.renderer import Camera, LossWeights, ParameterInfo, ReplacedMesh, Space, differentiated
@@ -47,7 +53,7 @@ class MitsubaRenderer:
 
     Parameters are `mi.TensorXf` of the shape that `parameters()` states: a number is (), a colour (3,), a bitmap (H, W, C), vertex
     positions (3 V,). Moving geometry uses Mitsuba's `prb` kernel, whose gradient omits visibility. For meshes that move, by their
-    vertices or rigidly (`poses.py`), `boundary_term.py` adds it. `camera_term.py` has the full derivative by sensors. Poses of shapes
+    vertices or rigidly (`poses.py`), `geometry_terms.py` adds it, and has the full derivative by sensors. Poses of shapes
     other than meshes have no path gradient.
 
     Attributes:

@@ -15,11 +15,17 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import gpu
-from unrender.rendering.mitsuba.boundary_term import BoundaryTerm, moved_shape
-from unrender.rendering.mitsuba.camera_paths import Kernel
-from unrender.rendering.mitsuba.camera_term import CameraTerm, moved_sensor, moving_geometry, no_tangents
+from unrender.rendering.mitsuba.camera_paths import DroppedSamples, Kernel, Paths
 from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
-from unrender.rendering.mitsuba.frozen import FrozenFunction
+from unrender.rendering.mitsuba.frozen import FrozenFunction, are_recordable, for_every_sensor, shapes_are_recordable
+from unrender.rendering.mitsuba.geometry_terms import (
+    BoundaryTerm,
+    CameraTerm,
+    moved_sensor,
+    moved_shape,
+    moving_geometry,
+    no_tangents,
+)
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
@@ -41,8 +47,6 @@ from unrender.rendering.mitsuba.passes import (
     VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
-from unrender.rendering.mitsuba.recordable import are_recordable, for_every_sensor, shapes_are_recordable
-from unrender.rendering.mitsuba.rendered_paths import DroppedSamples, Paths
 from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -56,24 +60,21 @@ _LANES = 1 << 22
 class MitsubaSession:
     """Kernels for one set of parameters. Equal arguments give equal results, independent of other sessions.
 
-    Each call sets both scenes to its own parameters, and all others to the scene's own values. Values that are already set are not set
-    again.
+    Each call sets both scenes to its own parameters, and all others to the scene's own values.
 
     Args:
         pair: both loads of the scene, which sessions share.
         keys: parameters, including poses that are written into the scene.
         poses: {key: its meaning} of the poses that transform rays.
-        derivatives: parameters that are leaves of the derivative graph, fixed for the session: a change between the primal and the adjoint
-            pass would record kernels again. Other parameters change without a derivative.
-        paths: settings of the light paths.
-        sampler: sampler that is cloned.
+        derivatives: parameters that are leaves of the derivative graph in every pass. Others change without a derivative.
+        paths, sampler: settings of the light paths; sampler that is cloned.
         differential_bsdf: whether adjoints and tangents of one state use differential BSDF sampling of roughness, see `RoughLobes`.
 
     Attributes:
         dropped: samples that were not finite.
 
-    Raises `InputError` for poses together with other parameters that move geometry, or poses with and without a derivative, since the
-    scenes of posed shapes are not rebuilt; and if `differential_bsdf` supports no parameter.
+    Raises `InputError` for poses together with other parameters that move geometry, or poses with and without a derivative; and if
+    `differential_bsdf` supports no parameter.
     """
 
     def __init__(

@@ -12,7 +12,7 @@ import math
 import sys
 import types
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,7 +66,10 @@ def unpack(packed: Packed, patterns: Sequence[Any] = ()) -> Any:
     Raises:
         InputError: the skeleton is invalid, or does not fit the tensors.
     """
-    unpacker = _Unpacker(packed.tensors, {_path(kind): kind for pattern in patterns for kind in _classes(pattern)})
+    unpacker = _Unpacker(
+        packed.tensors,
+        {_path(type(part)): type(part) for pattern in patterns for part in parts(pattern) if _is_state(type(part))},
+    )
     try:
         state = unpacker.node(packed.skeleton, 0)
     except (ValueError, TypeError, OverflowError) as error:
@@ -270,19 +273,18 @@ def _path(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
-def _classes(state: Any) -> Iterator[type]:
-    """Yield the frozen dataclasses in a state."""
+def parts(state: Any) -> Iterator[Any]:
+    """Yield a state and all its parts: fields of dataclasses, values of mappings, and elements of lists and tuples."""
+    yield state
+    below: Iterable[Any] = ()
     if dataclasses.is_dataclass(state) and not isinstance(state, type):
-        if _is_state(type(state)):
-            yield type(state)
-        for each in dataclasses.fields(state):
-            yield from _classes(getattr(state, each.name))
+        below = (getattr(state, each.name) for each in dataclasses.fields(state))
     elif isinstance(state, Mapping):
-        for part in state.values():
-            yield from _classes(part)
+        below = state.values()
     elif isinstance(state, (tuple, list)):
-        for part in state:
-            yield from _classes(part)
+        below = state
+    for part in below:
+        yield from parts(part)
 
 
 def _required(kind: Any) -> set[str]:

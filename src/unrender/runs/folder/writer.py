@@ -22,7 +22,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import reason_of
 from unrender.io import files
 from unrender.optimizers.base import Measuring
-from unrender.runs import phase_times
+from unrender.runs import callbacks
 from unrender.runs.callbacks import Callback
 from unrender.runs.final_images import at_start, render_final_images, warm_up
 from unrender.runs.folder import checkpoint, contents, method_file
@@ -156,7 +156,7 @@ class RunWriter(Callback):
         if self.final_spp != 1 and not run.stopped:
             share = _TESTED_SHARE[run.compiled]
             self._tested = run.seconds is None or run.time_left() > share * run.seconds
-            with phases.phase(phase_times.COMPILING):
+            with phases.phase(callbacks.COMPILING):
                 warm_up(run.problem, run.full(), self._tested)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
@@ -195,7 +195,7 @@ class RunWriter(Callback):
                 standard_error=images.standard_error,
                 warnings=[*result.warnings, *images.warnings],
             )
-            result = phase_times.with_phase(result, phase_times.PICTURES, time.perf_counter() - started)
+            result = callbacks.with_phase(result, callbacks.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
         self._guarded("meshes", lambda: write_files(self.folder, run.problem, result.parameters))
         return result

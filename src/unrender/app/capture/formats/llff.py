@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from unrender.app.capture.cameras import Lens
-from unrender.app.capture.capture import Capture, Photograph
-from unrender.app.capture.conventions import pose
+from unrender.app.capture.capture import Capture, Photograph, pose
 from unrender.app.capture.formats import files
 from unrender.core.errors import InputError
 from unrender.io import bounded_files

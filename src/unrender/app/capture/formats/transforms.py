@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from unrender.app.capture.cameras import FISHEYE, RADIAL_TANGENTIAL, Lens
-from unrender.app.capture.capture import Capture, Photograph
-from unrender.app.capture.conventions import pose
+from unrender.app.capture.capture import Capture, Photograph, pose
 from unrender.app.capture.formats import files
 from unrender.core.errors import InputError
 from unrender.core.text import printable

@@ -1,17 +1,76 @@
-"""Renderers of one pixel in NumPy, with known integrals and derivatives."""
+"""Problems without a renderer: `exponential`, the toy problem of Balint et al. 2023, Fig. 2, and `quad`, a polynomial."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.core.registry import register
 from unrender.core.trees import Tree
+from unrender.gallery import fields
+from unrender.losses import L2, Loss
 from unrender.rendering.renderer import ParameterInfo, Rendering, RenderSession, SampleRequest, Space
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+from unrender.scene.view import View
+
+_MEAN, _FIRST_RATE = 2.0, 1.5
+
+
+@register(name="exponential", position=13)
+@dataclass(frozen=True)
+class Exponential:
+    """The rate of an exponential distribution from its mean: one number, no renderer.
+
+    The mean is 2, the true rate 0.5, the initial rate 1.5.
+    """
+
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def problem(self, name: str) -> Problem:
+        """Return the problem, with an image of one pixel that contains the mean."""
+        return Problem(
+            ExponentialRenderer(1 / _MEAN),
+            [Parameter(RATE, initial=_FIRST_RATE)],
+            [View(np.full((1, 1, 3), _MEAN, np.float32))],
+            self.loss,
+            truth={RATE: 1 / _MEAN},
+            name=name,
+        )
+
+
+_MATRIX = np.array([[5.0, 3.75], [3.75, 5.0]])
+_START = (1.5, 1.0)
+
+
+@register(name="quad", position=14)
+@dataclass(frozen=True)
+class Quad:
+    """The minimum of 5 x₀² + 5 x₁² + 7.5 x₀ x₁, a narrow smooth valley: no renderer, no noise.
+
+    Two unknowns, x (2,). The minimum is 0 at 0, the start is (1.5, 1). With L2, the default, the loss is the polynomial itself. Its
+    Hessian has eigenvalues 17.5 and 2.5, along (1, 1) and (1, −1). At this ratio of seven, steepest descent zigzags, whereas Newton's
+    method needs one step.
+    """
+
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def problem(self, name: str) -> Problem:
+        """Return the problem, with a black image of one pixel as reference."""
+        return Problem(
+            QuadraticRenderer(_MATRIX, np.zeros(2)),
+            [Parameter(POINT, initial=np.array(_START))],
+            [View(np.zeros((1, 1, 3), np.float32))],
+            self.loss,
+            truth={POINT: np.zeros(2)},
+            name=name,
+        )
+
 
 RATE = "rate"
 """Key of λ, the parameter of `ExponentialRenderer`."""

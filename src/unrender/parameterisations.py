@@ -1,8 +1,9 @@
-"""Identity and logarithm."""
+"""Changes of variables for the optimizer, so that one learning rate suits reflectances, radiances and extinctions alike."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -10,7 +11,46 @@ from unrender.core import arrays
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.registry import register
-from unrender.parameterisations.base import Bounds, Transform
+
+__all__ = ["Identity", "Log", "Parameterisation"]
+
+Bounds = tuple[float | None, float | None]
+"""(low, high); None is unbounded."""
+
+
+class Transform(Protocol):
+    """A smooth increasing elementwise map x = φ(u) from the optimizer's variable u to the values x of a parameter.
+
+    Arrays are NumPy's or Dr.Jit's, and results have the argument's type. Every x is inside the bounds less a margin, where φ' > 0.
+    """
+
+    def forward(self, u: Array) -> Array:
+        """Return φ(u)."""
+        ...
+
+    def inverse(self, x: Array) -> Array:
+        """Return the u with φ(u) = x."""
+        ...
+
+    def slope(self, x: Array) -> Array:
+        """Return φ' > 0 at the u with φ(u) = x."""
+        ...
+
+    def curvature(self, x: Array) -> Array:
+        """Return φ'' at the u with φ(u) = x."""
+        ...
+
+
+class Parameterisation(Protocol):
+    """A rule that defines the optimizer's variable from a parameter's bounds and initial values."""
+
+    def transform(self, bounds: Bounds, initial: np.ndarray) -> Transform | None:
+        """Return φ of a parameter with these bounds and initial values; None for the identity.
+
+        Raises `InputError` for unsuitable bounds.
+        """
+        ...
+
 
 _LARGEST = 80.0
 """Magnitude at which u is clamped in exponentials: e^88 is the limit of single precision."""

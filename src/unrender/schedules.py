@@ -14,6 +14,8 @@ from unrender.core import checks
 from unrender.core.errors import InputError
 from unrender.core.registry import register
 
+__all__ = ["Constant", "Cosine", "Exponential", "Inverse", "InverseRoot", "Schedule", "Steps", "Warmup"]
+
 
 class Schedule(Protocol):
     """A pure function from a step to a factor."""

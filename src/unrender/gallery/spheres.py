@@ -1,0 +1,251 @@
+"""Problems `sphere-to-mesh`, `sphere-to-bunny` and `shadow-art`: a body from images, by moving the vertices of a sphere.
+
+After Wang et al., Fig. 5, and Mitra and Pauly 2009, "Shadow Art", in which no camera sees the body, only its shadows on two walls. True
+positions of vertices are undefined, only their surface is: many vertex distributions give the same images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from unrender.core.registry import register
+from unrender.gallery import fields, meshes, parts, textures
+from unrender.gallery.specification import views_of
+from unrender.losses import L2, Loss
+from unrender.preconditioners import LargeSteps
+from unrender.rendering.mitsuba.scene_loading import load
+from unrender.rendering.picture_format import AOVS
+from unrender.scene.parameter import Parameter
+from unrender.scene.problem import Problem
+
+_RADIUS = 0.7
+"""Radius of the sphere; the body fits into a ball of radius about 1."""
+
+
+@register(name="sphere-to-mesh", position=21)
+@dataclass(frozen=True)
+class SphereToMesh:
+    """The shape of a body seen from all sides, by moving every vertex of a sphere.
+
+    Several views. The unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2, initially a sphere at the body's
+    centre. There is no true value: vertices may slide along the surface. The difficulty is their number, that most information about a
+    shape is in its silhouettes and shadows, and that only large steps (`strength`) keep the mesh smooth.
+    """
+
+    resolution: int = fields.resolution(48)
+    views: int = fields.integer(6, "cameras around the body, alternately lower and higher", at_least=1, at_most=32)
+    subdivisions: int = fields.integer(3, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=6)
+    mesh: str = meshes.option("PLY or OBJ file of the body, in place of the one made by code")
+    reference_spp: int = fields.reference_spp(512)
+    max_depth: int = fields.max_depth(2, at_least=2)
+    strength: int = fields.integer(0, "λ of large steps (LargeSteps) on the mesh, 0 for none; 19 is usual", at_least=0)
+    pictures: str = fields.choice("colour", f"what the images contain: colour, {', '.join(AOVS)}", ("colour", *AOVS))
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the sphere floating over a floor, under a sun, with cameras that look down, so that the floor shows its dark side's
+        outline. Masks are of the sphere alone."""
+        points, faces = meshes.icosphere(self.subdivisions)
+        return self._stage() | {"sphere": meshes.triangles("sphere", _RADIUS * points, faces, _clay())}
+
+    def target(self) -> dict[str, Any]:
+        """Return the same scene with the body in place of the sphere."""
+        if self.mesh:
+            return self._stage() | {"body": meshes.centred(self.mesh, _clay())}
+        points, faces = meshes.icosphere(5)
+        return self._stage() | {"body": meshes.triangles("body", _body(points), faces, _clay())}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the vertices of the sphere."""
+        smooth = LargeSteps(float(self.strength)) if self.strength else None
+        return (Parameter("sphere.vertex_positions", preconditioner=smooth),)
+
+    def problem(self, name: str) -> Problem:
+        """Return the problem: the sphere's scene, and references of the body by Mitsuba's `path` integrator."""
+        views = views_of(load(self.target), self, "" if self.pictures == "colour" else self.pictures)
+        return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name)
+
+    def _stage(self) -> dict[str, Any]:
+        floor = parts.rectangle((0, -1.3, 0), (20, 0, 0), (0, 0, -20), parts.diffuse(0.12, 0.18, 0.25))
+        angles = 2 * np.pi * np.arange(self.views) / self.views
+        return {
+            "type": "scene",
+            **parts.cameras_around(angles, 3.8, (1.9, 3.2), (0, -0.1, 0), 34.0, self.resolution),
+            "sun": parts.sun((0.35, 1.0, 0.45), 1.0),
+            **({} if self.pictures == "mask" else {"floor": floor}),
+        }
+
+
+def _clay() -> dict[str, Any]:
+    return parts.twosided(parts.diffuse(0.8, 0.7, 0.55))
+
+
+def _body(directions: np.ndarray) -> np.ndarray:
+    """Return a pear with a bent neck and a dent in its side, from unit directions: (V, 3)."""
+    x, y, z = directions.T
+    neck = textures.ramp(y, -0.1, 0.9)
+    width = 0.78 - 0.42 * neck - 0.18 * np.exp(-((x - 0.9) ** 2 + (y + 0.2) ** 2 + z**2) / 0.12)
+    return np.stack([width * x + 0.3 * neck**2, 0.9 * y - 0.05, width * z - 0.1 * neck**2], -1)
+
+
+_CENTRE = np.array([0.0, -0.15, 0.0])
+_PARTS = (
+    meshes.Ellipsoid((-0.1, -0.36, 0.0), (0.6, 0.44, 0.4), 12.0),
+    meshes.Ellipsoid((-0.32, -0.5, 0.26), (0.3, 0.3, 0.16)),
+    meshes.Ellipsoid((-0.32, -0.5, -0.26), (0.3, 0.3, 0.16)),
+    meshes.Ellipsoid((0.3, -0.5, 0.0), (0.2, 0.3, 0.26)),
+    meshes.Ellipsoid((0.42, 0.12, 0.0), (0.28, 0.25, 0.23), -15.0),
+    meshes.Ellipsoid((0.64, 0.05, 0.0), (0.13, 0.12, 0.12)),
+    meshes.Ellipsoid((0.26, 0.52, 0.16), (0.11, 0.38, 0.09), 18.0),
+    meshes.Ellipsoid((0.26, 0.52, -0.16), (0.11, 0.38, 0.09), 18.0),
+    meshes.Ellipsoid((-0.74, -0.36, 0.0), (0.14, 0.14, 0.14)),
+)
+"""Body, haunches, chest, head, muzzle, ears, tail."""
+_BLEND = 0.02
+
+
+@register(name="sphere-to-bunny", position=28)
+@dataclass(frozen=True)
+class SphereToBunny:
+    """The shape of a sitting hare with two long ears, from images from all sides, by moving every vertex of a sphere.
+
+    Several views. The unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2. The light is known: a sky and a
+    sun. True positions of vertices are undefined; errors are distances between surfaces. The difficulty is that the ears must grow out of
+    a sphere, and that few images show the gap between them.
+    """
+
+    resolution: int = fields.resolution(64)
+    views: int = fields.integer(6, "cameras around the animal, alternately lower and higher", at_least=1, at_most=64)
+    subdivisions: int = fields.integer(4, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=7)
+    mesh: str = meshes.option("PLY or OBJ file of a body, in place of the one made by code")
+    remesh_at: int = fields.integer(
+        0, "step before which the mesh gets even triangles of half the edge (unrender[remesh]); 0 for never", at_least=0
+    )
+    reference_spp: int = fields.reference_spp(256)
+    max_depth: int = fields.max_depth(2, at_least=2)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the sphere under the sky and the sun."""
+        points, faces = meshes.icosphere(self.subdivisions)
+        return self._stage() | {"sphere": meshes.triangles("sphere", _CENTRE + 0.62 * points, faces, _fur())}
+
+    def target(self) -> dict[str, Any]:
+        """Return the same scene with the animal in place of the sphere."""
+        if self.mesh:
+            return self._stage() | {"body": meshes.centred(self.mesh, _fur())}
+        return self._stage() | {"body": meshes.triangles("body", *_animal(), _fur())}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the vertices of the sphere."""
+        return (Parameter("sphere.vertex_positions", remeshing=(self.remesh_at,) if self.remesh_at else None),)
+
+    def problem(self, name: str) -> Problem:
+        """Return the problem: the sphere's scene, references of the animal by Mitsuba's `path` integrator, and its surface."""
+        true = load(self.target)
+        body = next(shape for shape in true.shapes() if shape.is_mesh())
+        surfaces = {"sphere.vertex_positions": meshes.surface(body)}
+        return Problem(
+            self.scene, self.parameters(), views_of(true, self), self.loss, self.max_depth, name=name, surfaces=surfaces
+        )
+
+    def _stage(self) -> dict[str, Any]:
+        angles = 2 * np.pi * (np.arange(self.views) + 0.25) / self.views
+        fov = 44.0 if self.mesh else 36.0  # a mesh from a file may fill its bounding box
+        return {
+            "type": "scene",
+            **parts.cameras_around(angles, 3.6, (0.4, 2.0), (0, 0, 0), fov, self.resolution),
+            "sky": {"type": "constant", "radiance": parts.colour(0.25, 0.3, 0.4)},
+            "sun": parts.sun((0.5, 1.0, 0.4), 0.7),
+        }
+
+
+def _fur() -> dict[str, Any]:
+    return parts.twosided(parts.diffuse(0.75, 0.6, 0.45))
+
+
+def _animal() -> tuple[np.ndarray, np.ndarray]:
+    return meshes.around(meshes.united(_PARTS, _BLEND), (-1.1, -1.0, -0.7), (1.0, 1.1, 0.7), 0.035)
+
+
+_WALL = 3.4
+
+
+@register(name="shadow-art", position=29)
+@dataclass(frozen=True)
+class ShadowArt:
+    """A body whose shadows are a heart on one wall and a fir tree on the other, by moving every vertex of a sphere.
+
+    Two views, each of a wall with the shadow of one sun. The unknown is the sphere's vertex positions, (3 V,) with V = 10 ·
+    4^subdivisions + 2. No image shows the body. Many bodies cast these shadows, so there is no true value; errors are those of the
+    images. The difficulty is that gradients come from shadow boundaries only, and that each vertex affects two of them.
+    """
+
+    resolution: int = fields.resolution(64)
+    subdivisions: int = fields.integer(4, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=7)
+    reference_spp: int = fields.reference_spp(256)
+    max_depth: int = fields.max_depth(2, at_least=2)
+    loss: Loss = field(default=L2(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the sphere between two suns and two walls."""
+        points, faces = meshes.icosphere(self.subdivisions)
+        return self._stage() | {
+            "sphere": meshes.triangles("sphere", _RADIUS * points, faces, parts.twosided(parts.diffuse(0.5)))
+        }
+
+    def target(self) -> dict[str, Any]:
+        """Return the same scene with a body in place of the sphere: the largest body with the two outlines."""
+        points, faces = meshes.around(_depth, (-1.2, -1.2, -1.2), (1.2, 1.2, 1.2), 0.05)
+        return self._stage() | {"body": meshes.triangles("body", points, faces, parts.twosided(parts.diffuse(0.5)))}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the vertices of the sphere."""
+        return (Parameter("sphere.vertex_positions"),)
+
+    def problem(self, name: str) -> Problem:
+        """Return the problem: the sphere's scene, and references of the two shadows by Mitsuba's `path` integrator."""
+        views = views_of(load(self.target), self)
+        return Problem(self.scene, self.parameters(), views, self.loss, self.max_depth, name=name)
+
+    def _stage(self) -> dict[str, Any]:
+        """Return suns, walls and cameras.
+
+        Each camera is between the body and a wall, and faces the wall; each sun lights one wall only.
+        """
+        wall, half = parts.diffuse(0.7, 0.65, 0.55), 1.7
+        return {
+            "type": "scene",
+            "camera_back": parts.camera((0, 0, -1.3), (0, 0, -_WALL), 62.0, self.resolution),
+            "camera_left": parts.camera((-1.3, 0, 0), (-_WALL, 0, 0), 62.0, self.resolution),
+            "sun_back": parts.sun((0, 0, 1), 1.0),
+            "sun_left": parts.sun((1, 0, 0), 1.0),
+            "back": parts.rectangle((0, 0, -_WALL), (half, 0, 0), (0, half, 0), wall),
+            "left": parts.rectangle((-_WALL, 0, 0), (0, 0, -half), (0, half, 0), wall),
+        }
+
+
+def _depth(points: np.ndarray) -> np.ndarray:
+    """Return the depth in the intersection of the two outlines, extruded along z and x."""
+    x, y, z = points.T
+    return np.minimum(_heart(x, y), _fir(z, y))
+
+
+def _heart(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return a depth, positive inside of the curve (a² + b² − 1)³ = a² b³, y from -1 to 1; approximately a distance near it."""
+    a, b = 1.16 * x, 1.1 * y + 0.12
+    value = np.square(a) * b**3 - (np.square(a) + np.square(b) - 1) ** 3
+    return 0.2 * np.cbrt(value)
+
+
+def _fir(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the depth in three tiers on a trunk, y from -1 to 1."""
+    tiers = [
+        np.minimum((top - y) * slope - np.abs(x), y - foot)
+        for top, foot, slope in ((1.0, 0.3, 0.75), (0.6, -0.2, 0.8), (0.2, -0.7, 0.8))
+    ]
+    trunk = np.minimum(np.minimum(0.16 - np.abs(x), y + 1.0), -0.6 - y)
+    return np.maximum.reduce([*tiers, trunk]) * 0.8

@@ -1,1 +1,0 @@
-"""Renderers in NumPy with known integrals and derivatives."""
