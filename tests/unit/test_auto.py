@@ -370,6 +370,11 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
         CONSTANTS.number_spp[1], CONSTANTS.difference_spp[1], noise_limit=CONSTANTS.noise_limit, remember=True
     )
     assert plan.estimator == expected
+    constants(monkeypatch, number_paths=0)  # as on a large film
+    assert chosen(made)[0].spp == 2 * 4 * CONSTANTS.difference_spp[1], (
+        "an image has fewer paths than the derivative images"
+    )
+    constants(monkeypatch)
     lit = {key: dataclasses.replace(info, nonlinear=True, brightness="light") for key, info in known.items()}
     formed.update(lit)
     assert method("auto").plan(made).estimator == expected, "lights alone are weighted as BSDFs"

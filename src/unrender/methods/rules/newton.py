@@ -78,11 +78,11 @@ def few_numbers(traits: Traits) -> Plan | None:
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_scattering(traits)
     nonlinear = nonlinear or [key for key, info in traits.infos.items() if not info.differentiable]
-    shapes = any(not traits.infos[key].light for key in traits.poses)
+    shapes = _moves_shapes(traits, keys)
     mixed = shapes and len(traits.poses) < len(keys)
     if not (nonlinear or traits.lights) or mixed or not traits.newton_suits or not _few(traits, keys):
         return None
-    estimator = _estimator(traits, keys, constants.pose_images)
+    estimator = _estimator(traits, keys, constants.pose_images if shapes else constants.number_images)
     estimator = replace(estimator, remember=traits.elements * problem.pixels <= constants.averaged_values)
     media = any(info.scattering == "medium" for info in traits.infos.values())
     if _only_scattering_and_brightness(traits) and not media:
@@ -114,7 +114,7 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     own = any(problem.unknowns[key].preconditioner is not None for key in keys)
     if not _few(traits, keys) or own or not problem.loss.linear or not isinstance(plan.estimator, PathGradient):
         return None
-    estimator = _estimator(traits, keys, constants.block_images)
+    estimator = _estimator(traits, keys, constants.block_images if _moves_shapes(traits, keys) else 0.0)
     eliminated = _eliminated(traits, keys, plan)
     images = 2 * _elements(traits, keys) + (IMAGES if eliminated else 0)
     traced = images * estimator.derivative_spp + estimator.spp
@@ -212,7 +212,7 @@ def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
 
 
 def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNewton:
-    """Return the estimator of these unknowns; `images` is the ratio of paths of the images of poses to those of the derivative images."""
+    """Return the estimator of these unknowns; `images` is the least ratio of paths of the images to those of the derivative images."""
     constants, problem, elements = traits.constants, traits.problem, _elements(traits, keys)
     moved = [key for key in keys if key in traits.poses]
     poses = [key for key in moved if not traits.infos[key].light]
@@ -220,7 +220,7 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
         constants.difference_spp, constants.difference_paths // (2 * elements * problem.pixels)
     )
     paths = constants.number_paths // problem.pixels
-    paths = max(paths, round(2 * elements * differences * images)) if poses else paths
+    paths = max(paths, round(2 * elements * differences * images))
     spp = traits.options.spp or sampling.within(constants.number_spp, paths)
     side = min(min(size) for size in problem.sizes)
     reach = constants.pose_reach if poses else constants.light_reach
@@ -235,10 +235,13 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
 
 
 def _optimizer(traits: Traits, keys: tuple[str, ...]) -> AveragedNewton:
-    poses = any(key in traits.poses and not traits.infos[key].light for key in keys)
     linear = tuple(key for key in traits.lights if key in keys)
-    averaging = traits.constants.pose_averaging if poses else AveragedNewton.averaging
+    averaging = traits.constants.pose_averaging if _moves_shapes(traits, keys) else AveragedNewton.averaging
     return AveragedNewton(averaging=averaging, linear=linear)
+
+
+def _moves_shapes(traits: Traits, keys: tuple[str, ...]) -> bool:
+    return any(key in traits.poses and not traits.infos[key].light for key in keys)
 
 
 def _elements(traits: Traits, keys: tuple[str, ...]) -> int:
