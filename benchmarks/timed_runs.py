@@ -32,6 +32,7 @@ class Kept(ur.protocols.Callback):
 
     def __init__(self, seconds: float, points: int = POINTS, steps: int | None = None):
         self._recorder = Recorder(seconds, points, steps, timer=work_time)
+        self.returned: dict[str, np.ndarray] = {}
 
     def on_step(self, run: Any, record: dict[str, Any]) -> None:
         try:
@@ -61,7 +62,8 @@ def timed_run(
     """Run `auto`, or an estimator and an optimizer, for some processor seconds or steps without measuring errors; return what was kept."""
     kept = Kept(seconds, points, steps)
     limit = 100 * seconds  # of the clock, never reached
-    ur.optimize(blind(problem), *method, seconds=limit, seed=seed, callbacks=[kept], progress=False)
+    result = ur.optimize(blind(problem), *method, seconds=limit, seed=seed, callbacks=[kept], progress=False)
+    kept.returned = dict(result.parameters)
     return kept
 
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 import unrender as ur
+from unrender.gallery import parts
 
 Scene = dict[str, Any]
 Case = tuple[Scene, dict[str, Any], dict[str, Any], float]
@@ -226,6 +227,52 @@ CASES: dict[str, Callable[[], Case]] = {
     "principled": principled,
     "two lamps": two_lamps,
 }
+
+
+def _plain_floor() -> dict[str, Any]:
+    return parts.rectangle([0, 0, 0], [2, 0, 0], [0, 0, -2], parts.diffuse(0.6, 0.5, 0.4))
+
+
+def one_lamp() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
+    """Return a point lamp of unknown position between a floor, a wall and a ball."""
+    scene = {
+        "floor": _plain_floor(),
+        "wall": parts.rectangle([0, 1, -1.5], [2, 0, 0], [0, 1, 0], parts.diffuse(0.5)),
+        "ball": {"type": "sphere", "center": [0.4, 0.4, 0], "radius": 0.4, "bsdf": parts.diffuse(0.3, 0.5, 0.6)},
+        "lamp": {"type": "point", "position": [-0.6, 1.3, 0.5], "intensity": parts.colour(3.0)},
+    }
+    return scene, {"lamp.position": ([-0.2, 1.6, 0.2], [-0.6, 1.3, 0.5])}
+
+
+def glass_ball() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
+    """Return a ball of rough glass of unknown index of refraction and roughness between a floor and a sky."""
+    bsdf = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.5, "ext_ior": 1.0}
+    scene = {
+        "floor": _plain_floor(),
+        "ball": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7, "bsdf": bsdf},
+        "lamp": parts.rectangle(
+            [-1, 2.4, 1.4], [0.5, 0, 0], [0, -0.3, -0.3], parts.diffuse(0.0), emitter=parts.light(6.0, 6.0, 6.0)
+        ),
+        "sky": {"type": "constant", "radiance": parts.colour(0.4)},
+    }
+    return scene, {"ball.bsdf.eta": (1.3, 1.5), "ball.bsdf.alpha.value": (0.35, 0.2)}
+
+
+def sun() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
+    """Return a sun of unknown direction, by two angles, over a ball, a floor and a wall under a sky."""
+    sun = {"type": "directional", "direction": [0.5, -1.0, -0.4], "irradiance": parts.colour(2.0)}
+    scene = {
+        "floor": _plain_floor(),
+        "wall": parts.rectangle([0, 1, -1.5], [2, 0, 0], [0, 1, 0], parts.diffuse(0.5)),
+        "ball": {"type": "sphere", "center": [-0.2, 0.5, 0], "radius": 0.5, "bsdf": parts.diffuse(0.3, 0.5, 0.6)},
+        "sun": sun,
+        "sky": {"type": "constant", "radiance": parts.colour(0.4)},
+    }
+    return scene, {"sun.rotation.x": (0.15, 0.0), "sun.rotation.z": (-0.15, 0.0)}
+
+
+SMALL = {"lamp": one_lamp, "glass": glass_ball, "sun": sun}
+"""Scenes without a sensor, with {key: (start, truth)}, for pictures of few pixels."""
 
 
 def problem(name: str, spp: int = 2048) -> ur.Problem:

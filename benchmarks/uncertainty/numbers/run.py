@@ -17,6 +17,7 @@ from benchmarks.internals import parts
 from benchmarks.runner import records
 from benchmarks.runner.records import Record
 from benchmarks.uncertainty.run import LEVELS, quantiles, with_own_references
+from tests import few_numbers
 
 MERGE = ("problems.*",)
 QUICK: dict[str, Any] = {"problems": ("lamp",), "seeds": 2, "folder_seeds": 1, "steps": 10}
@@ -25,54 +26,9 @@ _LIMITS = (1.0, 2.0)
 """Numbers of standard errors of which coverage is counted."""
 
 
-def _floor() -> dict[str, Any]:
-    return parts.rectangle([0, 0, 0], [2, 0, 0], [0, 0, -2], parts.diffuse(0.6, 0.5, 0.4))
-
-
-def _lamp() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
-    """Return a point lamp of unknown position between a floor, a wall and a ball."""
-    scene = {
-        "floor": _floor(),
-        "wall": parts.rectangle([0, 1, -1.5], [2, 0, 0], [0, 1, 0], parts.diffuse(0.5)),
-        "ball": {"type": "sphere", "center": [0.4, 0.4, 0], "radius": 0.4, "bsdf": parts.diffuse(0.3, 0.5, 0.6)},
-        "lamp": {"type": "point", "position": [-0.6, 1.3, 0.5], "intensity": parts.colour(3.0)},
-    }
-    return scene, {"lamp.position": ([-0.2, 1.6, 0.2], [-0.6, 1.3, 0.5])}
-
-
-def _glass() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
-    """Return a ball of rough glass of unknown index of refraction and roughness between a floor and a sky."""
-    bsdf = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.5, "ext_ior": 1.0}
-    scene = {
-        "floor": _floor(),
-        "ball": {"type": "sphere", "center": [0, 0.7, 0], "radius": 0.7, "bsdf": bsdf},
-        "lamp": parts.rectangle(
-            [-1, 2.4, 1.4], [0.5, 0, 0], [0, -0.3, -0.3], parts.diffuse(0.0), emitter=parts.light(6.0, 6.0, 6.0)
-        ),
-        "sky": {"type": "constant", "radiance": parts.colour(0.4)},
-    }
-    return scene, {"ball.bsdf.eta": (1.3, 1.5), "ball.bsdf.alpha.value": (0.35, 0.2)}
-
-
-def _sun() -> tuple[dict[str, Any], dict[str, tuple[Any, Any]]]:
-    """Return a sun of unknown direction, by two angles, over a ball, a floor and a wall under a sky."""
-    sun = {"type": "directional", "direction": [0.5, -1.0, -0.4], "irradiance": parts.colour(2.0)}
-    scene = {
-        "floor": _floor(),
-        "wall": parts.rectangle([0, 1, -1.5], [2, 0, 0], [0, 1, 0], parts.diffuse(0.5)),
-        "ball": {"type": "sphere", "center": [-0.2, 0.5, 0], "radius": 0.5, "bsdf": parts.diffuse(0.3, 0.5, 0.6)},
-        "sun": sun,
-        "sky": {"type": "constant", "radiance": parts.colour(0.4)},
-    }
-    return scene, {"sun.rotation.x": (0.15, 0.0), "sun.rotation.z": (-0.15, 0.0)}
-
-
-SCENES = {"lamp": _lamp, "glass": _glass, "sun": _sun}
-
-
 def problem(name: str) -> ur.Problem:
     """Return the problem of a name, without its reference."""
-    scene, unknown = SCENES[name]()
+    scene, unknown = few_numbers.SMALL[name]()
     scene |= {"type": "scene", "sensor": parts.camera([0, 1.6, 4.2], [0, 0.4, 0], 40, _SIZE)}
     return ur.Problem(
         scene,

@@ -1,0 +1,98 @@
+"""Problems of 1 to 9 numbers: `auto` against Mitsuba's loop and against fixed settings of our own, at equal processor time.
+
+Lamps, a lens, a field of view, indices of refraction, roughness, a principled BSDF, fog, a sky and poses of lights, each from one picture
+of at most 32² pixels with 4,096 samples per pixel. Errors are means over the unknowns, relative to the start, of the returned values. The
+loop is tuned on a seed of its own over samples per pixel, rates and whether these fall, where `prb` has derivatives. Seconds are the
+processor's, without planning and the first step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from statistics import geometric_mean
+from typing import Any
+
+import numpy as np
+
+import unrender as ur
+from benchmarks import markdown
+from benchmarks.races import TUNING_SEED, Setting, grid, total_error, tune
+from benchmarks.runner.records import Record
+from benchmarks.runner.timing import work_time
+from benchmarks.shapes.lights import run as lights
+from benchmarks.stock_loop import stock_loop
+from benchmarks.suite import ablation
+from benchmarks.suite.run import compare, setting_text
+from benchmarks.timed_runs import blind, timed_run
+from benchmarks.uncertainty.numbers import run as uncertain
+from tests import few_numbers
+
+MERGE = ("problems.*",)
+QUICK: dict[str, Any] = {"problem": ("metal",), "seconds": 0.3, "seeds": 1, "spp": (2,), "rates": (0.02,)}
+PROBLEMS: dict[str, Callable[[], ur.Problem]] = {
+    **{name: partial(few_numbers.problem, name, 4096) for name in few_numbers.CASES},
+    "glass ball": lambda: uncertain.with_own_references(uncertain.problem("glass"), 4096, 0),
+    **{name: partial(lights.problem, name, 1, 0, 24, 4096) for name in ("projector", "area")},
+}
+NO_LOOP = ("lamps", "lens", "view", "pose", "projector", "area")
+"""Problems with unknowns by which `prb` has no derivatives."""
+OPTIONS = ("spp=16", "spp=256", "model-steps")
+"""Fixed settings: of `auto`, and its plan without Gauss-Newton steps, see `ablation`."""
+
+
+def run(
+    problem: tuple[str, ...] = tuple(PROBLEMS),
+    seconds: float = 1.0,
+    seeds: int = 3,
+    spp: tuple[int, ...] = (4, 16),
+    rates: tuple[float, ...] = (0.005, 0.02, 0.05),
+) -> Iterator[dict[str, Any]]:
+    for name in problem:
+        made = PROBLEMS[name]()
+        start = made.parameter_error(made.initial())
+
+        def error(values: Any, made: ur.Problem = made, start: dict[str, float] = start) -> float:
+            return total_error(made.parameter_error(values), start)
+
+        def ours(seed: int, option: str = "", made: ur.Problem = made, error: Any = error) -> list[tuple[float, float]]:
+            plan = ablation.plan(blind(made), option)
+            kept = timed_run(plan.problem, seconds, seed, plan)
+            return [*((at, error(values)) for at, values in kept.found), (kept.seconds, error(kept.returned))]
+
+        def loop(setting: Setting, seed: int, made: ur.Problem = made, error: Any = error) -> list[tuple[float, float]]:
+            fall: Any = ur.schedules.Cosine(1) if setting["falling"] else None
+            given = {"seed": seed, "error": error, "timer": work_time, "fall": fall}
+            history = stock_loop(made, setting["spp"], setting["rate"], seconds, **given)
+            return [(entry["seconds"], entry["parameter_error"]) for entry in history]
+
+        mine = [ours(seed) for seed in range(seeds)]
+        fixed = [option for option in OPTIONS if ablation.changes(made, option)]
+        ends = {option: [ours(seed, option)[-1][1] for seed in range(seeds)] for option in fixed}
+        entry: dict[str, Any] = {"ends": {"": [points[-1][1] for points in mine], **ends}, "seconds": seconds}
+        if name not in NO_LOOP:
+            tries = grid(spp=spp, rate=rates, falling=(False, True))
+            setting, tried = tune(name, tries, lambda each, loop=loop: loop(each, TUNING_SEED)[-1][1])
+            theirs = [loop(setting, seed) for seed in range(seeds)]
+            entry |= {"setting": setting, "tried": tried, "loop": compare(theirs, mine, seconds)}
+        print(name, {option: float(np.median(x)) for option, x in entry["ends"].items()}, flush=True)
+        yield {"problems": {name: entry}}
+
+
+def table(record: Record) -> str:
+    """Errors at the end, the ratio to the best fixed setting, and the speed-up over the loop."""
+    rows, regrets = [], []
+    for name, entry in record["problems"].items():
+        auto, *others = ((float(np.median(x)), option) for option, x in entry["ends"].items())
+        best, option = min(others)
+        regrets.append(max(auto[0] / best, 1.0))
+        cells = ["no derivatives", "", ""]
+        if "loop" in entry:
+            speed = f"{entry['loop']['speed']:.2g}" if entry["loop"]["speed"] else "below 1"
+            cells = [setting_text(entry["setting"]), markdown.spread(entry["loop"]["final"]["loop"]), speed]
+        ends = entry["ends"][""]
+        rows.append([name, len(ends), markdown.spread(ends), f"{best:.4f} ({option})", f"{regrets[-1]:.2f}", *cells])
+    head = "problem | seeds | `auto` | best fixed setting | regret | the loop's setting | loop | speed-up"
+    text = "{seconds:g} s of the processor, median (least to greatest). Regret: ".format(**record["settings"])
+    text += f"geometric mean {geometric_mean(regrets):.2f}, at most 1.15 on {sum(x <= 1.15 for x in regrets)} of {len(rows)}."
+    return markdown.blocks(text, markdown.table(head, rows))
