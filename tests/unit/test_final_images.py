@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.analytic import AnalyticRenderer
-from unrender import optimizers
+from unrender import losses, optimizers
 from unrender.core import phases
 from unrender.estimators.path import PathGradient
 from unrender.images.recursive_control_variate import RecursiveControlVariate
@@ -229,16 +229,16 @@ def test_a_texture_without_a_map_has_the_reason_in_the_record(tmp_path: Path) ->
     assert not final_images.render_final_images(made, replace(result, history=[])).without_errors
 
 
-def textured(shift: float, noise: float) -> Problem:
-    """Two views of one texture of 32 elements, of which the second reference shows it brighter by `shift`."""
+def textured(shift: float, noise: float, count: int = 2) -> Problem:
+    """Views of one texture of 32 elements, of which each reference shows it brighter than the one before by `shift`."""
     rng = np.random.default_rng(0)
     x, y = np.meshgrid(*[np.linspace(0, 1, 40)] * 2)
     blobs = [np.exp(-8 * ((x - a) ** 2 + (y - b) ** 2)).ravel() for a, b in rng.random((32, 2))]
     matrix = np.repeat(np.stack(blobs, axis=1), 3, axis=0)
     truth = {"map": rng.uniform(0.3, 0.7, 32)}
-    renderer = AnalyticRenderer({"map": np.full(32, 0.5)}, matrix, noise=noise, shape=(40, 40), sensors=2)
+    renderer = AnalyticRenderer({"map": np.full(32, 0.5)}, matrix, noise=noise, shape=(40, 40), sensors=count)
     exact = renderer.exact(truth)
-    given = [View(exact * (1.0 + shift * view), sensor=view) for view in range(2)]
+    given = [View(exact * (1.0 + shift * view), sensor=view) for view in range(count)]
     return Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], given)
 
 
@@ -256,10 +256,27 @@ def test_a_wrong_model_is_told_by_the_final_pictures_where_others_have_too_few_p
     assert any("no longer improves" in line for line in alone.warnings) is told  # by the paths left for verification
 
 
+@dataclass(frozen=True)
+class OfFullViews(losses.L2):
+    """As a perceptual loss, it needs full views."""
+
+    @property
+    def linear(self) -> bool:
+        return False
+
+    @property
+    def pixelwise(self) -> bool:
+        return False
+
+
+@pytest.mark.parametrize("count", [2, 5])
 @pytest.mark.parametrize(("rate", "rises"), [(0.1, True), (0.003, False)])
-def test_a_run_that_the_final_pictures_find_worse_returns_its_start(rate: float, rises: bool, tmp_path: Path) -> None:
-    """The pictures of the verification have too few paths to tell."""
-    made = textured(0.0, noise=0.6)
+def test_a_run_that_the_final_pictures_find_worse_returns_its_start(
+    rate: float, rises: bool, count: int, tmp_path: Path
+) -> None:
+    """The pictures of the verification have too few paths to tell. Of five views for a loss of full views they show one."""
+    made = textured(0.0, noise=0.6, count=count)
+    made = made.replaced(loss=OfFullViews()) if count > 2 else made
     truth = np.linalg.lstsq(made.renderer.matrix, np.ravel(made.views[0].reference))[0].astype(np.float32)  # type: ignore
     made = made.replaced(parameters=[Parameter("map", initial=truth, bounds=(0, 1))])
     parts, pictures = (PathGradient(spp=4), optimizers.Adam(rate)), RunAnnotations(final_spp=512)

@@ -51,6 +51,9 @@ _ERRORS, _ERRORS_OF_RISE, _OF_START, _OF_PICTURE = 2.0, 4.0, 0.2, 1e-4
 """Standard errors by which a verified loss must have fallen to be lower; those by which final images must be worse than the initial ones,
 and by how much of the initial mean square error and of the mean square of the references."""
 
+_OF_BIAS = 0.25
+"""Share of the bias from noise that counts as its standard error, since two halves may agree by chance."""
+
 _SEEDS = {"initial": 1, "result": 2}
 _SECOND_HALF = 1 << 16
 """Offset of the seed for the second half of an image's samples."""
@@ -121,10 +124,10 @@ def render_final_images(
         complete: whether the standard errors of the result contain the references' noise.
     """
     with phases.phase("final pictures") as advance:
-        samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
-        chosen = _chosen(problem)
-        pictures, errors, ends = _pictures(problem, result, chosen, samples, advance)
-        if len(chosen) == len(problem.views) and (rise := _rise(problem, result, pictures, errors)):
+        samples, chosen = spp or _affordable(problem, result, _PICTURES_SHARE * left()), _chosen(problem)
+        pictures, errors, halves_of = _pictures(problem, result, chosen, samples, advance)
+        ends = halves_of["result"]
+        if rise := _rise(problem, result, pictures, errors, halves_of):
             return FinalImages(pictures, errors, samples, {}, rise=rise)
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
@@ -177,13 +180,15 @@ def _rise(
     result: Result,
     pictures: Mapping[str, np.ndarray],
     errors: Mapping[str, tuple[float, float]],
+    halves: Mapping[str, Sequence[tuple[np.ndarray, ...]]],
 ) -> str:
     """Return a warning if the final images of all views are worse than the initial ones, by more than noise and by a visible amount.
 
     It is "" where the verification found that the loss has fallen, or that earlier parameters are better, and for losses and priors whose
-    minimum is elsewhere.
+    minimum is elsewhere. Losses of full images, of which the verification renders few, are compared themselves.
     """
-    if not problem.loss.linear or any(unknown.prior is not None for unknown in problem.unknowns.values()):
+    prior = any(unknown.prior is not None for unknown in problem.unknowns.values())
+    if prior or (problem.loss.pixelwise and not problem.loss.linear):
         return ""
     start, end = (result.verification.get(name, [None, None]) for name in ("start", "end"))
     ended = problem.remeshed_from is None and result.status == "finished" and result.verification.get("best") == "end"
@@ -191,6 +196,12 @@ def _rise(
         return ""
     if end[0] + _ERRORS * math.hypot(start[1], end[1]) < start[0] or len(errors) < 2 * len(problem.views):
         return ""
+    if not problem.loss.pixelwise:
+        values, views = (result.initial, result.parameters), range(len(problem.views))
+        pairs = zip(values, (halves["initial"], halves["result"]), strict=True)
+        (before, noise), (after, more) = (_loss(problem, own, views, images) for own, images in pairs)
+        rises = after - before > max(_ERRORS_OF_RISE * math.hypot(noise, more), _OF_START * before)
+        return _worse("loss", after, before) if rises else ""
     totals, variance, size = {"initial": 0.0, "result": 0.0}, 0.0, 0.0
     for index, view in enumerate(problem.views):
         share = view.weight / sum(each.weight for each in problem.views)
@@ -205,11 +216,29 @@ def _rise(
         rise > _ERRORS_OF_RISE * math.sqrt(variance) and rise > max(_OF_START * totals["initial"], _OF_PICTURE * size)
     ):
         return ""
-    before, after = (formatting.number(math.sqrt(totals[which])) for which in ("initial", "result"))
+    return _worse("image error", math.sqrt(totals["result"]), math.sqrt(totals["initial"]))
+
+
+def _worse(measure: str, after: float, before: float) -> str:
     return (
-        f"the final picture is worse than the initial one: image error {after}, {before} at the start; the result holds the initial "
-        "parameters; try a lower learning_rate, more samples per pixel, or another method"
+        f"the final picture is worse than the initial one: {measure} {formatting.number(after)}, {formatting.number(before)} at the start; "
+        "the result holds the initial parameters; try a lower learning_rate, more samples per pixel, or another method"
     )
+
+
+def _loss(
+    problem: Problem, values: Mapping[str, np.ndarray], views: Sequence[int], images: Sequence[tuple[np.ndarray, ...]]
+) -> tuple[float, float]:
+    """Return the loss of images of some views without the bias from their noise, and about its standard error, from their halves."""
+    loss, square, array = penalty(problem, values), 0.0, problem.renderer.array
+    for view, (one, other) in zip(views, images, strict=True):
+        both, *parts = (
+            arrays.number(problem.loss_value(view, array(image))) for image in ((one + other) / 2, one, other)
+        )
+        half = sum(parts) / 2.0
+        loss += 2.0 * both - half
+        square += (0.5 * (parts[0] - parts[1])) ** 2 + (_OF_BIAS * (half - both)) ** 2
+    return loss, math.sqrt(square)
 
 
 def _no_improvement(
@@ -219,12 +248,7 @@ def _no_improvement(
     known = any(DIFFERS in line for line in result.warnings) or result.verification.get("best") != "end"
     if known or len(views) < len(problem.views) or len(ends[0]) < 2:
         return ()
-    loss, array = penalty(problem, result.parameters), problem.renderer.array
-    for view, (one, other) in zip(views, ends, strict=True):
-        both, *halves = (
-            arrays.number(problem.loss_value(view, array(image))) for image in ((one + other) / 2, one, other)
-        )
-        loss += 2.0 * both - sum(halves) / 2.0  # without the bias from the images' noise
+    loss, _ = _loss(problem, result.parameters, views, ends)
     change = result.verification.get("change", {})
     return tuple(no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends)))
 
@@ -237,11 +261,11 @@ def _untested(problem: Problem, result: Result, reason: str) -> Uncertainty:
 
 def _pictures(
     problem: Problem, result: Result, views: Sequence[int], spp: int, advance: Callable[[float], None]
-) -> tuple[dict[str, np.ndarray], dict[str, tuple[float, float]], list[tuple[np.ndarray, ...]]]:
-    """Return the pictures of some views by name, their errors, and the halves of each view's final image."""
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[float, float]], dict[str, list[tuple[np.ndarray, ...]]]]:
+    """Return the pictures of some views by name, their errors, and the halves of each view's initial and final image."""
     pictures: dict[str, np.ndarray] = {}
     errors: dict[str, tuple[float, float]] = {}
-    ends: list[tuple[np.ndarray, ...]] = []
+    halves_of: dict[str, list[tuple[np.ndarray, ...]]] = {which: [] for which in _SEEDS}
     for place, index in enumerate(views):
         reference = np.asarray(problem.views[index].reference, np.float32)
         pictures[f"view{index}/reference"] = reference
@@ -250,13 +274,12 @@ def _pictures(
             of = problem.remeshed_from or problem if which == "initial" else problem
             halves, error = _picture(of, values, index, spp, _SEEDS[which])
             pictures[name] = sum(halves[1:], halves[0]) / len(halves)
-            if which == "result":
-                ends.append(halves)
+            halves_of[which].append(halves)
             if error is not None:
                 errors[name] = error
             advance((2 * place + done + 1) / (2 * len(views)))
         pictures |= _maps(result, index, reference.shape[:2])
-    return pictures, errors, ends
+    return pictures, errors, halves_of
 
 
 def _maps(result: Result, view: int, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
