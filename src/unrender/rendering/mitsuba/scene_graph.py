@@ -74,6 +74,11 @@ class ObjectGraph:
             if _attribute(node) == name and any(shape in chain for chain in self.chains(node))
         ]
 
+    def vertex_attributes(self, shape: Any) -> list[str]:
+        """Return the names of a shape's attributes per vertex that textures of its BSDF read."""
+        names = sorted({name for node in self.nodes if (name := _attribute(node)).startswith("vertex_")})
+        return [name for name in names if self.attribute_readers(shape, name)]
+
     def missing_attributes(self) -> list[str]:
         """Return one notice for each attribute that a texture reads from a shape without it. Mitsuba reads 0 there, in silence."""
         lines = []
