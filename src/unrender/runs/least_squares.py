@@ -41,10 +41,8 @@ _CHANNELS = 3.0
 """Channels that share their noise."""
 _ERRORS, _ROUNDING = 3.0, 1e-10
 """Standard errors by which the change along a direction must exceed its noise; square of one, relative to the largest, left by rounding."""
-_DOUBTFUL = 0.1
-"""Standard error, as a share of a number's size, from which on the references leave it open."""
-_FURTHER, _STEP_ERRORS = 0.05, 4.0
-"""Least remaining step, as a share of a number's size and in standard errors, that is reported."""
+_DOUBTFUL = 0.1  # standard error, as a share of a number's size, from which on it is undetermined
+_FURTHER, _STEP_ERRORS = 0.05, 4.0  # least step reported: share of a number's size, standard errors
 _OF_WIDTHS, _TOGETHER = 10.0, 0.9
 """Size of a pose, in widths of its differences; correlation from which on two numbers count as determined together."""
 _ROUNDS, _WEAK = 3, 0.3
@@ -375,9 +373,11 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
             others = [k for k, x in numbers.places().items() if k != key and together[of][open_[of]][:, x].any()]
             others += [*numbers.fields] if shared[of].any() else []
             together_with = f", together with {listed(others)}" if others else ""
+            limit = f"determines it to ± {_numbers(shown[of])}{max(more[of])}"
+            found = limit if (error <= sizes)[of].any() else "does not determine it"
             undetermined[key] = (
-                f"{key}: the references leave it open by ± {_numbers(shown[of])}{max(more[of])}{together_with} (standard error with their "
-                "noise); fix one of these, add views, or narrow the bounds"
+                f"{key}: a least-squares test at the end {found}{together_with} (with the noise of the references and of the test); fix "
+                "one of these, add views or samples, or narrow the bounds"
             )
         elif further[of].any() and numbers.problem.loss.linear:
             unfinished[key] = (
