@@ -167,8 +167,7 @@ def element_scales(like: Tree, squares: np.ndarray) -> np.ndarray:
 
 def pixel_shares(problem: ur.Problem, sampler: Any, state: Any) -> np.ndarray:
     """Probabilities of the pixels of all views, relative to uniform ones, by the state of a sampler with an importance map."""
-    guided = sampler._sampler_for(problem) if isinstance(sampler, ur.pixels.Adaptive) else sampler._sampler
-    tiles = guided._tiles(problem)
+    tiles = sampler._sampler_for(problem)._tiles(problem)
     found = []
     for part, grid, view in zip(tiles.split(state.shares), tiles.grids, problem.views, strict=True):
         height, width = problem.renderer.resolutions()[view.sensor]

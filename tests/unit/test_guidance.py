@@ -175,9 +175,8 @@ def test_a_learning_rate_that_crosses_the_range_is_commented() -> None:
     assert "learning_rate of 2 crosses its range, 0 to 1, in one step" in line
     first, *others = optimize(bounded, PathGradient(), optimizers.Adam(2.0), steps=1).warnings
     assert first == line
-    assert [other.partition(":")[0] for other in others] in ([], ["the final picture is worse than the initial one"]), (
-        others
-    )
+    at_its_end = {"parameter wall", "the final picture is worse than the initial one"}  # at a bound, after one step
+    assert {other.partition(":")[0] for other in others} <= at_its_end, others
     assert remarks(bounded, optimizers.Adam(0.05)) == []
     assert remarks(problem(bounds=(0, 100)), optimizers.Adam(2.0)) == []
     assert remarks(problem(bounds=(None, None)), optimizers.Adam(2.0)) == []
