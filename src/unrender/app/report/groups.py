@@ -26,7 +26,8 @@ class Group:
     """Runs of one method with equal settings and different seeds.
 
     Attributes:
-        label: name of the method, with the settings that differ if several groups share the method.
+        label: name of the method, with the settings that differ if several groups share the method, and with the folder's name if runs
+            share the seed, too.
         runs: the runs, in the order of the arguments.
     """
 
@@ -35,7 +36,10 @@ class Group:
 
 
 def group(runs: Sequence[RunFolder]) -> tuple[Group, ...]:
-    """Group runs by method and settings, in order of first appearance. Seeds and budgets are not settings."""
+    """Group runs by method and settings, in order of first appearance. Seeds and budgets are not settings.
+
+    Runs that share a seed, such as a run and its continuation, are no spread over seeds: each is a group.
+    """
     kinds: dict[tuple, list[RunFolder]] = {}
     for run in runs:
         kinds.setdefault((run.record.method, tuple(_settings(run).items())), []).append(run)
@@ -43,7 +47,13 @@ def group(runs: Sequence[RunFolder]) -> tuple[Group, ...]:
     unique = [
         f"{name} ({labels[: i + 1].count(name)})" if labels.count(name) > 1 else name for i, name in enumerate(labels)
     ]
-    return tuple(Group(name, tuple(of)) for name, of in zip(unique, kinds.values(), strict=True))
+    found: list[Group] = []
+    for name, of in zip(unique, kinds.values(), strict=True):
+        if len({run.record.seed for run in of}) == len(of):
+            found.append(Group(name, tuple(of)))
+        else:
+            found += [Group(f"{name}, {printable(run.path.name)}", (run,)) for run in of]
+    return tuple(found)
 
 
 def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
@@ -94,9 +104,6 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
         if len(set(values)) > 1:
             notices.append(f"These runs have different {what}.")
     notices += filter(None, (_changes(first, run) for run in runs[1:]))
-    for of in group(runs):
-        if len({run.record.seed for run in of.runs}) < len(of.runs):
-            notices.append(f"{of.label}: some runs share a seed, so the spread over the runs is too small.")
     if first.record.method == "stock" and len({run.record.method for run in runs}) > 1 and _default_rate(first):
         notices.append("stock ran with its default learning rate, not tuned: ratios and times are relative to that.")
     for run in runs:
