@@ -95,7 +95,7 @@ def test_few_values_are_listed_up_to_twelve_numbers() -> None:
     known = {f"colour{i}": np.array([0.25, 0.5, 1.0]) for i in range(5)} | {"map": np.zeros((4, 4))}
     texts = formatting.few_values(known, {"colour0": [0.01, None, 0.02]})
     assert list(texts) == ["colour0", "colour1", "colour2", "colour3"]
-    assert texts["colour0"] == "0.25 ± 0.01, 0.5 (not determined), 1 ± 0.02"
+    assert texts["colour0"] == "0.250 ± 0.010, 0.5 (not determined), 1.000 ± 0.020"
     assert texts["colour1"] == "0.25, 0.5, 1"
 
 
@@ -128,3 +128,9 @@ def test_the_error_of_a_single_pixel_is_not_zero(masked: bool) -> None:
         value, error = debiased.rmse(first, second, np.zeros(shape), mask)
         scores.append(abs(value - 0.5) / error)
     assert np.quantile(scores, 0.5) < 2.0
+
+
+def test_values_have_as_many_digits_as_their_standard_errors() -> None:
+    """A value of 12.035 ± 0.042 was shown as 12."""
+    found = formatting.values(np.array([12.0353, -0.00123, 50.713]), [0.0424, 0.0011, None])
+    assert found == "12.035 ± 0.042, −0.0012 ± 0.0011, 50.7 (not determined)"

@@ -216,7 +216,7 @@ def test_numbers_have_their_standard_errors(tmp_path):
     parameters = {"a": np.array([-0.3, 0.4]), "b": np.array([1.25])}
     run = write_run(tmp_path / "run", truth=parameters, parameters=parameters, standard_error={"a": [0.012, 0.034]})
     text = Page(report.page(run)).words
-    assert f"{formatting.number(-0.3)} ± 0.012, 0.4 ± 0.034" in text
+    assert "−0.300 ± 0.012, 0.400 ± 0.034" in text
     assert "1.25 ±" not in text
     assert "one standard error, from the noise" in text
 

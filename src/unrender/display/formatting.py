@@ -63,12 +63,15 @@ def values(array: np.ndarray, standard_error: Sequence[float | None] | None = No
         return ""
     if array.size > LISTED:
         return " … ".join(number(float(value)) for value in (array.min(), array.max()))
-    texts = [number(float(value)) for value in array.reshape(-1)]
-    if standard_error is not None and len(standard_error) == len(texts):
-        texts = [
-            f"{text} ± {deviation(error)}" if deviation(error)[0].isdigit() else f"{text} ({deviation(error)})"
-            for text, error in zip(texts, standard_error, strict=True)
-        ]
+    numbers = [float(value) for value in array.reshape(-1)]
+    if standard_error is None or len(standard_error) != len(numbers):
+        return ", ".join(map(number, numbers))
+    texts = [
+        with_standard_error(value, error)
+        if error is not None and math.isfinite(error)
+        else f"{number(value)} ({deviation(error)})"
+        for value, error in zip(numbers, standard_error, strict=True)
+    ]
     return ", ".join(texts)
 
 
