@@ -212,6 +212,13 @@ def test_the_table_tells_errors_from_the_truth(tmp_path):
     assert "0.25" in words_of_page
 
 
+def test_the_parameter_error_is_that_of_the_returned_values(tmp_path):
+    """The page had the error of the last step's values: 0.032 where the values beside it were off by 0.0009."""
+    truth, initial, last = ({"a": np.array([value])} for value in (0.5, 1.5, 0.625))
+    run = write_run(tmp_path / "run", errors=(0.9, 0.7, 0.5, 0.3), truth=truth, initial=initial, parameters=last)
+    assert "Parameter error 0.125 RMSE, from 1" in Page(report.page(run)).words
+
+
 def test_numbers_have_their_standard_errors(tmp_path):
     parameters = {"a": np.array([-0.3, 0.4]), "b": np.array([1.25])}
     run = write_run(tmp_path / "run", truth=parameters, parameters=parameters, standard_error={"a": [0.012, 0.034]})

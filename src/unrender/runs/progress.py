@@ -153,7 +153,8 @@ class Progress(Callback):
     def _line(self, run: Run, record: dict[str, Any]) -> str:
         parts = [f"step {run.step}" + (f"/{run.steps}" if run.steps else "")]
         if self._loss is not None:
-            parts.append(f"loss {self._loss:.4g} (mean of ~{round(1 / _SMOOTHING)} steps)")
+            steps = f" (mean of ~{round(1 / _SMOOTHING)} steps)" if run.step > 1 else ""
+            parts.append(f"loss {self._loss:.4g}{steps}")
         if self._error:
             parts.append("error " + ", ".join(f"{error:.3g}" for error in self._error.values()))
         if record["gradient_noise"] is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -140,14 +141,14 @@ class ViewRow:
 def tiles(run: RunFolder) -> list[Tile]:
     """Return the tiles in the head of the page of a run."""
     all_tiles = []
-    series = [(key, s) for key in run.known if (s := curves.parameter_error(run, key)) is not None]
-    if len(series) == 1:
-        key, errors = series[0]
-        first, last = float(errors.values[0]), float(errors.values[-1])
+    known = {key: (run.error_before[key], after) for key, after in run.error_after.items() if key in run.error_before}
+    ratios = [after / before for before, after in known.values() if 0 < before < math.inf]
+    if len(known) == 1:
+        ((key, errors),) = known.items()
         measure = run.measure(key)
-        all_tiles.append(_tile("Parameter error", first, last, measure.name, measure.unit))
-    elif (relative := curves.relative_error(run, run.known)) is not None:
-        all_tiles.append(Tile("Parameter error", f"{relative.values[-1]:.1%}", "of the start's, mean over parameters"))
+        all_tiles.append(_tile("Parameter error", *errors, measure.name, measure.unit))
+    elif ratios:
+        all_tiles.append(Tile("Parameter error", f"{np.mean(ratios):.1%}", "of the start's, mean over parameters"))
     after = curves.image_error(run)
     if (measured := _image_error(run)) is not None:
         all_tiles.append(measured)
