@@ -64,7 +64,8 @@ def test_a_descent_that_arrives_is_not_disturbed() -> None:
     assert plan.other_starts == (KEY,)
     result = ur.optimize(made, plan, steps=40)
     alone = ur.optimize(made, replace(plan, other_starts=()), steps=40)
-    np.testing.assert_array_equal(result.last[KEY], alone.last[KEY])
+    # Sums of several threads have no fixed order.
+    np.testing.assert_allclose(result.last[KEY], alone.last[KEY], rtol=1e-4)
     assert not any("begins again" in line for line in result.adapted)
 
 
