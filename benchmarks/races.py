@@ -228,6 +228,12 @@ def total_error(errors: dict[str, float], start: dict[str, float]) -> float:
     return float(np.mean([errors[key] / start[key] for key in errors]))
 
 
+def relative_error(problem: ur.Problem) -> Callable[[dict[str, Any]], float]:
+    """`total_error` of values of the problem's parameters."""
+    start = problem.parameter_error(problem.initial())
+    return lambda values: total_error(problem.parameter_error(values), start)
+
+
 def tenths(runs: Runs, column: int) -> dict[str, list[float]]:
     """Each method's error, median over seeds, at each tenth of the seconds (column 0) or samples (1) that all reached."""
     end = min(run[-1][column] for found in runs.values() for run in found)

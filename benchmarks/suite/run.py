@@ -14,6 +14,7 @@ higher_order.table2, since the loop has no gradients of them.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from statistics import geometric_mean
@@ -94,10 +95,11 @@ def loop(
     seed: int,
     every: int,
     setting: dict[str, Any],
+    timer: Callable[[], float] = time.perf_counter,
 ) -> Points:
     """A run of the stock loop."""
     fall: Any = ur.schedules.Cosine(1) if setting["falling"] else None
-    options = {"seed": seed, "every": every, "fall": fall, "error": error}
+    options = {"seed": seed, "every": every, "fall": fall, "error": error, "timer": timer}
     history = stock_loop(problem, setting["spp"], setting["rate"], seconds, **options)
     return [(h["seconds"], h["parameter_error"]) for h in history]
 

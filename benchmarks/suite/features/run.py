@@ -15,7 +15,7 @@ import numpy as np
 import unrender as ur
 from benchmarks import markdown
 from benchmarks.internals import Lenses, Relief, dr, mi, parts, textures
-from benchmarks.races import TUNING_SEED, search, total_error
+from benchmarks.races import TUNING_SEED, relative_error, search
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.stock_loop import stock_loop
@@ -140,12 +140,8 @@ def run(
 ) -> Iterator[dict[str, Any]]:
     for name in problem:
         made = PROBLEMS[name]()
-        start = made.parameter_error(made.initial())
+        error = relative_error(made)
         integrator = _PTRACER if name == "caustic" else None
-
-        def error(values: Any, made: ur.Problem = made, start: dict[str, float] = start) -> float:
-            return total_error(made.parameter_error(values), start)
-
         given: dict[str, Any] = {"every": 2, "error": error, "timer": work_time, "integrator": integrator}
 
         def loop(samples: int, rate: float, seed: int, made: ur.Problem = made, given: Any = given) -> Any:

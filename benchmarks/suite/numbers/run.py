@@ -17,13 +17,12 @@ import numpy as np
 
 import unrender as ur
 from benchmarks import markdown
-from benchmarks.races import TUNING_SEED, Setting, grid, total_error, tune
+from benchmarks.races import TUNING_SEED, Setting, grid, relative_error, tune
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
 from benchmarks.shapes.lights import run as lights
-from benchmarks.stock_loop import stock_loop
 from benchmarks.suite import ablation
-from benchmarks.suite.run import compare, setting_text
+from benchmarks.suite.run import Points, compare, loop, setting_text
 from benchmarks.timed_runs import blind, timed_run
 from benchmarks.uncertainty.numbers import run as uncertain
 from tests import few_numbers
@@ -39,6 +38,8 @@ NO_LOOP = ("lamps", "lens", "view", "pose", "projector", "area")
 """Problems with unknowns by which `prb` has no derivatives."""
 OPTIONS = ("spp=16", "spp=256", "model-steps")
 """Fixed settings: of `auto`, and its plan without Gauss-Newton steps, see `ablation`."""
+_EVERY = 5
+"""Steps of the loop between errors."""
 
 
 def run(
@@ -50,21 +51,15 @@ def run(
 ) -> Iterator[dict[str, Any]]:
     for name in problem:
         made = PROBLEMS[name]()
-        start = made.parameter_error(made.initial())
-
-        def error(values: Any, made: ur.Problem = made, start: dict[str, float] = start) -> float:
-            return total_error(made.parameter_error(values), start)
+        error = relative_error(made)
 
         def ours(seed: int, option: str = "", made: ur.Problem = made, error: Any = error) -> list[tuple[float, float]]:
             plan = ablation.plan(blind(made), option)
             kept = timed_run(plan.problem, seconds, seed, plan)
             return [*((at, error(values)) for at, values in kept.found), (kept.seconds, error(kept.returned))]
 
-        def loop(setting: Setting, seed: int, made: ur.Problem = made, error: Any = error) -> list[tuple[float, float]]:
-            fall: Any = ur.schedules.Cosine(1) if setting["falling"] else None
-            given = {"seed": seed, "error": error, "timer": work_time, "fall": fall}
-            history = stock_loop(made, setting["spp"], setting["rate"], seconds, **given)
-            return [(entry["seconds"], entry["parameter_error"]) for entry in history]
+        def theirs_of(setting: Setting, seed: int, made: ur.Problem = made, error: Any = error) -> Points:
+            return loop(made, error, seconds, seed, _EVERY, setting, timer=work_time)
 
         mine = [ours(seed) for seed in range(seeds)]
         fixed = [option for option in OPTIONS if ablation.changes(made, option)]
@@ -72,8 +67,8 @@ def run(
         entry: dict[str, Any] = {"ends": {"": [points[-1][1] for points in mine], **ends}, "seconds": seconds}
         if name not in NO_LOOP:
             tries = grid(spp=spp, rate=rates, falling=(False, True))
-            setting, tried = tune(name, tries, lambda each, loop=loop: loop(each, TUNING_SEED)[-1][1])
-            theirs = [loop(setting, seed) for seed in range(seeds)]
+            setting, tried = tune(name, tries, lambda each, of=theirs_of: of(each, TUNING_SEED)[-1][1])
+            theirs = [theirs_of(setting, seed) for seed in range(seeds)]
             entry |= {"setting": setting, "tried": tried, "loop": compare(theirs, mine, seconds)}
         print(name, {option: float(np.median(x)) for option, x in entry["ends"].items()}, flush=True)
         yield {"problems": {name: entry}}

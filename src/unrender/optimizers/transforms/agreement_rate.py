@@ -127,10 +127,10 @@ class AgreementRate(StepTransform):
                 most = log_most[key] = min(before[key] + change, limit)
                 least = state.log_least[key] + self._change(min(rho, 0.0), shape, update.made)
                 least = log_least[key] = min(least, most) if fit.gain == 1.0 else most
-                share = min(1.0, fit.lasting + _LASTING_ERRORS / math.sqrt(max(1, math.prod(shape))))
+                errors = _LASTING_ERRORS / math.sqrt(max(1, math.prod(shape)))
+                share, few = min(1.0, fit.lasting + errors), min(1.0, errors)
                 log_rate[key] = math.log((1.0 - share) * math.exp(least) + share * math.exp(most))
                 factor = math.exp(log_rate[key]) * (share + (1.0 - share) * fit.inflation**-_INFLATION)
-                few = min(1.0, _LASTING_ERRORS / math.sqrt(max(1, math.prod(shape))))
                 factors[key] = max(factor, min(factor * (few + (1.0 - few) * fit.growth), math.exp(limit)))
             falls = {key for key, q in factors.items() if q < _FALL * state.factors[key]}
             falls = {key for key in falls if update.smoothing.get(key, SMOOTHING_UNCHANGED).gain == 1.0}

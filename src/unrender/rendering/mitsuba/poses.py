@@ -28,7 +28,6 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 from unrender.rendering.renderer import ParameterInfo
 
 _AXES = ("x", "y", "z")
@@ -208,8 +207,7 @@ class PosedScene:
         static: scene without the posed shapes, with all emitters and sensors.
         parts: {id: a scene of that shape alone}.
 
-    Raises `InputError` if two parameters set the same coordinate, and for a mesh with attributes per vertex: Mitsuba interpolates them at
-    the mesh's place as loaded.
+    Raises `InputError` if two parameters set the same coordinate.
     """
 
     def __init__(self, scene: Any, chosen: Mapping[str, PoseKey]):
@@ -217,13 +215,6 @@ class PosedScene:
         targets = {key.target for key in chosen.values()}
         shapes = scene.shapes()
         posed = {shape.id(): shape for shape in shapes if shape.id() in targets}
-        graph = ObjectGraph(scene) if posed else None
-        for name, shape in posed.items():
-            if graph is not None and (read := graph.vertex_attributes(shape)):
-                raise InputError(
-                    f"{name}: a mesh whose material reads {', '.join(read)} cannot be posed; use {name}.vertex_positions, "
-                    "or a bitmap in place of the attribute"
-                )
         rest = [shape for shape in shapes if shape.id() not in posed]
         rest += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
         shape_of_sensor = {sensor.id(): sensor.get_shape() for sensor in scene.sensors()}

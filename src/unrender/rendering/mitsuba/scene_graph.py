@@ -7,7 +7,7 @@ object's parameters affect the image, and each holder caches values that depend 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from typing import Any
 
@@ -74,10 +74,15 @@ class ObjectGraph:
             if _attribute(node) == name and any(shape in chain for chain in self.chains(node))
         ]
 
-    def vertex_attributes(self, shape: Any) -> list[str]:
-        """Return the names of a shape's attributes per vertex that textures of its BSDF read."""
+    def check_posed(self, ids: Collection[str]) -> None:
+        """Raise `InputError` for a posed mesh with attributes per vertex: Mitsuba interpolates them at the mesh's place as loaded."""
         names = sorted({name for node in self.nodes if (name := _attribute(node)).startswith("vertex_")})
-        return [name for name in names if self.attribute_readers(shape, name)]
+        for shape in self._scene.shapes():
+            if shape.id() in ids and (read := [name for name in names if self.attribute_readers(shape, name)]):
+                raise InputError(
+                    f"{shape.id()}: a mesh whose material reads {', '.join(read)} cannot be posed; use {shape.id()}.vertex_positions, "
+                    "or a bitmap in place of the attribute"
+                )
 
     def missing_attributes(self) -> list[str]:
         """Return one notice for each attribute that a texture reads from a shape without it. Mitsuba reads 0 there, in silence."""

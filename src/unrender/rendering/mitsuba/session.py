@@ -120,6 +120,7 @@ class MitsubaSession:
         self._pair, self._keys, self._poses, self._attached = pair, keys, fixed, frozenset(derivatives)
         if fixed:  # restore shapes that an earlier session has moved
             scene.set_parameters({})
+        scene.graph.check_posed({pose.target for pose in fixed.values()})
         self._posed = PosedScene(pair.current, fixed) if fixed else None
         if self._posed is not None:
             share_addresses(self._posed.scenes())
