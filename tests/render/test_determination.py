@@ -119,7 +119,7 @@ def test_cells_that_hardly_change_the_pictures_are_told():
     hidden = seen.copy()
     hidden[:, :4] = 0
     (line,) = undetermined_cells({"wall": hidden})
-    assert line.startswith("wall: 38% of it hardly changes the pictures")  # next to seen ones, they count as seen
+    assert line.startswith("wall: 50% of it hardly changes the pictures")
 
 
 def test_a_run_tells_in_its_folder(tmp_path: Any):

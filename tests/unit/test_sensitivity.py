@@ -57,13 +57,14 @@ def test_noise_of_the_adjoint_would_be_counted_without_separate_paths(monkeypatc
 
 
 def test_cells_that_no_pixel_sees_are_hardly_seen():
-    """With those around them: one that noise has made 0 among others that are seen is none."""
-    found = np.ones((12, 9, 3), np.float32)
-    found[:4] = 0.0
-    found[8, 5] = 0.0
+    """Those beside seen ones too, and those that bounced light alone shows. One that noise has made 0 among seen ones is seen."""
     expected = np.zeros((12, 9), bool)
-    expected[:3] = True
-    np.testing.assert_array_equal(insensitive(found), expected)
+    expected[:4] = True
+    for bounced in (0.0, 0.07):
+        found = np.ones((12, 9, 3), np.float32)
+        found[:4] = bounced
+        found[8, 5] = 0.0
+        np.testing.assert_array_equal(insensitive(found), expected)
     assert insensitive(np.zeros((2, 2, 3))).all()
 
 

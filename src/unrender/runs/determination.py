@@ -131,7 +131,7 @@ def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
         where = seen_cells(sensitivity)
         if where is not None and (share := 1.0 - float(where.mean())) >= _UNSEEN:
             lines.append(
-                f"{key}: {share:.0%} of it hardly changes the pictures; values there are the initial ones, or smoothed"
+                f"{key}: {share:.0%} of it hardly changes the pictures; values there are the initial ones, smoothed, or noise"
             )
     return lines
 

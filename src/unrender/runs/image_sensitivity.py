@@ -28,8 +28,8 @@ _PROJECTIONS = 1 << 25
 """Numbers of the probes' projections that are stored for the overlap."""
 COUNTED = 0.1
 """Curvature relative to the median above which a cell counts in means over cells."""
-_INSENSITIVE = 0.05
-"""Sensitivity relative to the median below which an element hardly affects the images."""
+_INSENSITIVE = 0.1
+"""Sensitivity relative to the median below which a cell hardly affects the images, such as by bounced light alone."""
 
 
 @dataclass(frozen=True)
@@ -209,12 +209,13 @@ def transposed(
 
 
 def around(values: np.ndarray) -> np.ndarray:
-    """Return the root mean square of a sensitivity over channels and neighbouring cells: (..., channels) -> (...).
+    """Return the root of the median over neighbouring cells of the mean square over channels: (..., channels) -> (...).
 
-    It averages the noise of single elements from few probes.
+    It lowers the noise of single elements from few probes, and keeps the border between seen and unseen cells.
     """
-    means = neighbour_means(np.mean(np.square(values, dtype=np.float64), axis=-1))
-    return np.sqrt(means.clip(min=0.0))  # running sums may round to below 0 next to large values
+    from scipy.ndimage import median_filter  # takes long to import
+
+    return np.sqrt(median_filter(np.mean(np.square(values, dtype=np.float64), axis=-1), 3, mode="nearest"))
 
 
 def neighbour_means(cells: np.ndarray, channels: bool = False) -> np.ndarray:
@@ -226,7 +227,7 @@ def neighbour_means(cells: np.ndarray, channels: bool = False) -> np.ndarray:
 
 
 def insensitive(values: np.ndarray) -> np.ndarray:
-    """Return a mask of the cells of a texture or grid whose smoothed sensitivity is below a twentieth of the median of the non-zero ones.
+    """Return a mask of the cells of a texture or grid whose smoothed sensitivity is below a tenth of the median of the non-zero ones.
 
     Args:
         values: result of `sensitivity`, (..., channels).

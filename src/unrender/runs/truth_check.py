@@ -21,8 +21,6 @@ _FURTHER, _FURTHER_EARLY = 1.1, 1.5
 """Ratio of a parameter's last error to its first from which a warning is given; the second one for runs of few steps."""
 _ERRORS = 2.0
 """Number of standard errors of a parameter that its last error must exceed in addition to its first error."""
-_INSENSITIVE = 0.05
-"""Fraction of the median of the seen cells below which a cell is hardly seen."""
 _PROBES, _SECONDS_SHARE = 8, 0.02
 """Probes of the sensitivity; fraction of the run's time after which no further one is started."""
 _SIGNS_SEED = 5
@@ -63,7 +61,7 @@ def further_from_truth(
         start, end = before[key], after[key]
         sensitivity_of_key = sensitivities.get(key)
         if sensitivity_of_key is not None and key in problem.truth:
-            where = _seen(sensitivity_of_key)
+            where = seen_cells(sensitivity_of_key)
             if where is not None and not where.all():
                 words = " where the pictures show it"
             known = problem.truth[key]
@@ -94,15 +92,6 @@ def _noise_of_pixels(pictures: FreshPictures, truth: Mapping[str, np.ndarray]) -
     of = residuals[0::2], residuals[1::2], pictures.references, pictures.weights, pictures.sizes
     shared = misfit(*of, 0.0)
     return total if shared is None else max(total - shared.error**2, 0.0)
-
-
-def _seen(sensitivity: np.ndarray) -> np.ndarray | None:
-    """Return the cells that affect the images themselves, not only through their neighbours; None for parameters without cells."""
-    where = seen_cells(sensitivity)
-    if where is None:
-        return None
-    own = np.sqrt(np.mean(np.square(sensitivity, dtype=np.float64), axis=-1))
-    return where & (own > _INSENSITIVE * np.median(own[where])) if where.any() else where
 
 
 def _noise(problem: Problem, key: str, sensitivity: np.ndarray, where: np.ndarray | None, residual: float) -> float:
