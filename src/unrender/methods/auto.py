@@ -47,6 +47,7 @@ class AutoMethod(Options):
     | vertices | large steps, one rate for all | |
     | cameras; up to 24 numbers, one of a light or of the picture's form | Gauss-Newton steps | `image` |
     | poses, and what path gradients refuse | perturbed renders: Gauss-Newton steps, or a smoothed loss | `sigma` |
+    | poses on a plateau | the best of 16 to 64 places of each shape | |
     """
 
     image: Literal["plain", "rcv"] | None = Field(
@@ -91,5 +92,6 @@ class AutoMethod(Options):
     def plan(self, problem: Problem) -> Plan:
         traits = Traits(problem, self, CONSTANTS)
         plan = next(plan for rule in RULES if (plan := rule(traits)) is not None)
+        plan = replace(plan, reasons=(*plan.reasons, *traits.notes))
         few = traits.elements <= CONSTANTS.few_numbers
         return replace(plan, other_starts=tuple(varied_keys(problem, list(traits.infos)))) if few else plan

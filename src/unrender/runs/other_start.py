@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from unrender.core.text import listed
 from unrender.estimators.fresh_pictures import FreshPictures
-from unrender.methods.rules.starts import better_place
+from unrender.methods.rules.starts import better_place, number_of_places
 from unrender.runs.callbacks import Callback
 from unrender.runs.loop import begin_at
 from unrender.runs.number_trace import NumberTrace
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 _USED, _FEWEST_STEPS = 0.4, 16
 """Fraction of the budget, and number of steps, after which values are compared once."""
-_SHARE, _LEAST_PATHS, _MOST_SHARE = 0.02, 1 << 14, 0.1
-"""Paths of one picture relative to the run's so far, their least number, and the share above which a short run is not compared."""
+_SHARE, _LEAST_PATHS, _MOST_SHARE = 0.5, 1 << 14, 2.5
+"""Paths of all pictures relative to the run's so far, the least number of one, and the share above which a short run is not compared."""
 _NUMBER, _KEPT = 4, "kept"
 """Index of the set of random numbers; outcome of a comparison without a better place."""
 
@@ -38,8 +38,10 @@ class OtherStart(Callback):
         state, problem = run.state, run.problem
         if not run.plan.other_starts or state.other_start or run.step < _FEWEST_STEPS or run.progress() < _USED:
             return
-        pictures = FreshPictures(problem, run.seed, max(_SHARE * state.samples, _LEAST_PATHS), _NUMBER)
-        if problem.executor.variant is not None or pictures.paths > _MOST_SHARE * state.samples:
+        places = number_of_places(problem, run.plan.other_starts)
+        paths = max(_SHARE / places * state.samples, _LEAST_PATHS)
+        pictures = FreshPictures(problem, run.seed, paths, _NUMBER)
+        if problem.executor.variant is not None or pictures.paths * places > _MOST_SHARE * state.samples:
             return
         state.other_start, values = _KEPT, run.full()
         differences = pictures.differences(pictures.picture(values).images)

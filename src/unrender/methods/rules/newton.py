@@ -10,6 +10,7 @@ import numpy as np
 from unrender.core import arrays, trees
 from unrender.core.random import Key
 from unrender.core.text import listed
+from unrender.core.trees import Tree
 from unrender.estimators.capabilities import Hessian
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient
@@ -73,7 +74,7 @@ def few_numbers(traits: Traits) -> Plan | None:
     Numbers of a BSDF or medium, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses take these
     steps if derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be combined
     with other numbers, such as intensities. A light on a plateau takes them too if a better start is found elsewhere. So does any number
-    without a path gradient, since a smoothed loss is far noisier.
+    without a path gradient, since a smoothed loss is far noisier. A shape on a plateau takes them from the best of some places.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_scattering(traits)
@@ -96,12 +97,18 @@ def few_numbers(traits: Traits) -> Plan | None:
         least = constants.explained if shapes else constants.explained_light
         if not problem.loss.linear:
             return None
-        plateau = not _explained(problem, trial) > least
+        plateau = not _explained(problem.initial(), problem, trial) > least
     why = f"are not linear in {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
     plan = Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))
-    made = best_start(traits, keys, plan)
-    return None if plateau and made is plan else made
+    made = best_start(traits, keys, plan, plateau and shapes)
+    if plateau and (made is plan or (shapes and not _explained(made.configured().start(), problem, trial) > least)):
+        traits.notes.append(
+            f"pictures at the start, and at other values, say little about {listed(traits.poses)}: the run may end far from them; give "
+            "other initial values, or bounds"
+        )
+        return None
+    return made
 
 
 def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Plan | None:
@@ -137,13 +144,12 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     return best_start(traits, keys, made)
 
 
-def _explained(problem: Problem, estimator: GaussNewton) -> float:
-    """Return the fraction of the initial loss that the quadratic model at the start predicts to remove.
+def _explained(first: Tree, problem: Problem, estimator: GaussNewton) -> float:
+    """Return the fraction of the loss that the quadratic model at some values predicts to remove.
 
     It is near 0 on a plateau, where no derivative image resembles the residual. Noise does not bias it: gradients and images come from
     two independent estimates. The loss must have a linear derivative, such as L2.
     """
-    first = problem.initial()
     state, estimates, losses, images = estimator.init(problem, first), [], [], []
     for step in range(2):
         estimate, state = estimator.estimate(problem, first, state, Key(0, step, stream=_TRIAL))
@@ -230,7 +236,7 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
         tolerance=_damping(traits),
         coarse=max(constants.pose_shift * side, 1.0) if poses else None,
         largest={key: reach * width for key, width in widths_of(traits.options.sigma, problem, moved).items()},
-        noise_limit=constants.noise_limit,
+        noise_limit=None if poses else constants.noise_limit,
     )
 
 

@@ -1,4 +1,4 @@
-"""Starts of few numbers: pictures of other places within their bounds are compared with that of given values."""
+"""Starts of few numbers: pictures of other places are compared with that of given values."""
 
 from __future__ import annotations
 
@@ -19,14 +19,18 @@ from unrender.scene.problem import Problem
 from unrender.statistics.debiased import normal_equations
 from unrender.statistics.paired_losses import difference, mean_and_error
 
-_PER_DIMENSION, _MOST_PLACES = 16, 24
-"""Number of compared places per dimension, and maximum number in all dimensions together."""
+_PER_DIMENSION, _MOST_PLACES, _MOST_POSES = 16, 24, 48
+"""Number of compared places per dimension, and maximum number in all dimensions together; the latter for the pose of a shape."""
+_NEAR = 16
+"""Number of places around the best pose of a shape."""
+_FAR = 4.0
+"""Largest distance of places without bounds, in lengths of the shape (`ParameterInfo.length`)."""
 _PATHS, _NUMBER = 1 << 15, 3
 """Paths of one picture, and index of their random numbers."""
 _BETTER, _ERRORS = 0.5, 4.0
 """Ratio of the losses below which another place is taken, and standard errors of their difference."""
-_ROTATION = "rotation"
-"""Part of the keys of angles, in radians."""
+_MOTIONS = ("translation", "rotation", "scale")
+"""Parts of the keys of poses, after the name of what they move."""
 _FACTORS = (1e-2, 1e2)
 """Limits of the common factor of lights in a comparison, within their bounds."""
 
@@ -46,22 +50,24 @@ class Place:
     loss: float
 
 
-def best_start(traits: Traits, keys: Sequence[str], plan: Plan) -> Plan:
-    """Return the plan with the best start among places within the bounds of some unknowns, if its picture is much better.
+def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = False) -> Plan:
+    """Return the plan with the best start among places of some unknowns, if its picture is much better.
 
-    Gauss-Newton steps end in the nearest minimum.
+    Gauss-Newton steps end in the nearest minimum. Poses of shapes are compared on a plateau alone.
 
     Args:
         traits: Traits of the problem.
         keys: Keys of the unknowns with Gauss-Newton steps.
         plan: Plan for the problem.
+        plateau: Whether the unknowns are poses on a plateau, where any better picture is enough.
     """
     problem = plan.configured()
-    varied, lights = varied_keys(problem, keys), [key for key in traits.lights if key in keys]
+    varied = [key for key in varied_keys(problem, keys) if plateau or not _is_shape(problem, key)]
+    lights = [key for key in traits.lights if key in keys]
     if not varied:
         return plan
     initial = {key: u.initial if u.first is None else u.first for key, u in problem.unknowns.items()}
-    place = better_place(problem, FreshPictures(traits.problem, 0, _PATHS, _NUMBER), initial, varied, lights)
+    place = better_place(problem, FreshPictures(traits.problem, 0, _PATHS, _NUMBER), initial, varied, lights, plateau)
     if place is None:
         return plan
     settings = {
@@ -70,8 +76,9 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan) -> Plan:
         )
         for key, x in place.values.items()
     }
-    where = f"starts at another place within the bounds of {listed(varied)}"
-    reason = f"{where}, where the loss is {place.share:.0%} of that at the initial values"
+    reason = (
+        f"starts at other values of {listed(varied)}, where the loss is {place.share:.0%} of that at the initial values"
+    )
     return replace(plan, settings={**plan.settings, **settings}, reasons=(*plan.reasons, reason))
 
 
@@ -81,11 +88,12 @@ def better_place(
     values: Mapping[str, np.ndarray],
     keys: Sequence[str],
     lights: Sequence[str],
+    plateau: bool = False,
 ) -> Place | None:
     """Return the best of some places within the bounds of unknowns; None unless its loss is at most half, beyond noise.
 
-    Each place is judged by the problem's loss. A common factor of unknown lights is fitted there, because a step would find it. Unknowns
-    with a prior keep their values.
+    Poses are compared shape by shape. Each place is judged by the problem's loss. A common factor of unknown lights is fitted there,
+    because a step would find it. Unknowns with a prior keep their values.
 
     Args:
         problem: Problem with the settings of its plan.
@@ -93,31 +101,81 @@ def better_place(
         values: {key: array}, the given values of all unknowns.
         keys: Keys of the varied unknowns, see `varied_keys`.
         lights: Keys of radiances and other values in which images are linear.
+        plateau: Whether any smaller loss is enough, beyond noise.
     """
     unknowns = problem.unknowns
     lights = [key for key in lights if unknowns[key].prior is None]
     limits = _limits([(values[key], unknowns[key].bounds) for key in lights])
-    first, _ = _losses(pictures, values, lights, limits)
-    best, factor, least = {}, 1.0, math.inf
-    for place in _places(problem, keys):
-        try:
-            losses, own = _losses(pictures, {**values, **place}, lights, limits)
-        except InputError:  # a value that the renderer rejects
-            continue
-        if (total := mean_and_error(losses)[0]) < least:
-            best, factor, least, change = place, own, total, difference(losses, first, sampled=True)
-    start = mean_and_error(first)[0]
-    share = max(least, 0.0) / start if start > 0.0 else math.inf  # without its noise, a loss may be negative
-    if not share < _BETTER or not change.value > _ERRORS * change.standard_error:
+    first = best = _Compared({}, 1.0, _losses(pictures, values, lights, limits)[0])
+    for group in _groups(problem, keys):
+        best = _best_of_group(problem, pictures, values, group, lights, limits, best)
+    start = first.total
+    share = max(best.total, 0.0) / start if start > 0.0 else math.inf  # without its noise, a loss may be negative
+    change = difference(best.losses, first.losses, sampled=pictures.sampled or not plateau)
+    if not share < (1.0 if plateau else _BETTER) or not change.value > _ERRORS * change.standard_error:
         return None
-    chosen = {**best, **{key: unknowns[key].project(factor * values[key]) for key in lights if factor != 1.0}}
-    return Place(chosen, share, least)
+    factor = best.factor
+    chosen = {**best.place, **{key: unknowns[key].project(factor * values[key]) for key in lights if factor != 1.0}}
+    return Place(chosen, share, best.total)
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Values that differ from the given ones, the factor of the lights, and the pseudo-values of the loss, (K, N)."""
+
+    place: dict[str, np.ndarray]
+    factor: float
+    losses: np.ndarray
+
+    @property
+    def total(self) -> float:
+        """The loss, without the picture's noise."""
+        return mean_and_error(self.losses)[0]
+
+
+def _best_of_group(
+    problem: Problem,
+    pictures: FreshPictures,
+    values: Mapping[str, np.ndarray],
+    keys: Sequence[str],
+    lights: Sequence[str],
+    limits: Bounds,
+    best: _Compared,
+) -> _Compared:
+    """Return the best of the places of some unknowns, whose others have their best values so far.
+
+    Places around the best pose of a shape are compared, too, because few of the spread ones overlap its picture in the references.
+    """
+    before, at = best, np.empty(0)
+    shape = _is_shape(problem, keys[0])
+    points = _points(problem, keys)
+    reach = len(points) ** (-1.0 / points.shape[1])
+    for _ in range(2 if shape else 1):
+        for point in points:
+            place = {**before.place, **_values(problem, keys, point, values)}
+            try:
+                losses, factor = _losses(pictures, {**values, **place}, lights, limits)
+            except InputError:  # a value that the renderer rejects
+                continue
+            if (made := _Compared(place, factor, losses)).total < best.total:
+                best, at = made, point
+        if best is before:
+            break
+        points = np.clip(at + reach * (2.0 * points[:_NEAR] - 1.0), 0.0, 1.0)
+    change = difference(best.losses, before.losses, sampled=pictures.sampled)
+    return best if not shape or change.value > _ERRORS * change.standard_error else before
 
 
 def varied_keys(problem: Problem, keys: Sequence[str]) -> list[str]:
     """Return the keys of unknowns whose places can be compared: directions, and numbers between two bounds that change the form of
     the picture."""
     return [key for key in keys if _dimensions(problem, key)]
+
+
+def number_of_places(problem: Problem, keys: Sequence[str]) -> int:
+    """Return how many places `better_place` compares at most."""
+    groups = _groups(problem, keys)
+    return sum(len(_points(problem, group)) + _NEAR * _is_shape(problem, group[0]) for group in groups)
 
 
 def _dimensions(problem: Problem, key: str) -> int:
@@ -127,41 +185,69 @@ def _dimensions(problem: Problem, key: str) -> int:
         return 0
     if info.role == "direction":
         return 2 if unknown.shape() == (3,) else 0
-    formed = info.light if info.rigid else info.nonlinear or info.scattering
-    return unknown.initial.size if formed and None not in _range(problem, key) else 0
+    formed = not info.viewpoint if info.rigid else info.nonlinear or info.scattering
+    return unknown.initial.size if formed and None not in _range(problem, key, 0.0) else 0
 
 
-def _range(problem: Problem, key: str) -> Bounds:
-    """Return the bounds of an unknown; a full turn for the rotation of a light without bounds."""
-    bounds = problem.unknowns[key].bounds
-    turns = problem.renderer.parameters()[key].rigid and _ROTATION in key.split(".")
-    return (-math.pi, math.pi) if turns and bounds == (None, None) else bounds
+def _is_shape(problem: Problem, key: str) -> bool:
+    """Return whether a key moves a shape that emits no light."""
+    info = problem.renderer.parameters()[key]
+    return info.rigid and not info.light and not info.viewpoint
 
 
-def _places(problem: Problem, keys: Sequence[str]) -> list[dict[str, np.ndarray]]:
-    """Return well-spread places (Roberts' additive sequence) within the bounds of the unknowns."""
-    dimensions = [_dimensions(problem, key) for key in keys]
-    total = sum(dimensions)
+def _groups(problem: Problem, keys: Sequence[str]) -> list[list[str]]:
+    """Return the keys whose places are compared together: those of each shape, and all others."""
+    groups: dict[str, list[str]] = {}
+    for key in keys:
+        parts = key.split(".")
+        end = next((i for i, part in enumerate(parts) if part in _MOTIONS), len(parts))
+        groups.setdefault(".".join(parts[:end]) if _is_shape(problem, key) else "", []).append(key)
+    return list(groups.values())
+
+
+def _range(problem: Problem, key: str, value: float) -> Bounds:
+    """Return the bounds of an unknown. Without bounds, a rotation has a full turn, and a shape moves by some lengths around a value."""
+    bounds, info = problem.unknowns[key].bounds, problem.renderer.parameters()[key]
+    if bounds != (None, None) or not info.rigid:
+        return bounds
+    if info.angle:
+        return -math.pi, math.pi
+    far = _FAR * info.length
+    return (value - far, value + far) if _is_shape(problem, key) and info.lowest is None else bounds
+
+
+def _points(problem: Problem, keys: Sequence[str]) -> np.ndarray:
+    """Return well-spread points of the unit cube (Roberts' additive sequence), (N, D)."""
+    total = sum(_dimensions(problem, key) for key in keys)
     golden = 2.0
     for _ in range(64):  # the root of x^(d + 1) = x + 1
         golden = (1.0 + golden) ** (1.0 / (total + 1.0))
-    number = np.arange(1, min(_PER_DIMENSION * total, _MOST_PLACES) + 1)[:, None]
-    points = (0.5 + number * golden ** -np.arange(1.0, total + 1.0)) % 1.0
-    parts = np.split(points, np.cumsum(dimensions)[:-1], axis=1)
-    return [
-        {key: _value(problem, key, part[i]) for key, part in zip(keys, parts, strict=True)} for i in range(len(points))
-    ]
+    most = _MOST_POSES if _is_shape(problem, keys[0]) else _MOST_PLACES
+    number = np.arange(1, min(_PER_DIMENSION * total, most) + 1)[:, None]
+    return (0.5 + number * golden ** -np.arange(1.0, total + 1.0)) % 1.0
 
 
-def _value(problem: Problem, key: str, point: np.ndarray) -> np.ndarray:
-    """Return the value of an unknown at a point of the unit cube."""
-    unknown = problem.unknowns[key]
-    if problem.renderer.parameters()[key].role == "direction":
+def _values(
+    problem: Problem, keys: Sequence[str], point: np.ndarray, around: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Return {key: value} of some unknowns at a point of the unit cube."""
+    ends = np.cumsum([_dimensions(problem, key) for key in keys])
+    return {
+        key: _value(problem, key, part, around[key]) for key, part in zip(keys, np.split(point, ends[:-1]), strict=True)
+    }
+
+
+def _value(problem: Problem, key: str, point: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """Return the value of an unknown at a point of the unit cube. Without bounds, places are denser near the given value."""
+    unknown, info = problem.unknowns[key], problem.renderer.parameters()[key]
+    if info.role == "direction":
         z, angle = 2.0 * point[0] - 1.0, 2.0 * math.pi * point[1]
         side = math.sqrt(1.0 - z * z)
         value = np.array([side * math.cos(angle), side * math.sin(angle), z])
+    elif _is_shape(problem, key) and unknown.bounds == (None, None) and not info.angle:
+        value = around + _FAR * info.length * (2.0 * point.reshape(unknown.initial.shape) - 1.0) ** 3
     else:
-        low, high = (float(end or 0.0) for end in _range(problem, key))
+        low, high = (float(end or 0.0) for end in _range(problem, key, 0.0))
         value = (low + (high - low) * point).reshape(unknown.initial.shape)
     return np.asarray(unknown.project(value), np.float32)
 

@@ -27,6 +27,7 @@ class Traits:
         constants: Constants of the rules.
         rates: First learning rates that are already decided, in units of the unknowns.
         block: Keys of unknowns with a separate optimizer in addition to path gradients.
+        notes: Lines that rules add to the reasons of the plan, whichever rule decides.
     """
 
     problem: Problem
@@ -34,6 +35,7 @@ class Traits:
     constants: Constants
     rates: Mapping[str, float] = field(default_factory=dict)
     block: tuple[str, ...] = ()
+    notes: list[str] = field(default_factory=list, compare=False)
 
     @cached_property
     def infos(self) -> dict[str, ParameterInfo]:
