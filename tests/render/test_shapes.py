@@ -59,7 +59,11 @@ def gradient(description: Any, key: str = KEY, request: SampleRequest | None = N
         ({"ball": {"type": "sphere", "radius": 0.1}}, "ball.translation", r"ball is not a mesh \(Sphere\)"),
         ({"camera": {"type": "orthographic"}}, "camera.translation", "limited to perspective sensors"),
         ({"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}, KEY, "with media"),
-        ({"thing": {"type": "cube", "emitter": {"type": "area"}}}, KEY, "do not support moving emitters"),
+        (
+            {"ball": {"type": "sphere", "emitter": {"type": "area"}}},
+            "ball.translation",
+            r"ball is not a mesh \(Sphere\)",
+        ),
     ],
 )
 def test_what_has_no_boundary_is_refused_in_one_line(more: dict[str, Any], key: str, message: str) -> None:

@@ -109,10 +109,33 @@ def lamps() -> dict[str, Any]:
     }
 
 
-def gradients(description: Any, key: str, depth: int, spp: int, boundary: bool = True) -> np.ndarray:
+def shining(kind: str = "rectangle", radiance: Any = 6.0, tilt: float = 25.0) -> Callable[[], dict[str, Any]]:
+    """A lamp that moves, in sight unless its tilt is 90°, above a block that throws a shadow."""
+
+    def described() -> dict[str, Any]:
+        place = mi.ScalarTransform4f().translate([0.4, 0.5, 0.2]).rotate([1, 0.1, 0], tilt).scale(0.22)
+        emitter = {"type": "area", "radiance": radiance() if callable(radiance) else {"type": "rgb", "value": radiance}}
+        bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+        found = block() | {"moving": {"type": kind, "to_world": place, "bsdf": bsdf, "emitter": emitter}}
+        del found["light"]
+        return found | {"block": block()["moving"]}
+
+    return described
+
+
+def patches() -> dict[str, Any]:
+    values = np.random.default_rng(0).uniform(0.5, 6.0, (4, 4, 3)).astype(np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True}
+
+
+def gradients(
+    description: Any, key: str, depth: int, spp: int, boundary: bool = True, lit: bool | None = None
+) -> np.ndarray:
     """(RUNS, n)."""
     renderer = MitsubaRenderer(description, depth, [key])
-    session = renderer.prepare([key], None)
+    session: Any = renderer.prepare([key], None)
+    if lit is not None:
+        session._boundary._integrator._table.lit = lit
     if not boundary:
         session._boundary = None
     values, weight = renderer.values([key]), renderer.array(weights()[None])
@@ -155,6 +178,15 @@ def test_the_pose_of_a_block_and_its_planted_faults() -> None:
     assert np.abs(scores(interior + 0.6 * (found - interior), expected)).max() > LIMIT
 
 
+def test_a_lamp_that_moves_and_planted_faults() -> None:
+    """Its picture moves, and the light that it sends to surfaces. Without the second, or with nine tenths of both, the test fails."""
+    lamp, key = shining(tilt=70.0), "moving.scale"
+    expected, found = differences(lamp, key, 2, 1024, 0.05), gradients(lamp, key, 2, 64)
+    assert np.abs(scores(found, expected)).max() < LIMIT
+    assert np.abs(scores(gradients(lamp, key, 2, 64, lit=False), expected)).max() > 2 * LIMIT
+    assert np.abs(scores(0.9 * found, expected)).max() > LIMIT
+
+
 def test_points_on_emitters_span_the_solid_angle_that_each_emitter_has() -> None:
     """Of two square lamps above a point, one of them in the distance, and a sky; their points are drawn side by side."""
     half, heights, each = 0.3, (1.0, 2.5), 4096
@@ -193,10 +225,18 @@ def test_points_on_emitters_span_the_solid_angle_that_each_emitter_has() -> None
         (sky, "moving.scale", 3),
         (lamps, "moving.translation.x", 2),
         (lamps, "moving.rotation.y", 3),
+        (shining(), "moving.translation", 2),
+        (shining(), "moving.rotation.x", 3),
+        (shining(), "moving.scale", 5),
+        (shining("cube"), "moving.rotation", 2),
+        (shining("cube"), "moving.translation.x", 4),
+        (shining(radiance=patches), "moving.translation", 2),
+        (shining(radiance=patches), "moving.rotation.z", 3),
     ],
 )
 def test_poses_at_several_depths(description: Any, key: str, depth: int) -> None:
-    found, expected = gradients(description, key, depth, 48), differences(description, key, depth, 256)
+    few, many = (96, 1024) if "emitter" in description()["moving"] else (48, 256)  # noise would hide a missing part
+    found, expected = gradients(description, key, depth, few), differences(description, key, depth, many)
     assert np.abs(scores(found, expected)).max() < LIMIT, (found.mean(axis=0), expected.mean(axis=0))
 
 

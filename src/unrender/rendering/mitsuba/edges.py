@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.rendering.mitsuba import gpu, mesh_layout
+from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 from unrender.rendering.mitsuba.scene_graph import ObjectGraph
 
 
@@ -74,16 +75,17 @@ class EdgeTable:
     Attributes:
         count: number of edges; those of moving shapes come first.
         moving: number of edges of moving shapes.
+        lit: whether a moving shape emits light.
     """
 
     def __init__(self, scene: Any, moving: AbstractSet[str], loaded: Mapping[str, np.ndarray] | None = None):
         meshes = [shape for shape in scene.shapes() if shape.is_mesh()]
         self._order = [mesh.id() for mesh in sorted(meshes, key=lambda mesh: mesh.id() not in moving)]
-        by_id = {mesh.id(): mesh for mesh in meshes}
+        by_id, self._moving = {mesh.id(): mesh for mesh in meshes}, moving
         none = np.zeros((0, 2), np.uint32)
         parts: list[tuple[MeshEdges, int]] = [(MeshEdges(none, none, np.zeros(0, bool), np.zeros(0, bool)), 0)]
         first = 0
-        self.moving = 0
+        self.moving, self.lit = 0, any(mesh.is_emitter() and mesh.id() in moving for mesh in meshes)
         for name in self._order:
             mesh = by_id[name]
             edges = edges_of(mesh, (loaded or {}).get(name))
@@ -93,7 +95,7 @@ class EdgeTable:
                 self.moving += len(edges.always)
         ends = np.concatenate([part.ends + offset for part, offset in parts])
         thirds = np.concatenate([part.thirds + offset for part, offset in parts])
-        self.count = len(ends)
+        self.count, self._counts = len(ends), [len(part.ends) for part, _ in parts[1:]]
         self._ends = mi.UInt32(ends[:, 0]), mi.UInt32(ends[:, 1])
         self._thirds = mi.UInt32(thirds[:, 0]), mi.UInt32(thirds[:, 1])
         self._always = mi.Bool(np.concatenate([part.always for part, _ in parts]))
@@ -103,6 +105,13 @@ class EdgeTable:
         """Return the concatenated vertices of all meshes, `mi.Float`; attached if the caller resumes gradients."""
         by_id = {shape.id(): shape for shape in scene.shapes() if shape.is_mesh()}
         return dr.concat([mesh_layout.positions(by_id[name]) for name in self._order])
+
+    def moving_emitters(self, scene: Any) -> Any:
+        """Return the registry id of the emitter that moves with each edge, 0 for none, `mi.UInt32` (count,)."""
+        by_id = {shape.id(): shape for shape in scene.shapes() if shape.is_mesh()}
+        lamps = [by_id[name].emitter() if name in self._moving else None for name in self._order]
+        numbers = [0 if lamp is None else int(registry_id(mi.EmitterPtr(lamp))[0]) for lamp in lamps]
+        return mi.UInt32(np.repeat(np.array(numbers, np.uint32), self._counts))
 
     def at(self, positions: Any, index: Any, active: Any = True) -> EdgePoints:
         """Return the edges of these indices."""

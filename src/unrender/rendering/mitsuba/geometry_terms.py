@@ -62,8 +62,6 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     known = pair.current_parameters
     if not shape.is_mesh() or not any(f"{target}.{name}" in known for name in (POSITIONS, "to_world")):
         return f"{target} is not a mesh ({shape.class_name()}); boundary derivatives are limited to meshes"
-    if shape.is_emitter():
-        return "path gradients do not support moving emitters"
     if is_mirror_or_glass(shape.bsdf()):
         return MOVED_MIRROR
     kinds = [sensor.class_name() for sensor in pair.current.sensors()]

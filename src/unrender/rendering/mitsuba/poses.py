@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -161,7 +161,7 @@ class Pose:
     def ray_inside(self, ray: Any) -> Any:
         """Transform a world ray to the local space of the posed object. Distances along the ray do not change."""
         local = mi.Ray3f(ray)
-        local.o = self.centre + self.inverse @ (ray.o - self.centre - self.translation) / self.scale
+        local.o = self.point_inside(ray.o)
         local.d = self.inverse @ ray.d / self.scale
         return local
 
@@ -171,6 +171,10 @@ class Pose:
         moved.o = self.point(ray.o)
         moved.d = self.matrix @ ray.d
         return moved
+
+    def point_inside(self, p: Any) -> Any:
+        """Transform a world point to the local space of the posed object."""
+        return self.centre + self.inverse @ (p - self.centre - self.translation) / self.scale
 
     def point(self, p: Any) -> Any:
         """Transform a point."""
@@ -202,6 +206,7 @@ class PosedScene:
     Args:
         scene: the loaded scene.
         chosen: {key: its meaning} of the parameters in use.
+        attributed: ids of shapes whose materials read attributes of vertices.
 
     Attributes:
         static: scene without the posed shapes, with all emitters and sensors.
@@ -210,8 +215,8 @@ class PosedScene:
     Raises `InputError` if two parameters set the same coordinate.
     """
 
-    def __init__(self, scene: Any, chosen: Mapping[str, PoseKey]):
-        self._slots = slots(chosen)
+    def __init__(self, scene: Any, chosen: Mapping[str, PoseKey], attributed: Collection[str] = ()):
+        self._slots, self._attributed = slots(chosen), attributed
         targets = {key.target for key in chosen.values()}
         shapes = scene.shapes()
         posed = {shape.id(): shape for shape in shapes if shape.id() in targets}
@@ -253,15 +258,16 @@ class PosedScene:
             v = [dr.gather(mi.Float, numbers, (7 * index + row) * count + batch) for row in range(7)]
             poses[name] = Pose(centre, v[0:3], v[3:6], v[6])
         static, *parts = scenes
-        return Assembly(static, [(part, poses[name]) for name, part in zip(self.parts, parts, strict=True)], poses)
+        return Assembly(static, dict(zip(self.parts, parts, strict=True)), poses, self._attributed)
 
 
 class Assembly:
     """The static scene and the posed ones, intersected as one. It replaces a `mitsuba.Scene` for ray tracing."""
 
     # This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
-    def __init__(self, static: Any, parts: list[tuple[Any, Pose]], poses: Mapping[str, Pose]):
-        self.static, self.parts, self.poses = static, parts, poses
+    def __init__(self, static: Any, parts: Mapping[str, Any], poses: Mapping[str, Pose], attributed: Collection[str]):
+        self.static, self.poses, self._attributed = static, poses, attributed
+        self.parts = {name: (part, poses[name]) for name, part in parts.items()}
 
     def ray_intersect(self, ray: Any, ray_flags: Any, coherent: Any, active: Any) -> Any:
         """Return the nearest surface interaction, like `mitsuba.Scene.ray_intersect`."""
@@ -270,7 +276,7 @@ class Assembly:
         nearest.t = dr.select(nearest.is_valid(), nearest.t, dr.inf)
         inside = mi.Ray3f(ray)
         matrix, scale = mi.Matrix3f(dr.identity(mi.Matrix3f)), mi.Float(1)
-        for part, pose in self.parts:
+        for part, pose in self.parts.values():
             local = pose.ray_inside(ray)
             local.maxt = dr.minimum(ray.maxt, nearest.t)
             candidate = part.ray_intersect_preliminary(local, coherent=coherent, active=active)
@@ -291,10 +297,18 @@ class Assembly:
         si.wi = dr.select(valid, si.to_local(-ray.d), -ray.d)
         return si
 
+    def material(self, si: Any) -> Any:
+        """Return an interaction as materials see it: Mitsuba interpolates attributes of vertices at the point where the mesh was loaded."""
+        material = type(si)(si)
+        for part, pose in (self.parts[name] for name in self._attributed):
+            own = si.shape == mi.ShapePtr(part.shapes()[0])
+            material.p = dr.select(own, pose.point_inside(si.p), material.p)
+        return material
+
     def ray_test(self, ray: Any, active: Any) -> Any:
         """Return whether a ray is occluded, like `mitsuba.Scene.ray_test`."""
         blocked = self.static.ray_test(ray, active)
-        for part, pose in self.parts:
+        for part, pose in self.parts.values():
             blocked |= part.ray_test(pose.ray_inside(ray), active & ~blocked)
         return blocked
 
@@ -323,7 +337,8 @@ def matrices(scene: Any, parameters: Mapping[str, np.ndarray]) -> dict[str, np.n
 
 def centres(scene: Any, targets: set[str]) -> dict[str, list[float]]:
     """Return the centre of rotation of each target: shapes first, then emitters, then sensors."""
-    result = {shape.id(): _centre(shape.bbox()) for shape in scene.shapes() if shape.id() in targets}
+    moved = [shape for shape in scene.shapes() if shape.id() in targets]
+    result = {shape.id(): np.array(shape.bbox().center(), float).reshape(-1).tolist() for shape in moved}
     lamps = [emitter for emitter in scene.emitters() if is_posable(emitter) and emitter.id() in targets]
     result |= {lamp.id(): _place(lamp) for lamp in lamps}
     for sensor in scene.sensors():
@@ -383,7 +398,3 @@ def _scene(objects: list[Any]) -> Any:
         name = item.id()
         named[name if name and name not in named else f"object_{index}"] = item
     return mi.load_dict(named, parallel=False, optimize=False)
-
-
-def _centre(box: Any) -> list[float]:
-    return [float(x) for x in np.array(box.center()).reshape(-1)]

@@ -268,10 +268,10 @@ class MitsubaRenderer:
     def _relates_paths(self, key: str) -> bool:
         """Return whether paths of two values of a parameter that moves a mesh can be related, see `MovedPair`."""
         scene = self.pair.loaded()
-        kinds = {shape.class_name() for shape in scene.scene.shapes()}
-        if key in self._poses and self._poses[key].light:
+        shapes, moved = scene.scene.shapes(), moved_shape(scene, key)
+        if not moved or moved_sensor(scene, key) or any(shape.id() == moved and shape.is_emitter() for shape in shapes):
             return False
-        return bool(moved_shape(scene, key)) and not moved_sensor(scene, key) and not kinds & {"Instance", "ShapeGroup"}
+        return not {shape.class_name() for shape in shapes} & {"Instance", "ShapeGroup"}
 
     def _check(self, key: str, space: Space | None, derivatives: bool) -> None:
         if key not in self._info:

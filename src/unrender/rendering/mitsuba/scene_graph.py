@@ -74,15 +74,21 @@ class ObjectGraph:
             if _attribute(node) == name and any(shape in chain for chain in self.chains(node))
         ]
 
-    def check_posed(self, ids: Collection[str]) -> None:
-        """Raise `InputError` for a posed mesh with attributes per vertex: Mitsuba interpolates them at the mesh's place as loaded."""
-        names = sorted({name for node in self.nodes if (name := _attribute(node)).startswith("vertex_")})
-        for shape in self._scene.shapes():
-            if shape.id() in ids and (read := [name for name in names if self.attribute_readers(shape, name)]):
-                raise InputError(
-                    f"{shape.id()}: a mesh whose material reads {', '.join(read)} cannot be posed; use {shape.id()}.vertex_positions, "
-                    "or a bitmap in place of the attribute"
-                )
+    def attributed(self, ids: Collection[str]) -> list[str]:
+        """Return the shapes of these ids whose materials read attributes of vertices.
+
+        Raises `InputError` if such a material has a volume texture too: Mitsuba evaluates both at one point, in different spaces.
+        """
+        chains = [(node, chain) for node in self.nodes if isinstance(node, mi.Texture) for chain in self.chains(node)]
+        readers = {shape for node, chain in chains if _attribute(node).startswith("vertex_") for shape in chain}
+        volumes = {shape for node, chain in chains if class_name(node) == "VolumeAdapter" for shape in chain}
+        shapes = [shape for shape in self._scene.shapes() if shape.id() in ids and shape in readers]
+        if both := [shape.id() for shape in shapes if shape in volumes]:
+            raise InputError(
+                f"{both[0]}: a mesh whose material reads attributes of vertices and a volume cannot be posed; leave out one of them, "
+                f"or use {both[0]}.vertex_positions"
+            )
+        return [shape.id() for shape in shapes]
 
     def missing_attributes(self) -> list[str]:
         """Return one notice for each attribute that a texture reads from a shape without it. Mitsuba reads 0 there, in silence."""

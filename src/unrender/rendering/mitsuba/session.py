@@ -99,7 +99,8 @@ class MitsubaSession:
         moved = {key: moved_shape(scene, key) for key in (*keys, *poses) if key not in cameras}
         moved |= {key: "" for key in keys if key in scene.poses and key not in derivatives}
         self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
-        self._related = bool(self._moving) and not (gpu.is_gpu() or has_instances(pair.current))
+        lit = any(shape.is_emitter() and shape.id() in self._moving for shape in pair.current.shapes())
+        self._related = bool(self._moving) and not (lit or gpu.is_gpu() or has_instances(pair.current))
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
@@ -120,8 +121,8 @@ class MitsubaSession:
         self._pair, self._keys, self._poses, self._attached = pair, keys, fixed, frozenset(derivatives)
         if fixed:  # restore shapes that an earlier session has moved
             scene.set_parameters({})
-        scene.graph.check_posed({pose.target for pose in fixed.values()})
-        self._posed = PosedScene(pair.current, fixed) if fixed else None
+        self._attributed = scene.graph.attributed({pose.target for pose in fixed.values()})
+        self._posed = PosedScene(pair.current, fixed, self._attributed) if fixed else None
         if self._posed is not None:
             share_addresses(self._posed.scenes())
         self._posed_previous: PosedScene | None = None
@@ -348,7 +349,7 @@ class MitsubaSession:
         if self._posed is None or not previous:
             return self._posed
         if self._posed_previous is None:
-            self._posed_previous = PosedScene(self._pair.previous, self._poses)
+            self._posed_previous = PosedScene(self._pair.previous, self._poses, self._attributed)
             share_addresses([*self._posed.scenes(), *self._posed_previous.scenes()])
         return self._posed_previous
 

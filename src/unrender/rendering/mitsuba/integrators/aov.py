@@ -45,7 +45,7 @@ class AovKernel:
         with context.resume_grad():
             lanes: Any = mi.Bool(active)
             si = context.geometry.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=lanes, active=lanes)
-            value = self.value(si, ray, active)
+            value = self.value(context.materials([si])[0] if self.name == "albedo" else si, ray, active)
             if not context.primal and dr.grad_enabled(value):
                 if context.forward:
                     return dr.forward_to(value), None

@@ -103,7 +103,7 @@ class PathContext:
     ):
         self.connections = connections
         self.mode, self.scene, self.tables, self.replay, self.pair = mode, scene, tables, replay, pair
-        self.geometry = scene if geometry is None else geometry
+        self.geometry, self._posed = scene if geometry is None else geometry, geometry
         self.primal, self.forward = mode == dr.ADMode.Primal, mode == dr.ADMode.Forward
         self.states = StatePointers(tables, pair)
         self.bsdf_ctx, self.phase_ctx = mi.BSDFContext(), mi.PhaseFunctionContext()
@@ -116,6 +116,10 @@ class PathContext:
     def resume_grad(self) -> Any:
         """Return a context that enables derivatives during a replay, but not in a primal pass."""
         return dr.resume_grad(when=not self.primal)
+
+    def materials(self, surfaces: list[mi.SurfaceInteraction3f]) -> list[mi.SurfaceInteraction3f]:
+        """Return the interactions with which BSDFs are evaluated, see `Assembly.material`."""
+        return surfaces if self._posed is None else [self._posed.material(si) for si in surfaces]
 
     def initial_radiance(self) -> list[Spectrum]:
         """Return L of each state before the first vertex: 0 or, in a replay, the total radiance."""

@@ -10,9 +10,10 @@ if path replay fixes c when it differentiates the integral over surfaces at x_a 
 edge outwards (Zhang et al. 2020): an edge point and a direction are sampled, x_a and c are traced, and x_a is connected to the sensor,
 directly or through further vertices.
 
-There are three disjoint parts with different sampling:
+There are four disjoint parts with different sampling:
     primary   x_a is the sensor: edges in the image.
     shadows   c is on an emitter: edges as seen from points on emitters, including delta emitters.
+    lights    b is on the border of a moving emitter, whose own radiance ends there (c = b): its edges and directions, uniformly.
     indirect  all other radiance of the jump: edges and directions, uniformly.
 
 Edges seen through perfect mirrors and glass are omitted, since x_a cannot be connected there.
@@ -42,9 +43,12 @@ from unrender.rendering.mitsuba.integrators.boundary_sampling import (
     coplanar,
     lane_sampler,
 )
+from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
 _NEAR = 1e-3
 """Relative margin at the end of a shadow ray within which occluders are ignored."""
+_OWN = 0.05
+"""Relative distance from an edge of an emitter within which a point on the same emitter counts as the edge's face."""
 _EMITTER_POINTS, _PAIRS = 256, 1 << 20
 """Maximum number of points on all emitters for shadow edges, and of pairs of a point with an edge."""
 
@@ -72,7 +76,7 @@ class BoundaryIntegrator:
             scene, sensor: Mitsuba's scene, and a perspective sensor.
             weights: `mi.TensorXf` (H, W, 3), derivative of the loss by each element of the image.
             seed: in [0, 2**32).
-            samples: number of samples of each of the three parts.
+            samples: number of samples of each part.
         """
         return self._collected(WeightedPicture(scene, sensor, weights, samples), seed)
 
@@ -84,7 +88,7 @@ class BoundaryIntegrator:
         return picture.image()
 
     def _collected(self, picture: Picture, seed: int) -> Any:
-        """Collect all three parts in a picture, and return its sum."""
+        """Collect all parts in a picture, and return its sum."""
         scene = picture.scene
         with dr.resume_grad():
             positions = self._table.positions(scene)
@@ -93,6 +97,8 @@ class BoundaryIntegrator:
         total = self._primary(picture, positions, seed)
         if self._max_depth >= 2 and len(scene.emitters()) > 0:
             total += self._shadows(picture, positions, seed ^ 0x5BD1E995)
+        if self._max_depth >= 2 and self._table.lit:
+            total += self._lights(picture, positions, seed ^ 0x27D4EB2F)
         if self._max_depth >= 3:
             total += self._indirect(picture, positions, seed ^ 0x1B873593)
         return total
@@ -189,11 +195,23 @@ class BoundaryIntegrator:
 
     # ------------------------------------------------------------------ edges and directions
 
-    def _indirect(self, picture: Picture, positions: Any, seed: int) -> Any:
-        table, scene, count = self._table, picture.scene, picture.samples
+    def _draw(
+        self, picture: Picture, positions: Any, seed: int, most: int, emitters: Any = None
+    ) -> tuple[Any, Any, BoundarySegment, EyePath, Any]:
+        """Sample edges, by length and solid angle of their directions, a point of each and a direction.
+
+        Args:
+            most: maximum number of vertices between x_a and the sensor.
+            emitters: registry ids by edge; edges of id 0 are left out. None for all edges.
+
+        Returns:
+            indices of edges, attached points, segments, eye paths, and the reciprocal of the density.
+        """
+        table, count = self._table, picture.samples
         with dr.suspend_grad():
             edges = table.at(positions, dr.arange(mi.UInt32, table.count))
-            chosen = WeightedChoice(dr.norm(edges.end - edges.start) * SilhouetteWedge(edges).angle)
+            weight = dr.norm(edges.end - edges.start) * SilhouetteWedge(edges).angle
+            chosen = WeightedChoice(weight if emitters is None else dr.select(emitters != 0, weight, 0))
             sampler = lane_sampler(seed, count, count)
             index, pmf = chosen.draw(sampler.next_1d())
             u = sampler.next_1d()
@@ -205,10 +223,30 @@ class BoundaryIntegrator:
             direction = wedge.direction(sampler.next_1d(), sampler.next_1d())
             segment = BoundarySegment(edge, mi.Point3f(dr.detach(point)), direction)
             active = (pmf > 0) & segment.valid & (wedge.angle > 0)
-        eye = EyePath(picture, segment, sampler, self._max_depth - 3, active)
-        with dr.suspend_grad():
-            L, far = self._both_sides(scene, segment, eye, seed ^ 0x9E3779B9)
             factor = segment.length * segment.sine * 4 * wedge.angle / pmf
+        return index, point, segment, EyePath(picture, segment, sampler, most, active), factor
+
+    def _lights(self, picture: Picture, positions: Any, seed: int) -> Any:
+        emitters, scene = self._table.moving_emitters(picture.scene), picture.scene
+        index, point, segment, eye, factor = self._draw(picture, positions, seed, self._max_depth - 2, emitters)
+        with dr.suspend_grad():
+            origin, jump = mi.Point3f(eye.first.spawn_ray(segment.direction).o), mi.Spectrum(0)
+            for target, sign in ((segment.inside, 1.0), (segment.outside, -1.0)):
+                distance = dr.norm(target - origin)
+                towards = mi.Vector3f(target - origin) / distance
+                si = scene.ray_intersect(mi.Ray3f(origin, towards, eye.time), eye.active)
+                emitter = si.emitter(scene, eye.active)
+                own = eye.active & (registry_id(emitter) == dr.gather(mi.UInt32, emitters, index))
+                own &= dr.abs(si.t - distance) < _OWN * distance
+                jump += sign * dr.select(own, emitter.eval(si, own), 0)
+            jump *= eye.throughput * factor
+        with dr.resume_grad():
+            return picture.collect(jump, eye.position, eye.active, dr.dot(segment.normal, point))
+
+    def _indirect(self, picture: Picture, positions: Any, seed: int) -> Any:
+        _, point, segment, eye, factor = self._draw(picture, positions, seed, self._max_depth - 3)
+        with dr.suspend_grad():
+            L, far = self._both_sides(picture.scene, segment, eye, seed ^ 0x9E3779B9)
             near = dr.norm(segment.point - eye.first.p)
             parts = []
             for side, sign in ((0, 1.0), (1, -1.0)):

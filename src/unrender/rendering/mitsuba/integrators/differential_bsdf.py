@@ -181,12 +181,12 @@ class DifferentialBsdf:
         """
         geometry: Any = context.geometry
         si = geometry.ray_intersect(branch.ray, ray_flags=mi.RayFlags.All, coherent=False, active=branch.valid)
-        bsdf = si.bsdf(branch.ray)
-        lobe = self.lobe(context, si, bsdf, branch.valid & si.is_valid())
+        bsdf, (material,) = si.bsdf(branch.ray), context.materials([si])
+        lobe = self.lobe(context, material, bsdf, branch.valid & si.is_valid())
         slope = mi.Spectrum(0)
         for wo in lobe.pair(numbers.next_2d()):
             active = lobe.reflects(wo)
-            weight = bsdf.eval(context.bsdf_ctx, si, wo, active) * lobe.weight(wo)
+            weight = bsdf.eval(context.bsdf_ctx, material, wo, active) * lobe.weight(wo)
             active &= dr.any(weight != 0)
             vertex = ScatteringVertex(dr.detach(si, True), lobe.pdf(wo), mi.Bool(False))
             L = incident(branch, vertex, si.spawn_ray(si.to_world(wo)), numbers.clone(), active)

@@ -181,16 +181,20 @@ class PathPair:
         )
         surfaces, bsdfs = context.states.interactions(si), context.states.bsdfs(si.bsdf(path.ray))  # pyright: ignore[reportArgumentType]
 
+        materials = context.materials(surfaces)
+
         # ---------------------- Direct emission ----------------------
         Le = emitters.direct_emission(context, path.last, surfaces, path.β, path.active)
 
         # ---------------------- Emitter sampling ----------------------
         active_next = path.active & (path.depth + 1 < self.max_depth) & si.is_valid()
-        lobe = self._rough_lobe(context, path, si, bsdfs[0], active_next)
-        Ld, connection = self._sample_emitter(context, path.β, surfaces, bsdfs, sampler, active_next, lobe)
+        lobe = self._rough_lobe(context, path, materials[0], bsdfs[0], active_next)
+        Ld, connection = self._sample_emitter(
+            context, path.β, surfaces[0], materials, bsdfs, sampler, active_next, lobe
+        )
 
         # ------------------ Detached BSDF sampling -------------------
-        direction = self._sample_bsdf(context, surfaces, bsdfs, sampler, active_next, lobe)
+        direction = self._sample_bsdf(context, materials, bsdfs, sampler, active_next, lobe)
         bs = direction.bs
 
         # ---- Update loop variables based on current interaction -----
@@ -220,24 +224,25 @@ class PathPair:
         self,
         context: PathContext,
         β: Sequence[Spectrum],
-        surfaces: Sequence[mi.SurfaceInteraction3f],
+        si: mi.SurfaceInteraction3f,
+        materials: Sequence[mi.SurfaceInteraction3f],
         bsdfs: Sequence[mi.BSDFPtr],
         sampler: Any,
         active: Bool,
         lobe: RoughLobe | None,
     ) -> tuple[list[Spectrum], emitters.EmitterConnection]:
         """Return Ld of each state, by next-event estimation."""
-        si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
+        bsdf, bsdf_ctx = bsdfs[0], context.bsdf_ctx
         active_em = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         connection = emitters.EmitterConnection(context, si, sampler.next_2d(), active_em, self.turning_emitters)
         ds = connection.ds
         connection.active &= ~context.geometry.ray_test(si.spawn_ray_to(ds.p), connection.active)
         wo = si.to_local(ds.d)
         with context.resume_grad():
-            f, pdf = bsdf.eval_pdf(bsdf_ctx, si, wo, connection.active)
+            f, pdf = bsdf.eval_pdf(bsdf_ctx, materials[0], wo, connection.active)
             previous = [
                 bsdfₚ.eval(bsdf_ctx, siₚ, wo, connection.active)
-                for bsdfₚ, siₚ in zip(bsdfs[1:], surfaces[1:], strict=True)
+                for bsdfₚ, siₚ in zip(bsdfs[1:], materials[1:], strict=True)
             ]
             if lobe is None:
                 return connection.contributions(β, [f, *previous], pdf), connection
@@ -249,13 +254,13 @@ class PathPair:
     def _sample_bsdf(
         self,
         context: PathContext,
-        surfaces: Sequence[mi.SurfaceInteraction3f],
+        materials: Sequence[mi.SurfaceInteraction3f],
         bsdfs: Sequence[mi.BSDFPtr],
         sampler: Any,
         active: Bool,
         lobe: RoughLobe | None,
     ) -> BsdfDirection:
-        si, bsdf, bsdf_ctx = surfaces[0], bsdfs[0], context.bsdf_ctx
+        si, bsdf, bsdf_ctx = materials[0], bsdfs[0], context.bsdf_ctx
         samples = sampler.next_1d(), sampler.next_2d()
         bs, weight = bsdf.sample(bsdf_ctx, si, *samples, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -263,7 +268,7 @@ class PathPair:
         with context.resume_grad():
             f, pdf = bsdf.eval_pdf(bsdf_ctx, si, bs.wo, smooth)
             previous = [
-                bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth) for bsdfₚ, siₚ in zip(bsdfs[1:], surfaces[1:], strict=True)
+                bsdfₚ.eval(bsdf_ctx, siₚ, bs.wo, smooth) for bsdfₚ, siₚ in zip(bsdfs[1:], materials[1:], strict=True)
             ]
             if lobe is not None:
                 f = lobe.without(f, bs.wo)
@@ -271,7 +276,7 @@ class PathPair:
         weights = specular.sampling_weights(values, pdf, weight, smooth, delta, bs.pdf)
         if self.changing_delta and (context.pair or not context.primal):
             lobes = specular.DeltaLobes(context.tables, bsdf, bs, samples, active, active & delta)
-            lobes.follow(context, bsdfs, surfaces, values, weights)
+            lobes.follow(context, bsdfs, materials, values, weights)
         return BsdfDirection(bs, pdf, delta, values, weights)
 
     def _differentiate(
