@@ -13,9 +13,9 @@ from scipy import stats
 import unrender as ur
 from tiers import quick, slow
 from unrender.backend import cache
-from unrender.gallery import boxes, meshes, specification, textures
+from unrender.gallery import meshes, poses, specification, textures
 from unrender.gallery.analytic import QuadraticRenderer
-from unrender.gallery.sunlit_vase import SunlitVase
+from unrender.gallery.sunlit import SunlitVase
 from unrender.methods import method
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
@@ -470,7 +470,7 @@ def test_what_moves_stays_in_the_picture_within_its_bounds(name):
 
 
 def test_no_square_is_drawn_to_the_place_of_another():
-    contrasts = np.array([square.colour for square in boxes._FIVE]) - boxes._GREY
+    contrasts = np.array([square.colour for square in poses._FIVE]) - poses._GREY
     products = contrasts @ contrasts.T
     assert np.all(products[~np.eye(5, dtype=bool)] <= 1e-12)
     assert np.all(np.abs(contrasts).max(axis=1) >= 0.4 - 1e-12)
@@ -789,14 +789,14 @@ def test_the_normals_of_triangles_follow_their_vertices():
 
 
 def test_the_sun_of_the_vase_casts_the_light_that_its_direction_says():
-    from unrender.gallery import sunlit_vase
+    from unrender.gallery import sunlit
 
-    scene = mi.load_dict({"type": "scene", "sky": {"type": "envmap", "bitmap": mi.Bitmap(sunlit_vase._sky())}})
+    scene = mi.load_dict({"type": "scene", "sky": {"type": "envmap", "bitmap": mi.Bitmap(sunlit._sky())}})
     sky = scene.emitters()[0]
     si = mi.SurfaceInteraction3f()
-    si.wi = mi.Vector3f((-sunlit_vase.SUN).tolist())
+    si.wi = mi.Vector3f((-sunlit.SUN).tolist())
     away = mi.SurfaceInteraction3f()
-    away.wi = mi.Vector3f((sunlit_vase.SUN * [1, -1, 1]).tolist())
+    away.wi = mi.Vector3f((sunlit.SUN * [1, -1, 1]).tolist())
     assert np.array(sky.eval(si)).min() > 100
     assert np.array(sky.eval(away)).max() < 1
 

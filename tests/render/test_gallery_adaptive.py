@@ -9,7 +9,7 @@ from scipy import stats
 
 import unrender as ur
 from tiers import quick
-from unrender.gallery import parts, two_planets
+from unrender.gallery import parts, planets
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import CountingSession, SampleRequest
 
@@ -296,7 +296,7 @@ def test_paths_into_the_sky_have_no_vertices_and_those_through_glass_the_most():
     assert 1 <= np.median(count[names == "free"]) < np.median(count[names == "glass"]) <= 6
 
 
-@pytest.mark.parametrize("planet", [two_planets.blue, two_planets.red])
+@pytest.mark.parametrize("planet", [planets.blue, planets.red])
 def test_a_planet_has_no_seam_and_is_of_real_paint(planet):
     picture = planet(64)
     assert picture.shape == (64, 64, 3)

@@ -12,7 +12,7 @@ from unrender.display import notebook
 from unrender.gallery import fields
 from unrender.gallery.fields import Option
 from unrender.gallery.specification import ProblemSource, build_problem
-from unrender.gallery.sunlit_vase import photographs
+from unrender.gallery.sunlit import photographs
 from unrender.scene.problem import Problem
 
 __all__ = ["Option", "names", "options", "photographs", "problem", "summary"]

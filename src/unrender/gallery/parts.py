@@ -72,6 +72,18 @@ def rectangle(centre: Vector, right: Vector, up: Vector, bsdf: dict[str, Any], *
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f(matrix.tolist()), "bsdf": bsdf, **more}
 
 
+def unit(vector: Vector) -> np.ndarray:
+    """Return a vector of length 1."""
+    return np.asarray(vector) / np.linalg.norm(vector)
+
+
+def facing(direction: Vector) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit vectors to the right and upwards of a `rectangle` that faces this direction, of any length; y is up."""
+    normal = unit(direction)
+    right = unit(np.cross([0.0, 1.0, 0.0], normal))
+    return right, np.cross(normal, right)
+
+
 def colour(*rgb: float) -> dict[str, Any]:
     """Return a colour in linear RGB; one number is grey."""
     return {"type": "rgb", "value": list(rgb) if len(rgb) == 3 else [rgb[0]] * 3}

@@ -25,6 +25,7 @@ from unrender.backend.variant import current, ensure, llvm_version
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.random import Key
+from unrender.gallery import meshes
 from unrender.io import bounded_files, files
 from unrender.losses import Loss
 from unrender.rendering.mitsuba import film
@@ -32,7 +33,7 @@ from unrender.rendering.mitsuba.film_response import FilmResponse, response_tabl
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.pixel_filter import PixelFilters, is_box
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
-from unrender.rendering.mitsuba.scene_loading import media
+from unrender.rendering.mitsuba.scene_loading import load, media
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
@@ -177,6 +178,29 @@ def build_problem(name: str, specification: Specification) -> Problem:
     truth = {key: value.numpy() for key, value in renderer.values([p.key for p in parameters]).items()}
     views = views_of(renderer.pair.current, specification)
     return Problem(renderer, parameters, views, specification.loss, specification.max_depth, truth=truth, name=name)
+
+
+def reconstruction(
+    name: str, specification: Any, aov: str = "", surface_of: str | None = None, max_depth: int | None = None
+) -> Problem:
+    """Return the problem of a specification whose references show another scene, `target()`, than the initial `scene()`.
+
+    Args:
+        aov: see `reference`.
+        surface_of: key of the vertex positions whose true surface is that of the first mesh of the target; None for no true values.
+        max_depth: path length of the problem; None for that of the references.
+    """
+    true = load(specification.target)
+    body = next((shape for shape in true.shapes() if shape.is_mesh()), None)
+    return Problem(
+        specification.scene,
+        specification.parameters(),
+        views_of(true, specification, aov),
+        specification.loss,
+        max_depth or specification.max_depth,
+        name=name,
+        surfaces={surface_of: meshes.surface(body)} if surface_of else {},
+    )
 
 
 def views_of(scene: Any, specification: Specification, aov: str = "") -> list[View]:

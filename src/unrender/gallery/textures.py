@@ -76,6 +76,11 @@ def ramp(x: np.ndarray, low: float | np.ndarray, high: float | np.ndarray) -> np
     return t * t * (3 - 2 * t)
 
 
+def mix(low: np.ndarray, high: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Return colours between `low` (at 0) and `high` (at 1), (3,) or (H, W, 3), by the share of each texel, (H, W)."""
+    return low + (high - low) * share[..., None]
+
+
 def bitmap(values: np.ndarray, repeat: tuple[float, float] | None = None) -> dict[str, Any]:
     """Return a differentiable texture of values (H, W, C) or (H, W) as a Mitsuba dictionary.
 

@@ -1,8 +1,10 @@
-"""Problems `smoke` and `nerf-volume`, and parts of problems with media: grids, cameras around the origin, a cube with invisible faces.
+"""Problems `smoke`, `nerf-volume`, `three-bodies` and `tea`, and parts of problems with media: grids, cameras, a cube with invisible faces.
 
 `smoke` is after Nicolet et al. 2023, Figs 5 and 11. Most of the cube is empty, and some of it dense, with multiple scattering. In a voxel
 that the optimisation has emptied, collisions alone would never show that smoke is missing. `nerf-volume`, an object with surfaces, is
 fitted by a volume that emits and absorbs. After Balint et al. 2023, Figs 7 and 8; `balls` has small balls far from each other, as Fig. 8.
+`three-bodies` and `tea` are after Nicolet et al. 2023, Fig. 2 and section 6. The tea is in a glass ball, in a room that is lit only via its
+ceiling. Glass refracts every ray, so no emitter can be sampled from inside of the tea: with few samples the image is noise.
 """
 
 from __future__ import annotations
@@ -15,9 +17,8 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, parts, textures
-from unrender.gallery.specification import views_of
+from unrender.gallery.specification import reconstruction
 from unrender.losses import L1, L2, Loss
-from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 
@@ -183,7 +184,7 @@ class NerfVolume:
 
     def problem(self, name: str) -> Problem:
         """Return the problem: the volume's scene, with direct emission only, and references of the toy by Mitsuba's `path` integrator."""
-        return Problem(self.scene, self.parameters(), views_of(load(self.target), self), self.loss, 1, name=name)
+        return reconstruction(name, self, max_depth=1)
 
     def _stage(self) -> dict[str, Any]:
         sky = {"type": "constant", "radiance": parts.colour(0.3, 0.35, 0.4)}
@@ -191,8 +192,6 @@ class NerfVolume:
 
 
 def _toy() -> dict[str, Any]:
-    import mitsuba as mi
-
     to = mi.ScalarTransform4f()
     red, blue, gold, green = ([0.75, 0.15, 0.1], [0.1, 0.25, 0.7], [0.8, 0.6, 0.15], [0.15, 0.55, 0.2])
     return {
@@ -219,3 +218,99 @@ def _balls(count: int) -> dict[str, Any]:
         }
         for n, (center, colour) in enumerate(zip(centers, colours.tolist(), strict=True))
     }
+
+
+@register(name="three-bodies", position=22)
+@dataclass(frozen=True)
+class ThreeBodies:
+    """Albedo, roughness and extinction of three balls: of paint, of metal and of fog.
+
+    One view. The unknowns are a reflectance (3,), a roughness α () and an extinction (3,). The scene multiplies the extinction by 4, to
+    inverse units of length.
+    """
+
+    resolution: int = fields.resolution(48)
+    reference_spp: int = fields.reference_spp(1024)
+    max_depth: int = fields.max_depth(6, at_least=2)
+    loss: Loss = field(default=L1(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return three balls of radius 0.6 on the floor y = -0.6, under a lamp and a sky."""
+        tiles = {"type": "checkerboard", "color0": parts.colour(0.15), "color1": parts.colour(0.6)}
+        tiles["to_uv"] = mi.ScalarTransform3f().scale([24.0, 24.0])
+        fog = {
+            "type": "homogeneous",
+            "scale": 4.0,  # Mitsuba limits colours to 1
+            "sigma_t": parts.colour(0.9, 0.6, 0.35),
+            "albedo": parts.colour(0.6, 0.85, 0.95),
+        }
+        floor = parts.rectangle((0, -0.6, 0), (8, 0, 0), (0, 0, -8), {"type": "diffuse", "reflectance": tiles})
+        return {
+            "type": "scene",
+            "camera": parts.camera((0, 1.3, 5.2), (0, -0.1, 0), 40.0, self.resolution),
+            "floor": floor,
+            "lamp": parts.rectangle(
+                (-2.5, 3.5, 1), (0.8, -0.6, 0), (0, 0, 1), parts.diffuse(0), emitter=parts.light(9, 8, 6)
+            ),
+            "sky": {"type": "constant", "radiance": parts.colour(0.25, 0.3, 0.4)},
+            "paint": _ball(-1.35, {"type": "diffuse", "reflectance": parts.colour(0.75, 0.25, 0.12)}),
+            "metal": _ball(0.0, {"type": "roughconductor", "material": "Al", "alpha": 0.12}),
+            "fog": _ball(1.35, {"type": "null"}) | {"interior": fog},
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the unknowns: grey paint, dull metal, thin grey fog."""
+        return (
+            Parameter("paint.bsdf.reflectance.value", initial=0.5),
+            Parameter("metal.bsdf.alpha.value", initial=0.4),
+            Parameter("fog.interior_medium.sigma_t.value.value", initial=0.2),
+        )
+
+
+def _ball(x: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "sphere", "center": [x, 0.0, 0.0], "radius": 0.6, "bsdf": bsdf}
+
+
+@register(name="tea", position=23)
+@dataclass(frozen=True)
+class Tea:
+    """Extinction and albedo of the tea in a glass ball, in a room lit only by light bounced off its ceiling.
+
+    One view. Two unknowns (3,). The scene multiplies the extinction by 10, to inverse units of length.
+    """
+
+    resolution: int = fields.resolution(32)
+    reference_spp: int = fields.reference_spp(2048)
+    max_depth: int = fields.max_depth(12, at_least=4)
+    loss: Loss = field(default=L1(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the room of `indirect-room` without its photograph, with the ball before the back wall."""
+        tea = {
+            "type": "homogeneous",
+            "scale": 10.0,  # Mitsuba limits colours to 1
+            "sigma_t": parts.colour(0.25, 0.4, 0.7),
+            "albedo": parts.colour(0.9, 0.72, 0.3),
+            "sample_emitters": False,
+        }
+        room = parts.room(parts.diffuse(0.75), parts.diffuse(0.6, 0.08, 0.06), parts.diffuse(0.12, 0.42, 0.1))
+        pot = {
+            "type": "sphere",
+            "center": [0.0, -0.5, 0.1],
+            "radius": 0.5,
+            "bsdf": {"type": "dielectric", "int_ior": 1.33},
+        }
+        return {
+            "type": "scene",
+            "camera": parts.camera((0, -0.1, 2.1), (0, -0.35, 0), 46.0, self.resolution),
+            **room,
+            "tea": pot | {"interior": tea},
+            **parts.uplight((0.72, -0.999, 0.9), (40e3, 36e3, 30e3)),
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return both unknowns, initially thin and grey."""
+        return (
+            Parameter("tea.interior_medium.sigma_t.value.value", initial=0.15),
+            Parameter("tea.interior_medium.albedo.value.value", initial=0.6),
+        )
