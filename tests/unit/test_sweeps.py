@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from unrender.app.cli.sweep_driver import equally_good, run_command
-from unrender.app.sweeps import pruning
-from unrender.app.sweeps.axes import Axis, parse_axes
+from unrender.app.sweeps import trials
 from unrender.app.sweeps.record import (
     RunOutcome,
     SweepPlan,
@@ -24,7 +23,7 @@ from unrender.app.sweeps.record import (
     watched_folders,
     write_sweep,
 )
-from unrender.app.sweeps.search import Grid, Random, Search
+from unrender.app.sweeps.search import Axis, Grid, Random, Search, parse_axes
 from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.core.errors import InputError
 from unrender.methods import method
@@ -130,9 +129,9 @@ def error_of(settings: dict[str, str], share: float = 1.0) -> float:
 def outcome(started: Started) -> RunOutcome:
     errors: dict[float, float] = {}
     status, error = "finished", error_of(started.settings)
-    for share in pruning.RUNGS:
+    for share in trials.RUNGS:
         errors[share] = error_of(started.settings, share)
-        if pruning.is_hopeless(errors, started.limits):
+        if trials.is_hopeless(errors, started.limits):
             status, error = "pruned", errors[share]
             break
     return run(status=status, error=error, rungs={str(share): value for share, value in errors.items()})
@@ -175,7 +174,7 @@ def test_the_outcome_does_not_depend_on_workers_nor_on_who_is_first(kind: str) -
 def test_that_test_sees_a_trial_that_looks_at_whatever_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     def limits(self: Trials, number: int) -> dict[float, float]:
         ended = [trial for trial in self.ended.values() if trial.status == "finished"]
-        return pruning.medians(
+        return trials.medians(
             {1.0: t.error, **{float(s): e for s, e in t.runs[0].rungs.items()}} for t in ended if t.error
         )
 
@@ -217,8 +216,8 @@ def test_pruning_keeps_the_best_and_saves_steps() -> None:
 
 
 def test_medians_are_of_those_that_came_to_their_end() -> None:
-    assert pruning.medians([{0.3: 1.0}] * 3) == {}
-    assert pruning.medians([{0.3: e, 1.0: 2 * e} for e in (1, 2, 3, 4)]) == {0.3: 2.5, 1.0: 5.0}
+    assert trials.medians([{0.3: 1.0}] * 3) == {}
+    assert trials.medians([{0.3: e, 1.0: 2 * e} for e in (1, 2, 3, 4)]) == {0.3: 2.5, 1.0: 5.0}
 
 
 @pytest.mark.parametrize(
@@ -233,8 +232,8 @@ def test_medians_are_of_those_that_came_to_their_end() -> None:
     ],
 )
 def test_those_that_fall_fast_are_spared(errors: dict[float, float], hopeless: bool) -> None:
-    assert pruning.is_hopeless(errors, {0.1: 1.0, 0.2: 1.0, 1.0: 0.1}) is hopeless
-    assert not pruning.is_hopeless(errors, {})
+    assert trials.is_hopeless(errors, {0.1: 1.0, 0.2: 1.0, 1.0: 0.1}) is hopeless
+    assert not trials.is_hopeless(errors, {})
 
 
 # ---------------------------------------------------------------------- records

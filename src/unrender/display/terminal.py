@@ -9,6 +9,7 @@ import typer
 from rich import console
 from rich.console import Group
 from rich.console import RenderableType as Renderable
+from rich.markup import escape
 from rich.segment import Segment
 from rich.text import Text
 
@@ -17,7 +18,7 @@ from unrender.core.text import visible
 if TYPE_CHECKING:
     from rich.table import Table
 
-__all__ = ["Console", "Group", "Renderable", "columns", "echo"]
+__all__ = ["Console", "Group", "Renderable", "columns", "echo", "plain"]
 
 _UNESCAPED = "\n\t"
 
@@ -55,6 +56,11 @@ def columns(*headings: str) -> Table:
         table.add_column(style="bold", no_wrap=True)
         table.add_column(overflow="fold")
     return table
+
+
+def plain(text: str) -> str:
+    """Return untrusted text without rich markup, with its printed width."""
+    return escape(visible(text))
 
 
 def echo(text: Any, err: bool = False) -> None:

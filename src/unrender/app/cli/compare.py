@@ -29,12 +29,14 @@ from unrender.app.cli.signals import FAILED
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
+from unrender.display import formatting
+from unrender.display.terminal import Console, columns, plain
 
 if TYPE_CHECKING:
     from unrender.app.cli.tasks import Job, RunTask
     from unrender.app.distributed.cluster import Cluster, Ended, Workers
+    from unrender.app.report.equal_time import Comparison, Spread
     from unrender.app.sweeps.record import RunOutcome
-    from unrender.display.terminal import Console
     from unrender.methods import Method
     from unrender.runs.progress import Progress
     from unrender.scene.problem import Problem
@@ -89,7 +91,6 @@ def compare(
     Every run has the same budget, as in `unrender run`. With workers, several runs are concurrent, each with its share of the machine.
     """
     steps, seconds = arguments.budget(steps, DEFAULT_SECONDS if seconds is None and steps is None else seconds)
-    from unrender.display.terminal import Console
     from unrender.runs.progress import Progress
 
     console = Console(highlight=False)
@@ -105,31 +106,24 @@ def compare(
         folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
         try:
             command = arguments.command_line(context)
-            job = _job(what[0], options, not no_cache, command, folder)
-            turns = itertools.product(range(seed, seed + seeds), chosen)  # a slow machine affects all methods
-            runs = [_run_task(method.name, settings_[method.name], steps, seconds, n, final_spp) for n, method in turns]
+            from unrender.app.cli.tasks import Job, RunTask
+
+            token = secrets.token_hex(16)
+            job = Job(arguments.absolute(what[0]), options, not no_cache, command, str(folder.resolve()), token)
+            budget = steps, seconds
+            runs = [  # in turn, since a slow machine affects all methods
+                RunTask(f"{one.name}-seed{n}", one.name, settings_[one.name], *budget, n, final_spp)
+                for n, one in itertools.product(range(seed, seed + seeds), chosen)
+            ]
             with _prepared(console, job, runs, variant, where) as comparison:
                 directories, status = _run_all(console, comparison, progress)
         finally:
             arguments.remove_if_empty(folder)
         if directories:
-            _report(console, directories, folder)
+            remark = "Times are those of the steps, without compilation and final pictures."
+            _report(console, directories, folder, remark)
     if status:
         raise typer.Exit(status)
-
-
-def _job(problem: str, options: Mapping[str, str], cached: bool, command: str, folder: Path) -> Job:
-    from unrender.app.cli.tasks import Job
-
-    return Job(arguments.absolute(problem), options, cached, command, str(folder.resolve()), secrets.token_hex(16))
-
-
-def _run_task(
-    method: str, settings: Mapping[str, str], steps: int | None, seconds: float | None, seed: int, final_spp: int | None
-) -> RunTask:
-    from unrender.app.cli.tasks import RunTask
-
-    return RunTask(f"{method}-seed{seed}", method, settings, steps, seconds, seed, final_spp)
 
 
 @contextlib.contextmanager
@@ -152,19 +146,54 @@ def _prepared(
         yield _Comparison(job, runs, problem, cluster)
 
 
-def _report(console: Console, directories: Sequence[Path], folder: Path) -> None:
-    """Compare runs made here."""
+def _report(console: Console, directories: Sequence[Path], folder: Path, remark: str = "") -> None:
+    """Write the page of a comparison, and print its tables and notices."""
     with phases.phase("page"):
         from unrender.app import report
-        from unrender.app.cli.comparison_table import show
 
         comparison, notices = report.load_comparison(directories)
         page = report.write_comparison(comparison, notices, folder)
-    show(console, comparison)
+    _show(console, comparison)
     for notice in notices:
         console.say(f"note: {notice}")
-    console.print("Times are those of the steps, without compilation and final pictures.")
+    if remark:
+        console.print(remark)
     console.say(f"page: {page}")
+
+
+def _show(console: Console, comparison: Comparison) -> None:
+    """Print the median and range over each method's runs, for every metric and for the final pictures."""
+    from unrender.app.report.equal_time import LOSS_WINDOW
+    from unrender.losses.metrics import has_flip
+
+    parameters = [metric for metric in comparison.metrics if metric.name != "loss"]
+    for metric in parameters or comparison.metrics:
+        window = f" (median over the last {LOSS_WINDOW:.0%} of the time)" if metric.name == "loss" else ""
+        console.print(f"[bold]{plain(metric.title)}[/]{window}", soft_wrap=True)
+        first = metric.methods[comparison.groups[0].label]
+        times = [f"at {formatting.duration(moment.seconds)}" for moment in first.moments]
+        table = columns("method", "runs", *times, f"after {formatting.count(comparison.samples)} paths")
+        for group in comparison.groups:
+            outcome = metric.methods[group.label]
+            cells = [moment.error for moment in (*outcome.moments, outcome.at_samples[-1])]
+            table.add_row(plain(group.label), str(len(group.runs)), *map(_spread, cells))
+        console.print(table)
+    if comparison.image_error[comparison.groups[0].label].median is not None:
+        console.print("[bold]Last pictures, each run's at its own end[/]")
+        table = columns("method", *comparison.images)
+        for group in comparison.groups:
+            table.add_row(plain(group.label), *(_spread(of[group.label]) for of in comparison.images.values()))
+        console.print(table)
+        if not has_flip():
+            console.say("FLIP is left out: its package is missing (pip install 'unrender[flip]')")
+
+
+def _spread(of: Spread) -> str:
+    if of.median is None:
+        return "–"
+    middle = formatting.number(of.median)
+    low, high = formatting.number(of.low), formatting.number(of.high)
+    return middle if low == high else f"{middle} ({low}–{high})"
 
 
 def _check_single(what: Sequence[str]) -> None:
@@ -181,19 +210,11 @@ def _compare_folders(
     """Compare earlier runs. Raise `InputError` for options that only apply to new runs."""
     if refused := arguments.typed_options(context, ("out", "overwrite", "allow_outside")):
         raise InputError(f"compare: {refused[0]} does not apply to run folders; leave it out")
-    from unrender.app import report
-    from unrender.app.cli.comparison_table import show
-
     folder = arguments.folder(out, "compare", overwrite, *_MARKS)
     try:
-        comparison, notices = report.load_comparison(directories)
-        page = report.write_comparison(comparison, notices, folder)
+        _report(console, directories, folder)
     finally:
         arguments.remove_if_empty(folder)
-    show(console, comparison)
-    for notice in notices:
-        console.say(f"note: {notice}")
-    console.say(f"page: {page}")
 
 
 @dataclass(frozen=True)
@@ -251,7 +272,7 @@ def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
     """Run as many runs concurrently as there are workers. A failed run is reported in one line, and the others continue. After an
     interrupt, return the completed runs, and the state of the others if they saved it within seconds."""
     from unrender.app.cli import tasks
-    from unrender.app.cli.task_display import TaskDisplay
+    from unrender.app.cli.tasks import TaskDisplay
     from unrender.app.distributed.cluster import OnWorkers
     from unrender.app.sweeps.record import RunOutcome
 

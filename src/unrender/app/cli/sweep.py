@@ -207,7 +207,7 @@ def _run_silently(
 
 
 def _texts(values: Mapping[str, Any] | None) -> dict[str, str]:
-    from unrender.app.sweeps.axes import as_text
+    from unrender.app.sweeps.search import as_text
 
     return {name: as_text(value) for name, value in (values or {}).items()}
 
@@ -223,8 +223,8 @@ def _planned(
     values: dict[str, Any], over: Sequence[str] | Mapping[str, str | Sequence[Any]]
 ) -> tuple[SweepPlan, Search]:
     """Return the plan of a sweep and its search. Raises `InputError`."""
-    from unrender.app.sweeps.axes import parse_axes
     from unrender.app.sweeps.record import SweepPlan
+    from unrender.app.sweeps.search import parse_axes
     from unrender.methods import method
     from unrender.runs.folder import schema
 
@@ -270,8 +270,7 @@ def _kind(search: str | None, axes: Any) -> Any:
 
 def _search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
     """Return the plan with its number of trials, and its search. Raises `InputError`."""
-    from unrender.app.sweeps.axes import parse_axes
-    from unrender.app.sweeps.search import TPE, Grid, Random
+    from unrender.app.sweeps.search import TPE, Grid, Random, parse_axes
     from unrender.methods import method
 
     axes = parse_axes(plan.over, method(plan.method), plan.settings)

@@ -19,8 +19,7 @@ from rich.text import Text
 from unrender.app.cli import arguments, report, tasks
 from unrender.app.cli.execute import introduce
 from unrender.app.cli.signals import FAILED, INTERRUPTED, TERMINATED
-from unrender.app.cli.task_display import TaskDisplay
-from unrender.app.cli.tasks import Job, RunTask
+from unrender.app.cli.tasks import Job, RunTask, TaskDisplay
 from unrender.app.distributed.cluster import Ended, Executor, InProcess, OnWorkers, Workers, connect
 from unrender.app.sweeps.record import (
     RUN_FOLDERS,
@@ -59,11 +58,6 @@ def line(trial: TrialRecord) -> str:
     where = f" (pruned at {share:.0%})" if trial.status == "pruned" else ""
     where += "".join(f" ({status})" for status in sorted({run.status for run in trial.runs} & DOUBTFUL))
     return f"{what}error {_error(trial)}{where}"
-
-
-def best_so_far(trials: Trials) -> Table:
-    """Return a table of the best completed trials."""
-    return _table(list(trials.ended.values()), _SHOWN_LIVE)
 
 
 def show(console: Console, record: SweepRecord) -> None:
@@ -291,7 +285,9 @@ def _announce(console: Console, session: Session, state: _State, executor: Execu
 def _drive(console: Console, session: Session, state: _State, executor: Executor, job: Job) -> None:
     """Run trials until all have ended, or one is interrupted."""
     plan, trials = state.record.plan, state.trials
-    display = TaskDisplay(console, trials.search.trials, "trials", lambda: best_so_far(trials))
+    display = TaskDisplay(
+        console, trials.search.trials, "trials", lambda: _table(list(trials.ended.values()), _SHOWN_LIVE)
+    )
     display.skip(len(trials.ended))
     with display:
         while not trials.done and not state.stopped:

@@ -63,7 +63,7 @@ class RunOutcome(BaseModel):
         seed: seed of its random numbers.
         status: "pruned", or the status in the run folder at the end of the run.
         stopped: see `Result.stopped`.
-        error, standard_error: see `pruning.stated_error`; None if unknown.
+        error, standard_error: see `trials.stated_error`; None if unknown.
         rungs: {fraction of the budget: error} during the run.
         steps, samples, seconds: its work; the seconds are those of the optimisation.
         wall_seconds: duration including compilation and pictures; 0 for a run that existed before the session.

@@ -1,4 +1,4 @@
-"""`unrender gallery`: built-in problems."""
+"""`unrender gallery` and `unrender methods`: the built-in problems, and the available methods with their options."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import typer
 from unrender.app.cli import arguments
 from unrender.app.cli.arguments import MOST_SAMPLES, NoCache, Overwrite, ProblemSettings, Variant
 from unrender.core.errors import InputError
+from unrender.display.terminal import Console
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from unrender.methods import Method
     from unrender.scene.problem import Problem
 
 
@@ -37,7 +39,6 @@ def gallery(
     from rich.markup import escape
 
     from unrender import gallery as problems
-    from unrender.display.terminal import Console
 
     _refuse_unused(arguments.typed_options(context), name)
     console = Console(highlight=False)
@@ -124,3 +125,65 @@ def _draw(problem: Problem, folder: Path, spp: int) -> list[Path]:
             path = folder / f"view{index}-{what}.png"
             written.append(write(path, png(srgb(picture * exposure(reference)))))
     return written
+
+
+def methods(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="Show this method only.")] = None,
+    plan: Annotated[
+        str | None,
+        typer.Option(metavar="PROBLEM", help="Print the plan of NAME, or of auto, for this problem, as a plan file."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", "-s", metavar="NAME=VALUE", help="With --plan: an option of the method. Repeatable."),
+    ] = None,
+    problem_settings: ProblemSettings = None,
+    variant: Variant = "auto",
+) -> None:
+    """List the methods, their options and defaults.
+
+    With --plan, print all that a method decides for a problem. `unrender run PROBLEM --method FILE.toml` runs such a file.
+    """
+    from rich.markup import escape
+
+    if plan is not None:
+        _print_plan(plan, name or "auto", arguments.settings(settings, "--set"), problem_settings, variant)
+        return
+    if unused := arguments.typed_options(context):
+        raise InputError(f"methods: {unused[0]} needs --plan PROBLEM")
+    from unrender.methods import method
+    from unrender.methods import methods as registered
+
+    console = Console(highlight=False)
+    for one in [method(name)] if name else registered().values():
+        console.print(f"[bold]{one.name}[/]  {escape(one.summary)}", soft_wrap=True)
+        console.print(_method_options(one))
+        console.print()
+
+
+def _print_plan(
+    problem: str, name: str, settings: dict[str, str], problem_settings: list[str] | None, variant: str
+) -> None:
+    from unrender.methods import method
+    from unrender.methods.plan_file import text
+
+    chosen, options = method(name), arguments.settings(problem_settings, "--problem-set")
+    chosen.start(settings)
+    arguments.check_problem(problem, options)
+    arguments.use_variant(variant)
+    print(text(chosen.plan(arguments.open_problem(problem, options), settings)), end="")
+
+
+def _method_options(one: Method) -> Table:
+    from rich.markup import escape
+
+    table = _table()
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, field in one.options.model_fields.items():
+        default = "none" if field.default is None else str(field.default)
+        about = f"{field.description} ({one.expected(name)})"
+        table.add_row(f"  {name}", escape(default), escape(about))
+    return table
