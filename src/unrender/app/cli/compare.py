@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -115,8 +115,7 @@ def compare(
                 RunTask(f"{one.name}-seed{n}", one.name, settings_[one.name], *budget, n, final_spp)
                 for n, one in itertools.product(range(seed, seed + seeds), chosen)
             ]
-            with _prepared(console, job, runs, variant, where) as comparison:
-                directories, status = _run_all(console, comparison, progress)
+            directories, status = _run_all(console, progress, job, runs, variant, where)
         finally:
             arguments.remove_if_empty(folder)
         if directories:
@@ -124,26 +123,6 @@ def compare(
             _report(console, directories, folder, remark)
     if status:
         raise typer.Exit(status)
-
-
-@contextlib.contextmanager
-def _prepared(
-    console: Console, job: Job, runs: Sequence[RunTask], variant: str, workers: Workers | None
-) -> Iterator[_Comparison]:
-    """Yield the open problem, with a connection to the workers if they are requested."""
-    from unrender.app.cli.execute import introduce
-
-    with contextlib.ExitStack() as stack:
-        cluster = None
-        if workers is not None:
-            from unrender.app.distributed.cluster import connect
-
-            cluster = stack.enter_context(connect(workers, variant))
-            job = replace(job, variant=cluster.variant, threads=cluster.share.threads)
-        running = arguments.use_variant(variant)
-        problem = arguments.open_problem(job.problem, dict(job.problem_settings), job.cached)
-        introduce(console, problem, running if cluster is None else cluster.variant)
-        yield _Comparison(job, runs, problem, cluster)
 
 
 def _report(console: Console, directories: Sequence[Path], folder: Path, remark: str = "") -> None:
@@ -217,47 +196,49 @@ def _compare_folders(
         arguments.remove_if_empty(folder)
 
 
-@dataclass(frozen=True)
-class _Comparison:
-    """Runs of a comparison, and their executor.
-
-    Attributes:
-        job: common data of the runs.
-        runs: runs in the order of their start.
-        problem: the open problem.
-        cluster: cluster whose workers run them; None for this process.
-    """
-
-    job: Job
-    runs: Sequence[RunTask]
-    problem: Problem
-    cluster: Cluster | None
-
-
-def _run_all(console: Console, comparison: _Comparison, progress: Progress) -> tuple[list[Path], int]:
-    """Carry out the runs until one is interrupted.
+def _run_all(
+    console: Console, progress: Progress, job: Job, runs: Sequence[RunTask], variant: str, workers: Workers | None
+) -> tuple[list[Path], int]:
+    """Carry out the runs, here or on workers, until one is interrupted.
 
     Returns the run folders of runs that took a step, and the exit status: of the one that was interrupted, or of one that failed, else 0.
     """
-    from unrender.app.cli import tasks
+    from unrender.app.cli.execute import introduce
+    from unrender.runs.folder.schema import RECORD
 
-    folder = Path(comparison.job.folder)
-    tasks.discard_earlier(folder, comparison.runs)
-    outcomes = _on_workers(console, comparison) if comparison.cluster else _here(console, comparison, progress)
+    folder = Path(job.folder)
+    with contextlib.ExitStack() as stack:
+        cluster = None
+        if workers is not None:
+            from unrender.app.distributed.cluster import connect
+
+            cluster = stack.enter_context(connect(workers, variant))
+            job = replace(job, variant=cluster.variant, threads=cluster.share.threads)
+        running = arguments.use_variant(variant)
+        problem = arguments.open_problem(job.problem, dict(job.problem_settings), job.cached)
+        introduce(console, problem, running if cluster is None else cluster.variant)
+        for run in runs:  # no run continues an earlier one
+            (folder / run.name / RECORD).unlink(missing_ok=True)
+        if cluster is None:
+            outcomes = _here(console, progress, job, runs, problem)
+        else:
+            outcomes = _on_workers(console, job, runs, cluster)
     names = [outcome.folder for outcome in outcomes if outcome.steps]
-    directories = [folder / run.name for run in comparison.runs if run.name in names]
+    directories = [folder / run.name for run in runs if run.name in names]
     interrupted = [outcome for outcome in outcomes if outcome.status == "interrupted"]
     statuses = [exit_status(outcome.stopped) or (FAILED if outcome.message else 0) for outcome in outcomes]
     return directories, exit_status(interrupted[0].stopped) if interrupted else max(statuses, default=0)
 
 
-def _here(console: Console, comparison: _Comparison, progress: Progress) -> list[RunOutcome]:
+def _here(
+    console: Console, progress: Progress, job: Job, runs: Sequence[RunTask], problem: Problem
+) -> list[RunOutcome]:
     from unrender.app.cli import tasks
 
     outcomes: list[RunOutcome] = []
-    for run in comparison.runs:
+    for run in runs:
         console.print(f"[bold]{run.method}[/], seed {run.seed}, {_budget(run)}")
-        outcomes.append(tasks.carry_out(comparison.job, run, comparison.problem, console, progress))
+        outcomes.append(tasks.carry_out(job, run, problem, console, progress))
         if outcomes[-1].status == "interrupted":
             break
     return outcomes
@@ -268,7 +249,7 @@ def _budget(run: RunTask) -> str:
     return ", ".join(f"{limit:g} {unit}" for unit, limit in limits if limit is not None)
 
 
-def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
+def _on_workers(console: Console, job: Job, runs: Sequence[RunTask], cluster: Cluster) -> list[RunOutcome]:
     """Run as many runs concurrently as there are workers. A failed run is reported in one line, and the others continue. After an
     interrupt, return the completed runs, and the state of the others if they saved it within seconds."""
     from unrender.app.cli import tasks
@@ -276,11 +257,9 @@ def _on_workers(console: Console, comparison: _Comparison) -> list[RunOutcome]:
     from unrender.app.distributed.cluster import OnWorkers
     from unrender.app.sweeps.record import RunOutcome
 
-    assert comparison.cluster is not None
-    job, waiting = comparison.job, list(comparison.runs)
-    folder = Path(job.folder)
+    waiting, folder = list(runs), Path(job.folder)
     outcomes: list[RunOutcome] = []
-    executor = OnWorkers(comparison.cluster, tasks.on_worker)
+    executor = OnWorkers(cluster, tasks.on_worker)
 
     def take(ended: Ended) -> None:
         name, seed = ended.key

@@ -87,12 +87,6 @@ class RunTask:
     limits: Mapping[float, float] | None = None
 
 
-def discard_earlier(folder: Path, tasks: Sequence[RunTask]) -> None:
-    """Delete earlier runs in the folders of tasks, so that no task continues one."""
-    for task in tasks:
-        (folder / task.name / RECORD).unlink(missing_ok=True)
-
-
 @contextlib.contextmanager
 def open_job(job: Job) -> Iterator[None]:
     """Mark the job's folder, so that workers can detect whether they share it."""
