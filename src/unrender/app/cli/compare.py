@@ -101,26 +101,24 @@ def compare(
     _check_single(what)
     typed, options = arguments.settings(settings, "--set"), arguments.settings(problem_settings, "--problem-set")
     with Progress(console) as progress:
-        chosen, settings_ = _methods_and_settings(methods, typed)
+        by_method = _methods_and_settings(methods, typed)
         arguments.check_problem(what[0], options, not no_cache)
         folder = arguments.folder(out, f"{arguments.short_name(what[0])}-compare", overwrite, *_MARKS)
         try:
-            command = arguments.command_line(context)
             from unrender.app.cli.tasks import Job, RunTask
 
-            token = secrets.token_hex(16)
-            job = Job(arguments.absolute(what[0]), options, not no_cache, command, str(folder.resolve()), token)
-            budget = steps, seconds
-            runs = [  # in turn, since a slow machine affects all methods
-                RunTask(f"{one.name}-seed{n}", one.name, settings_[one.name], *budget, n, final_spp)
-                for n, one in itertools.product(range(seed, seed + seeds), chosen)
-            ]
+            place, token = str(folder.resolve()), secrets.token_hex(16)
+            command = arguments.command_line(context)
+            job = Job(arguments.absolute(what[0]), options, not no_cache, command, place, token)
+            turns = itertools.product(range(seed, seed + seeds), by_method)  # a slow machine affects all methods
+            runs = [RunTask(f"{m}-seed{n}", m, by_method[m], steps, seconds, n, final_spp) for n, m in turns]
             directories, status = _run_all(console, progress, job, runs, variant, where)
         finally:
             arguments.remove_if_empty(folder)
         if directories:
-            remark = "Times are those of the steps, without compilation and final pictures."
-            _report(console, directories, folder, remark)
+            _report(
+                console, directories, folder, "Times are those of the steps, without compilation and final pictures."
+            )
     if status:
         raise typer.Exit(status)
 
@@ -289,15 +287,13 @@ def _on_workers(console: Console, job: Job, runs: Sequence[RunTask], cluster: Cl
     return outcomes
 
 
-def _methods_and_settings(
-    names: str | None, typed: Mapping[str, str]
-) -> tuple[list[Method], dict[str, dict[str, str]]]:
-    """Return the methods, and the validated settings of each. Raise `InputError`."""
+def _methods_and_settings(names: str | None, typed: Mapping[str, str]) -> dict[str, dict[str, str]]:
+    """Return the validated settings of each method, by name. Raise `InputError`."""
     chosen = _parse_methods(names)
     by_method = _settings_by_method(chosen, typed)
     for one in chosen:
         one.start(by_method[one.name])
-    return chosen, by_method
+    return by_method
 
 
 def _parse_methods(names: str | None) -> list[Method]:
