@@ -18,11 +18,11 @@ from tiers import quick
 pytest.importorskip("cv2", reason="photographs need OpenCV: pip install 'unrender[capture]'")
 
 import unrender
-from unrender.app.capture import atlas, formats, hull, importing, pictures, views
+from unrender.app.capture import formats, hull, importing, pictures, views
 from unrender.app.capture.cameras import Lens, project, rigid
 from unrender.app.capture.capture import AXES, Capture, CapturedView, Photograph, pose, reinterpreted
 from unrender.app.capture.formats import colmap, files, lights
-from unrender.app.capture.mesh import Mesh, decimate, normals, smooth, without_crumbs
+from unrender.app.capture.mesh import Mesh, decimate, normals, smooth, unwrap, without_crumbs
 from unrender.app.capture.views import Resampling, pinhole
 from unrender.core.errors import InputError
 
@@ -101,7 +101,7 @@ def test_crumbs_are_left_out_and_decimation_keeps_the_place() -> None:
 def test_an_atlas_has_no_overlaps_and_keeps_the_surface() -> None:
     pytest.importorskip("xatlas", reason="atlases need xatlas: pip install 'unrender[capture]'")
     ball = decimate(hull.visual_hull(_views(24), 24), 400)
-    found = atlas.unwrap(ball, 128)
+    found = unwrap(ball, 128)
     assert found.uv is not None
     assert found.uv.min() >= 0
     assert found.uv.max() <= 1
@@ -127,10 +127,10 @@ def test_an_atlas_that_does_not_end_is_given_up(tmp_path: Path) -> None:
     sleeper = tmp_path / "sleeper.py"
     sleeper.write_text("import time\ntime.sleep(60)\n")
     with pytest.raises(InputError, match=r"the atlas of 1 faces was not ready within 0\.2 s"):
-        atlas.unwrap(mesh, 16, seconds=0.2, command=(sys.executable, str(sleeper)))
+        unwrap(mesh, 16, seconds=0.2, command=(sys.executable, str(sleeper)))
     sleeper.write_text("raise SystemExit('its charts fill 3 atlases')\n")
     with pytest.raises(InputError, match="could not be made: its charts fill 3 atlases"):
-        atlas.unwrap(mesh, 16, command=(sys.executable, str(sleeper)))
+        unwrap(mesh, 16, command=(sys.executable, str(sleeper)))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5, 0.37])
@@ -237,7 +237,7 @@ def test_the_atlas_program_imports_nothing_from_the_current_directory(
     assert unrender.__file__ is not None
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", os.path.relpath(Path(unrender.__file__).parents[1]))
-    assert atlas.unwrap(Mesh(np.eye(3), np.array([[0, 1, 2]])), 16).uv is not None
+    assert unwrap(Mesh(np.eye(3), np.array([[0, 1, 2]])), 16).uv is not None
     assert not (tmp_path / "was-run").exists()
 
 

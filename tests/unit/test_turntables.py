@@ -9,9 +9,8 @@ import pytest
 
 from unrender.app.capture import photometric_folder, turntable
 from unrender.app.capture.cameras import Lens
-from unrender.app.capture.capture import CapturedView
+from unrender.app.capture.capture import CapturedView, StoredViews
 from unrender.app.capture.formats import is_lit, lights
-from unrender.app.capture.stored import StoredViews
 from unrender.core.errors import InputError
 
 SIZE, COUNT = 48, 12

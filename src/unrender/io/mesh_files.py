@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -351,9 +351,14 @@ def ply(
         normals: unit normals, (V, 3).
         uv: Mitsuba's texture coordinates, (V, 2); stored as (u, 1 - v), for `flip_tex_coords`.
     """
-    columns = [("xyz", vertices)]
+    columns: list[tuple[Sequence[str], np.ndarray]] = [("xyz", vertices)]
     columns += [] if normals is None else [(("nx", "ny", "nz"), normals)]
     columns += [] if uv is None else [(("s", "t"), upwards(uv))]
+    return ply_of(columns, faces)
+
+
+def ply_of(columns: Sequence[tuple[Sequence[str], np.ndarray]], faces: np.ndarray) -> bytes:
+    """Encode properties of vertices, (their names, values (V, n)), and faces (F, 3) as binary little-endian PLY in float32."""
     names = [name for group, _ in columns for name in group]
     table = np.concatenate([values for _, values in columns], 1).astype("<f4")
     corners = np.empty(len(faces), [("count", "u1"), ("corners", "<i4", 3)])

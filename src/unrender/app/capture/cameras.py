@@ -67,6 +67,11 @@ class Lens:
         """True if straight lines are curved in the picture."""
         return self.model == FISHEYE or any(self.distortion)
 
+    @property
+    def coefficients(self) -> np.ndarray:
+        """All coefficients of the model in OpenCV's order, (8,) or (4,) of a fisheye."""
+        return np.array([*self.distortion, *[0.0] * 8][: _MOST_COEFFICIENTS[self.model]], float)
+
     def scaled(self, width: int, height: int) -> Lens:
         """Return the lens of the same picture at another size of the same aspect ratio."""
         x, y = width / self.width, height / self.height
@@ -97,16 +102,10 @@ def project(lens: Lens, camera_to_world: np.ndarray, points: np.ndarray) -> tupl
     cv2 = opencv()
     matrix = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
     if lens.model == FISHEYE:
-        coefficients = np.array([*lens.distortion, 0, 0, 0, 0][:4], float)
-        return cv2.fisheye.distortPoints(normalised[None], matrix, coefficients)[0], depth
+        return cv2.fisheye.distortPoints(normalised[None], matrix, lens.coefficients)[0], depth
     rays = np.concatenate([normalised, np.ones((len(normalised), 1))], 1)
     none = np.zeros(3)
-    return cv2.projectPoints(rays, none, none, matrix, _coefficients(lens))[0].reshape(-1, 2), depth
-
-
-def _coefficients(lens: Lens) -> np.ndarray:
-    """Return the coefficients of a radial-tangential lens, (8,), in OpenCV's order."""
-    return np.array([*lens.distortion, *[0.0] * 8][:8], float)
+    return cv2.projectPoints(rays, none, none, matrix, lens.coefficients)[0].reshape(-1, 2), depth
 
 
 def rigid(matrix: Any, where: str) -> tuple[np.ndarray, float]:

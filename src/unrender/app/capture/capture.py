@@ -1,4 +1,4 @@
-"""Contents of a folder of posed photographs, independent of the program that wrote it; and conventions of camera axes.
+"""Contents of a folder of posed photographs, independent of the program that wrote it; conventions of camera axes; prepared views.
 
 | name | x | y | z | written by |
 |---|---|---|---|---|
@@ -9,15 +9,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
 from unrender.app.capture.cameras import Lens, rigid
 from unrender.core.errors import InputError
+from unrender.io.stored_pictures import PictureStore, StoredPicture
 
 INSIDE = 0.999
 """Fraction of a pixel inside the photograph or the mask from which the whole pixel counts as inside."""
@@ -45,14 +45,60 @@ class CapturedView:
     held_out: bool
 
 
-class CapturedViews(Protocol):
-    """A list of views, or `StoredViews`, which reads each view on access: process one at a time."""
+_NONE = np.zeros(0, np.float32)
 
-    def __len__(self) -> int: ...
 
-    def __getitem__(self, index: int, /) -> CapturedView: ...
+class StoredViews:
+    """Views with or without masks in a temporary file, each read on access, so that memory does not grow with their number.
 
-    def __iter__(self) -> Iterator[CapturedView]: ...
+    Names, poses and lenses stay in memory.
+
+    Args:
+        views: consumed one by one.
+    """
+
+    def __init__(self, views: Iterable[CapturedView] = ()):
+        self._store = PictureStore()
+        self._views: list[tuple[CapturedView, StoredPicture, StoredPicture | None, StoredPicture]] = []
+        for view in views:
+            self.append(view)
+
+    def append(self, view: CapturedView) -> None:
+        """Store one more view."""
+        add = self._store.add
+        mask = None if view.mask is None else add(view.mask)
+        bare = replace(view, values=_NONE, mask=None, shown=_NONE)
+        self._views.append((bare, add(view.values), mask, add(view.shown)))
+
+    def of(self, held_out: bool) -> StoredViews:
+        """Return the held-out or the other views, which share the stored arrays."""
+        subset = object.__new__(StoredViews)
+        subset._store, subset._views = self._store, [each for each in self._views if each[0].held_out == held_out]
+        return subset
+
+    def bare(self) -> list[CapturedView]:
+        """Return all views without masks, and with empty arrays in place of values and coverage."""
+        return [view for view, *_ in self._views]
+
+    @property
+    def masked(self) -> list[bool]:
+        """True if each view has a mask."""
+        return [mask is not None for _, _, mask, _ in self._views]
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def __getitem__(self, index: int) -> CapturedView:
+        view, values, mask, shown = self._views[index]
+        read = None if mask is None else np.asarray(mask)
+        return replace(view, values=np.asarray(values), mask=read, shown=np.asarray(shown))
+
+    def __iter__(self) -> Iterator[CapturedView]:
+        return (self[index] for index in range(len(self)))
+
+
+CapturedViews = list[CapturedView] | StoredViews
+"""Views: process one at a time."""
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from xml.etree import ElementTree as Xml
 
 import numpy as np
 
-from unrender.app.capture.capture import INSIDE, CapturedView
+from unrender.app.capture.capture import INSIDE, CapturedView, StoredViews
 from unrender.app.capture.problem_folder import sensor_element
-from unrender.app.capture.stored import StoredViews
 from unrender.app.capture.writing import (
     MASKS,
     PROBLEM,

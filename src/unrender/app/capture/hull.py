@@ -16,8 +16,8 @@ from unrender.app.capture.cameras import Lens, project
 from unrender.app.capture.capture import AXES, Capture, CapturedView, CapturedViews, reinterpreted
 from unrender.app.capture.mesh import Mesh, decimate, smooth, without_crumbs
 from unrender.app.capture.silhouettes import Silhouettes, overlap
-from unrender.app.capture.stored import StoredArrays
 from unrender.core.errors import InputError
+from unrender.io.stored_pictures import PictureStore, StoredPicture
 
 _COARSE = 32
 _REFINED = 4
@@ -51,7 +51,8 @@ def visual_hull(views: CapturedViews, resolution: int) -> Mesh:
     from skimage import measure
 
     cameras = [(view.lens, view.camera_to_world) for view in views]
-    distances = StoredArrays(map(_distance, views))
+    store = PictureStore()
+    distances = [store.add(_distance(view)) for view in views]
     low, high = _box(*_first_ball(views), cameras, distances)
     spacing = float((high - low).max()) / resolution
     counts = np.ceil((high - low) / spacing).astype(int) + 3  # one empty voxel around it
@@ -73,16 +74,17 @@ def visual_hull(views: CapturedViews, resolution: int) -> Mesh:
 EMPTY = "no point lies inside all masks: poses, masks or their order do not belong together"
 
 
-def field(cameras: Sequence[Camera], distances: StoredArrays, points: np.ndarray) -> np.ndarray:
+def field(cameras: Sequence[Camera], distances: Sequence[StoredPicture], points: np.ndarray) -> np.ndarray:
     """Return the field at points (N, 3), (N,): positive inside. `distances` are those of the masks, in pixels."""
     from scipy import ndimage
 
     minimum = np.full(len(points), np.inf)
-    for (lens, pose), distance in zip(cameras, distances, strict=True):
+    for (lens, pose), stored in zip(cameras, distances, strict=True):
+        distance = np.asarray(stored)
         at, depth = project(lens, pose, points)
         pixels = ndimage.map_coordinates(distance, (at - 0.5).T[::-1], order=1, mode="nearest")
         outside = (at < 0) | (at > (lens.width, lens.height))
-        if _touches_edge(distance):
+        if any((side > 0).any() for side in (distance[0], distance[-1], distance[:, 0], distance[:, -1])):
             pixels[outside.any(1)] = _UNKNOWN
         else:  # the object ends inside the picture
             off = np.abs(at - np.clip(at, 0, (lens.width, lens.height))).max(1)
@@ -108,12 +110,8 @@ def _distance(view: CapturedView) -> np.ndarray:
     return signed
 
 
-def _touches_edge(distance: np.ndarray) -> bool:
-    return any((side > 0).any() for side in (distance[0], distance[-1], distance[:, 0], distance[:, -1]))
-
-
 def _box(
-    middle: np.ndarray, radius: float, cameras: Sequence[Camera], distances: StoredArrays
+    middle: np.ndarray, radius: float, cameras: Sequence[Camera], distances: Sequence[StoredPicture]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of a box around the hull. Coarse grids refine it iteratively, starting from a ball."""
     low, high = middle - radius, middle + radius
@@ -160,13 +158,13 @@ def _first_ball(views: CapturedViews) -> tuple[np.ndarray, float]:
     return middle, 1.2 * float(np.max(radii))
 
 
-def _evaluated(cameras: Sequence[Camera], distances: StoredArrays, points: np.ndarray) -> np.ndarray:
+def _evaluated(cameras: Sequence[Camera], distances: Sequence[StoredPicture], points: np.ndarray) -> np.ndarray:
     chunks = [points[start : start + _CHUNK] for start in range(0, len(points), _CHUNK)]
     return np.concatenate([field(cameras, distances, chunk) for chunk in chunks])
 
 
 def _refined(
-    cameras: Sequence[Camera], distances: StoredArrays, low: np.ndarray, spacing: float, counts: np.ndarray
+    cameras: Sequence[Camera], distances: Sequence[StoredPicture], low: np.ndarray, spacing: float, counts: np.ndarray
 ) -> np.ndarray:
     """Return the field on a grid, evaluated only where a coarser grid indicates that its zero level set is near."""
     from scipy import ndimage
@@ -275,14 +273,7 @@ def _reduced(view: CapturedView) -> CapturedView:
         blocks = values[: height * factor, : width * factor].reshape(height, factor, width, factor)
         return blocks.mean((1, 3))
 
-    lens = replace(
-        view.lens,
-        width=width,
-        height=height,
-        fx=view.lens.fx / factor,
-        fy=view.lens.fy / factor,
-        cx=view.lens.cx / factor,
-        cy=view.lens.cy / factor,
-    )
+    sizes = {name: getattr(view.lens, name) / factor for name in ("fx", "fy", "cx", "cy")}
+    lens = replace(view.lens, width=width, height=height, **sizes)
     assert view.mask is not None
     return replace(view, lens=lens, mask=smaller(view.mask), shown=smaller(view.shown))

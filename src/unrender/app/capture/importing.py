@@ -10,7 +10,6 @@ import numpy as np
 from PIL import Image
 
 from unrender.app.capture import (
-    atlas,
     field_folder,
     formats,
     hull,
@@ -22,11 +21,10 @@ from unrender.app.capture import (
     writing,
 )
 from unrender.app.capture import mesh as meshes
-from unrender.app.capture.capture import Capture, reinterpreted
+from unrender.app.capture.capture import Capture, StoredViews, reinterpreted
 from unrender.app.capture.formats import lights
 from unrender.app.capture.mesh import Mesh
 from unrender.app.capture.silhouettes import Silhouettes, overlap
-from unrender.app.capture.stored import StoredViews
 from unrender.app.capture.unknowns import DEFAULT, OF_HULL, parse
 from unrender.app.capture.views import prepare
 from unrender.app.exporting.ready_made import file_name
@@ -197,7 +195,7 @@ def import_capture(
     mesh = data.mesh
     if mesh.uv is None:
         with phases.phase("atlas"):
-            mesh = atlas.unwrap(mesh, options.texture)
+            mesh = meshes.unwrap(mesh, options.texture)
 
     def fill(place: Path) -> None:
         with phases.phase("problem"):
@@ -207,7 +205,10 @@ def import_capture(
             (place / SHEET).write_bytes(
                 _sheet(
                     data,
-                    [silhouettes.thumbnail(_overlay(data, index)) for index in silhouettes.chosen(len(data.views))],
+                    [
+                        silhouettes.thumbnail(silhouettes.overlay(data.views[index], data.silhouettes))
+                        for index in silhouettes.chosen(len(data.views))
+                    ],
                 )
             )
 
@@ -216,7 +217,6 @@ def import_capture(
 
 
 def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
-    """Import a capture of one camera under known lights."""
     options.refuse(_OF_POSES, "one camera under known lights")
     if options.response != pictures.SRGB:
         raise InputError(
@@ -238,7 +238,6 @@ def _import_lit(folder: Path, out: Path, options: ImportOptions) -> Imported:
 
 
 def _import_field(folder: Path, out: Path, options: ImportOptions) -> Imported:
-    """Import a capture as a radiance field."""
     options.refuse(_OF_ASSET, "a radiance field")
     assert options.field is not None
     if options.response == pictures.FIT:
@@ -268,7 +267,6 @@ def _capture(folder: Path, options: ImportOptions) -> Capture:
 
 
 def _views(capture: Capture, options: ImportOptions, masks: bool = True) -> tuple[StoredViews, list[str]]:
-    """Read the photographs of a capture. See `views.prepare`."""
     with phases.phase("photographs") as advance:
         size = options.resolution, options.scale
         return prepare(
@@ -296,7 +294,7 @@ def check(folder: Path, out: Path, options: ImportOptions) -> tuple[Imported, st
             (place / CHECK).mkdir()
             shown, thumbnails = set(silhouettes.chosen(len(data.views))), []
             for index, view in enumerate(data.views):
-                picture = _overlay(data, index)
+                picture = silhouettes.overlay(view, data.silhouettes)
                 name = f"{index:04d}-{file_name(Path(view.name).stem)}.png"
                 (place / CHECK / name).write_bytes(png(picture))
                 thumbnails += [silhouettes.thumbnail(picture)] if index in shown else []
@@ -332,7 +330,7 @@ def _read(folder: Path, options: ImportOptions, unwrapped: bool) -> _Read:
     if own_mesh is None:
         meshes.check_installed()
     if unwrapped and (own_mesh is None or own_mesh.uv is None):
-        atlas.check_installed()
+        meshes.check_atlas_installed()
     if own_mesh is None and not _has_masks(capture):
         raise InputError(f"{folder}: neither masks nor a mesh: give --masks D or --mesh M")
     views, notices = _views(capture, options)
@@ -365,10 +363,6 @@ def _has_masks(capture: Capture) -> bool:
         p.mask is not None or p.file.suffix.lower() in (".exr", ".png", ".tif", ".tiff", ".webp")
         for p in capture.photographs
     )
-
-
-def _overlay(data: _Read, index: int) -> np.ndarray:
-    return silhouettes.overlay(data.views[index], data.silhouettes)
 
 
 def _sheet(data: _Read, thumbnails: list[Image.Image]) -> bytes:

@@ -1,8 +1,15 @@
-"""Triangle meshes as arrays: normals, smoothing, decimation, PLY files."""
+"""Triangle meshes as arrays: normals, smoothing, decimation, files, and texture atlases by xatlas.
+
+xatlas does not terminate on some meshes and cannot be interrupted, so it runs in a subprocess with a time limit: this module.
+"""
 
 from __future__ import annotations
 
 import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +49,11 @@ def normals(mesh: Mesh) -> np.ndarray:
         np.add.at(total, mesh.faces[:, corner], weighted)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.maximum(length, 1e-30), [0.0, 0.0, 1.0])
+
+
+def shading_normals(mesh: Mesh) -> np.ndarray:
+    """Return the mesh's own normals, or those of `normals`."""
+    return normals(mesh) if mesh.normals is None else mesh.normals
 
 
 def smooth(mesh: Mesh, steps: int) -> Mesh:
@@ -89,12 +101,9 @@ def decimate(mesh: Mesh, faces: int) -> Mesh:
     """Simplify to at most about `faces` faces, by quadric error. Raise `InputError` if the required package is missing."""
     if len(mesh.faces) <= faces:
         return mesh
-    try:
-        import fast_simplification
-    except ImportError as error:
-        raise InputError(
-            f"a first shape needs fast-simplification ({error}): pip install 'unrender[capture]'"
-        ) from error
+    check_installed()
+    import fast_simplification
+
     # The package uses single precision, so centre and normalise the vertices.
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     extent = float(np.ptp(mesh.vertices, axis=0).max())
@@ -135,13 +144,91 @@ def read(path: Path) -> Mesh:
 
 def ply(mesh: Mesh) -> bytes:
     """Return the mesh as a binary PLY file with normals, and u and v if present."""
-    columns = [("xyz", mesh.vertices), (("nx", "ny", "nz"), normals(mesh) if mesh.normals is None else mesh.normals)]
-    columns += [] if mesh.uv is None else [("uv", mesh.uv)]
-    names = [name for group, _ in columns for name in group]
-    table = np.concatenate([values for _, values in columns], 1).astype("<f4")
-    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
-    faces["count"], faces["corners"] = 3, mesh.faces
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    lines += [f"property float {name}" for name in names]
-    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    return "\n".join(lines).encode() + table.tobytes() + faces.tobytes()
+    uv = [] if mesh.uv is None else [("uv", mesh.uv)]
+    return mesh_files.ply_of([("xyz", mesh.vertices), (("nx", "ny", "nz"), shading_normals(mesh)), *uv], mesh.faces)
+
+
+_SECONDS = 120.0
+"""Time limit of an atlas in seconds; 10 000 faces take 2 seconds, 20 000 faces 15."""
+_PADDING = 3
+"""Texels between charts, before the atlas is scaled down slightly."""
+_COMMAND = (sys.executable, "-m", "unrender.app.capture.mesh")
+
+
+def check_atlas_installed() -> None:
+    """Raise `InputError` if xatlas is missing."""
+    if importlib.util.find_spec("xatlas") is None:
+        raise InputError("a mesh without texture coordinates needs xatlas: pip install 'unrender[capture]'")
+
+
+def unwrap(mesh: Mesh, resolution: int, seconds: float = _SECONDS, command: tuple[str, ...] = _COMMAND) -> Mesh:
+    """Return the mesh with texture coordinates: one atlas without overlaps, with charts about 2 texels apart.
+
+    Vertices on seams are duplicated. Normals do not change.
+
+    Args:
+        mesh: at most 2^31 faces.
+        resolution: texels along the atlas's sides.
+        seconds: time limit.
+        command: command of the subprocess, to which two file names are appended.
+
+    Raises:
+        InputError: xatlas is not installed, fails, or exceeds the time limit.
+    """
+    check_atlas_installed()
+    middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    with tempfile.TemporaryDirectory(prefix="unrender-atlas-") as folder:
+        mesh_file, made = Path(folder, "mesh.npz"), Path(folder, "atlas.npz")
+        local = np.ascontiguousarray((mesh.vertices - middle) / extent, np.float32)
+        np.savez(mesh_file, vertices=local, faces=mesh.faces.astype(np.uint32), resolution=resolution)
+        try:
+            # Python searches the current directory for modules first, which may be untrusted.
+            done = subprocess.run(
+                [*command, str(mesh_file), str(made)],
+                timeout=seconds,
+                capture_output=True,
+                check=False,
+                cwd=folder,
+                env=_environment(),
+            )
+        except subprocess.TimeoutExpired as error:
+            many = f"{len(mesh.faces)} faces"
+            raise InputError(f"the atlas of {many} was not ready within {seconds:g} s: try fewer (--faces)") from error
+        if done.returncode or not made.is_file():
+            last = done.stderr.decode(errors="replace").strip().splitlines()[-1:] or [f"status {done.returncode}"]
+            raise InputError(f"the atlas of {len(mesh.faces)} faces could not be made: {last[0][:200]}")
+        with np.load(made, allow_pickle=False) as arrays:
+            of, faces, uv = arrays["of"], arrays["faces"].astype(np.int64), arrays["uv"].astype(float)
+    return Mesh(mesh.vertices[of], faces, uv, shading_normals(mesh)[of])
+
+
+def _environment() -> dict[str, str]:
+    """Return the environment of a subprocess that does not import modules from its current directory."""
+    environment = {**os.environ, "PYTHONSAFEPATH": "1"}
+    if path := environment.get("PYTHONPATH"):
+        environment["PYTHONPATH"] = os.pathsep.join(os.path.abspath(place) for place in path.split(os.pathsep))
+    return environment
+
+
+def _unwrap_file(mesh_file: str, made: str) -> None:
+    """Make the atlas in this process: `python -m unrender.app.capture.mesh IN.npz OUT.npz`."""
+    import xatlas  # pyright: ignore[reportMissingImports]
+
+    with np.load(mesh_file, allow_pickle=False) as mesh:
+        vertices, faces, resolution = mesh["vertices"], mesh["faces"], int(mesh["resolution"])
+    packing = xatlas.PackOptions()
+    packing.resolution, packing.padding, packing.bilinear = resolution, _PADDING, True
+    atlas = xatlas.Atlas()
+    atlas.add_mesh(vertices, faces)
+    atlas.generate(pack_options=packing)
+    if atlas.atlas_count != 1:
+        raise SystemExit(f"its charts fill {atlas.atlas_count} atlases")
+    of, faces_of_atlas, uv = atlas.get_mesh(0)
+    # xatlas treats the resolution as a hint: the atlas is slightly larger, and not square.
+    uv = uv * np.array([atlas.width, atlas.height]) / max(atlas.width, atlas.height)
+    np.savez(made, of=of, faces=faces_of_atlas, uv=uv.astype(np.float32))
+
+
+if __name__ == "__main__":
+    _unwrap_file(*sys.argv[1:])

@@ -77,11 +77,6 @@ def _stored_size(path: Path) -> tuple[int, int, int]:
     return width, height, 1
 
 
-def _oriented_size(width: int, height: int, orientation: int) -> tuple[int, int]:
-    """Return width and height after applying EXIF's orientation."""
-    return (height, width) if orientation in _QUARTER_TURNS else (width, height)
-
-
 def read(path: Path, orientation: int = 1, response: str = SRGB) -> Pixels:
     """Read a photograph. 8- and 16-bit integers are decoded, floating-point numbers are linear; CMYK becomes RGB.
 
@@ -134,9 +129,8 @@ def upright(path: Path, lens: Lens | None) -> tuple[int, int, int]:
     width, height, orientation = _stored_size(path)
     if lens is None or _proportional(width, height, lens):
         return width, height, 1
-    rotated_size = _oriented_size(width, height, orientation)
-    if rotated_size != (width, height) and _proportional(*rotated_size, lens):
-        return *rotated_size, orientation
+    if orientation in _QUARTER_TURNS and width != height and _proportional(height, width, lens):
+        return height, width, orientation
     raise InputError(
         f"{path}: {width} x {height} pixels, but its camera has {lens.width} x {lens.height}: expected the same aspect ratio"
     )
@@ -156,7 +150,7 @@ def _turn(values: np.ndarray, orientation: int) -> np.ndarray:
 def _decode(path: Path) -> np.ndarray | None:
     """Return the pixels as stored, uint8 or uint16; None for kinds that Mitsuba reads."""
     header = _header(path)
-    if header.kind == "TIFF" or _is_16_bit(header):
+    if header.kind == "TIFF" or (header.kind == "PNG" and header.bits == 16):  # Pillow would truncate 16 bits to 8
         return _decode_opencv(path, header)
     return _decode_pillow(path, header) if header.kind in _PILLOW_KINDS else None
 
@@ -170,11 +164,6 @@ def _header(path: Path) -> image_size.Header:
     width, height, _ = header.sizes[0]
     _check_size(path, width, height)
     return header
-
-
-def _is_16_bit(header: image_size.Header) -> bool:
-    """Return whether a PNG file has 16 bits per channel, which Pillow would truncate to 8."""
-    return header.kind == "PNG" and header.bits == 16
 
 
 @contextmanager

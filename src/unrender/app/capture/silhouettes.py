@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 
 from unrender.app.capture.cameras import Lens
 from unrender.app.capture.capture import CapturedView, CapturedViews
-from unrender.app.capture.mesh import Mesh
+from unrender.app.capture.mesh import Mesh, shading_normals
 from unrender.core.text import printable
 from unrender.display.pictures import png, quantized
 from unrender.losses.metrics import srgb
@@ -27,14 +27,12 @@ class Silhouettes:
     def __init__(self, mesh: Mesh):
         import mitsuba as mi
 
-        from unrender.app.capture.mesh import normals
         from unrender.rendering.mitsuba import mesh_layout
 
         self._middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
         self._extent = float(np.ptp(mesh.vertices, axis=0).max())
         local = Mesh((mesh.vertices - self._middle) / self._extent, mesh.faces, mesh.uv, mesh.normals)
-        own = normals(local) if local.normals is None else local.normals
-        made = mesh_layout.build("mesh", local.vertices, local.faces, own)
+        made = mesh_layout.build("mesh", local.vertices, local.faces, shading_normals(local))
         self._scene: Any = mi.load_dict({"type": "scene", "mesh": made})
 
     def mask(self, lens: Lens, camera_to_world: np.ndarray) -> np.ndarray:
@@ -92,7 +90,7 @@ def overlay(view: CapturedView, silhouettes: Silhouettes) -> np.ndarray:
     lens = view.lens.scaled(factor * view.lens.width, factor * view.lens.height)
     normals, distances = silhouettes.normals(lens, view.camera_to_world)
     inside = np.any(normals != 0, -1)
-    photograph = np.repeat(np.repeat(srgb(view.values * _exposure(view)), factor, 0), factor, 1)
+    photograph = _enlarged(srgb(view.values * _exposure(view)), factor)
     shading = 0.35 + 0.65 * np.clip(np.abs(normals[..., 2:]), 0, 1)
     tinted = (1 - _TINT) * photograph + _TINT * shading * _MESH
     picture = np.where(inside[..., None], tinted, 0.6 * photograph)
@@ -134,8 +132,8 @@ def _exposure(view: CapturedView) -> float:
     return min(0.8 / level, 16.0) if level > 0 else 1.0
 
 
-def _enlarged(mask: np.ndarray, factor: int) -> np.ndarray:
-    return np.repeat(np.repeat(mask, factor, 0), factor, 1)
+def _enlarged(picture: np.ndarray, factor: int) -> np.ndarray:
+    return np.repeat(np.repeat(picture, factor, 0), factor, 1)
 
 
 def _outline(inside: np.ndarray) -> np.ndarray:

@@ -16,8 +16,7 @@ import numpy as np
 
 from unrender.app.capture import pictures
 from unrender.app.capture.cameras import FISHEYE, Lens, opencv
-from unrender.app.capture.capture import Capture, CapturedView, Photograph
-from unrender.app.capture.stored import StoredViews
+from unrender.app.capture.capture import Capture, CapturedView, Photograph, StoredViews
 from unrender.core.errors import InputError
 from unrender.core.text import printable
 
@@ -244,13 +243,8 @@ class Resampling:
             ]
         )
         of = np.array([[source.fx, 0, source.cx - 0.5], [0, source.fy, source.cy - 0.5], [0, 0, 1]])
-        if source.model == FISHEYE:
-            coefficients = np.array([*source.distortion, 0, 0, 0, 0][:4], float)
-            x, y = cv2.fisheye.initUndistortRectifyMap(of, coefficients, np.eye(3), into, size, cv2.CV_32FC1)
-        else:
-            coefficients = np.array(source.distortion or (0.0,) * 4, float)
-            coefficients = np.concatenate([coefficients, np.zeros(max(0, 8 - len(coefficients)))])
-            x, y = cv2.initUndistortRectifyMap(of, coefficients, np.eye(3), into, size, cv2.CV_32FC1)
+        undistort = (cv2.fisheye if source.model == FISHEYE else cv2).initUndistortRectifyMap
+        x, y = undistort(of, source.coefficients, np.eye(3), into, size, cv2.CV_32FC1)
         inside = (
             (x >= -_MARGIN) & (x <= source.width - 1 + _MARGIN) & (y >= -_MARGIN) & (y <= source.height - 1 + _MARGIN)
         )
@@ -268,7 +262,7 @@ def _farthest(lens: Lens, within: float) -> float:
     A polynomial lens model decreases somewhere outside its picture, and would show the picture a second time there.
     """
     r = np.linspace(0, within, _SAMPLES)
-    k = [*lens.distortion, *[0.0] * 8]
+    k = lens.coefficients
     if lens.model == FISHEYE:
         angle = np.arctan(r)
         image = angle * (1 + k[0] * angle**2 + k[1] * angle**4 + k[2] * angle**6 + k[3] * angle**8)

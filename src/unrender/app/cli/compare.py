@@ -116,15 +116,13 @@ def compare(
         finally:
             arguments.remove_if_empty(folder)
         if directories:
-            _report(
-                console, directories, folder, "Times are those of the steps, without compilation and final pictures."
-            )
+            _report(console, directories, folder, new=True)
     if status:
         raise typer.Exit(status)
 
 
-def _report(console: Console, directories: Sequence[Path], folder: Path, remark: str = "") -> None:
-    """Write the page of a comparison, and print its tables and notices."""
+def _report(console: Console, directories: Sequence[Path], folder: Path, new: bool = False) -> None:
+    """Write the page of a comparison of `new` or earlier runs, and print its tables and notices."""
     with phases.phase("page"):
         from unrender.app import report
 
@@ -133,8 +131,8 @@ def _report(console: Console, directories: Sequence[Path], folder: Path, remark:
     _show(console, comparison)
     for notice in notices:
         console.say(f"note: {notice}")
-    if remark:
-        console.print(remark)
+    if new:
+        console.print("Times are those of the steps, without compilation and final pictures.")
     console.say(f"page: {page}")
 
 

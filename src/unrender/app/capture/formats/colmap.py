@@ -96,8 +96,7 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
         matrix, _ = pose(_matrix(image, images_file), AXES, True, f"{images_file}: {printable(image.name)}")
         mask = files.find_mask(folder, file, masks)
         photographs.append(Photograph(image.name, file, lenses[image.camera], matrix, mask))
-    notices = files.left_out(missing, len(images))
-    notices += files.without_pose({p.file.parent for p in photographs}, [p.file for p in photographs])
+    notices = files.notices([p.file for p in photographs], missing, len(images))
     return Capture(folder, "colmap", tuple(photographs), AXES, True, notices)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from unrender.core.errors import InputError
@@ -92,22 +92,19 @@ def _of_name(folder: Path, relative: Iterable[Path]) -> Path | None:
     return None
 
 
-def left_out(missing: list[str], count: int) -> tuple[str, ...]:
-    """Return a notice on photographs with known poses but missing files."""
-    if not missing:
-        return ()
-    return (f"{len(missing)} of {count} photographs are missing and were skipped, the first {printable(missing[0])}",)
-
-
-def without_pose(folders: Iterable[Path], used: Collection[Path]) -> tuple[str, ...]:
-    """Return a notice on pictures next to the photographs that have no pose."""
+def notices(used: Sequence[Path], missing: Sequence[str], count: int) -> tuple[str, ...]:
+    """Return notices on photographs with known poses but missing files, and on pictures next to the `used` ones without a pose."""
     known = {path.resolve() for path in used}
     rest = [
         path
-        for folder in sorted(set(folders))
+        for folder in sorted({path.parent for path in used})
         for path in pictures(folder)
         if path.resolve() not in known and not path.stem.endswith("_mask")
     ]
-    if not rest:
-        return ()
-    return (f"{len(rest)} pictures have no pose and were skipped, the first {printable(rest[0].name)}",)
+    lines = []
+    if missing:
+        first = printable(missing[0])
+        lines.append(f"{len(missing)} of {count} photographs are missing and were skipped, the first {first}")
+    if rest:
+        lines.append(f"{len(rest)} pictures have no pose and were skipped, the first {printable(rest[0].name)}")
+    return tuple(lines)

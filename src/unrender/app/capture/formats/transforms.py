@@ -60,8 +60,7 @@ def read(folder: Path, masks: Path | None = None) -> Capture:
                 missing.append(frame["file_path"])
                 continue
             photographs.append(_photograph(folder, file, frame, document, where, masks, held_out))
-    notices = files.left_out(missing, count)
-    notices += files.without_pose({p.file.parent for p in photographs}, [p.file for p in photographs])
+    notices = files.notices([p.file for p in photographs], missing, count)
     return Capture(folder, "transforms", tuple(photographs), AXES, False, notices)
 
 
