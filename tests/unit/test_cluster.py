@@ -27,8 +27,7 @@ from unrender.app.distributed.cluster import (
     share,
     workers,
 )
-from unrender.app.distributed.cluster.connection import HeadNode
-from unrender.app.distributed.cluster.waiting import Waiter
+from unrender.app.distributed.cluster.connection import HeadNode, Waiter
 from unrender.backend import limits
 from unrender.core.errors import InputError
 

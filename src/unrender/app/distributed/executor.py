@@ -23,7 +23,7 @@ from unrender.estimators.path import PathGradient
 from unrender.estimators.sample_groups import GradientRequest, GradientSample
 from unrender.images.denoising import Denoised
 from unrender.images.plain import Plain
-from unrender.images.recursive_control_variate import RecursiveControlVariate, RecursiveControlVariateState, Snapshot
+from unrender.images.recursive_control_variate import RecursiveControlVariate, RecursiveControlVariateState
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.pixel_statistics import PilotRequest
@@ -133,8 +133,8 @@ class DistributedExecutor:
             updated.recipe.call = replace(call, replay=True, pictures=False)
         replies = self._replies(calls, sent, memory)
         self._in_step = False
-        if isinstance(updated, Memory):
-            self._collect_if_long(updated)
+        if isinstance(updated, Memory) and updated.recipe.is_long(self._collection):
+            self._collect(updated.recipe)
         gathered = self._sample(request, [replies[index] for index in sorted(replies)], updated)
         draws_of_parts = [(part, replies[index].draws) for index, part in enumerate(parts) if part is not None]
         return replace(gathered, draws=joined([(part, draws) for part, draws in draws_of_parts if draws is not None]))
@@ -162,7 +162,6 @@ class DistributedExecutor:
         return paths
 
     def _reset_traffic(self) -> None:
-        """Reset the traffic counters at the start of a step."""
         if not self._in_step:
             self.traffic = Traffic(lost=self.traffic.lost, repeated=self.traffic.repeated)
         self._in_step = True
@@ -175,12 +174,9 @@ class DistributedExecutor:
 
     def collect(self, state: Any) -> Any:
         if isinstance(state, RecursiveControlVariateState) and isinstance(state.views, Memory):
-            collected_state = replace(state, views=self._views(state.views.recipe), snapshot=None)
-            return (
-                collected_state
-                if state.snapshot is None
-                else replace(collected_state, snapshot=_snapshot(collected_state))
-            )
+            collected: Any = replace(state, views=self._views(state.views.recipe), snapshot=None)
+            # The snapshot is that of all views.
+            return collected if state.snapshot is None else RecursiveControlVariate().prepare(self._problem, collected)
         if dataclasses.is_dataclass(state) and not isinstance(state, type):
             parts = {each.name: getattr(state, each.name) for each in dataclasses.fields(state) if each.init}
             collected = {name: self.collect(part) for name, part in parts.items()}
@@ -323,11 +319,6 @@ class DistributedExecutor:
 
     # ------------------------------------------------------------------ collection of memories
 
-    def _collect_if_long(self, memory: Memory) -> None:
-        """Collect a memory if restoring it would take many steps."""
-        if memory.recipe.is_long(self._collection):
-            self._collect(memory.recipe)
-
     def _collect(self, recipe: Recipe) -> None:
         if recipe.stored is not None:
             return
@@ -383,8 +374,3 @@ class DistributedExecutor:
             info=info,
             image=state,
         )
-
-
-def _snapshot(state: RecursiveControlVariateState) -> Snapshot | None:
-    """Return the snapshot of a state with all views."""
-    return RecursiveControlVariate().prepare(None, state).snapshot  # pyright: ignore[reportArgumentType]

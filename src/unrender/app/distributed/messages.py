@@ -161,12 +161,7 @@ def payload_bytes(message: Any) -> int:
     """Return the bytes of the arrays in a message."""
     if isinstance(message, np.ndarray):
         return message.nbytes
-    if isinstance(message, (Difference, Batch, DrawStatistics, Pilot)):
-        return sum(payload_bytes(value) for value in vars(message).values())
-    if isinstance(message, (Call, Reply)):
-        return sum(payload_bytes(value) for value in vars(message).values())
-    if isinstance(message, dict):
-        return sum(payload_bytes(value) for value in message.values())
-    if isinstance(message, tuple):
-        return sum(payload_bytes(value) for value in message)
-    return 0
+    if isinstance(message, (Call, Reply, Difference, Batch, DrawStatistics, Pilot)):
+        message = vars(message)
+    parts = message.values() if isinstance(message, dict) else message if isinstance(message, tuple) else ()
+    return sum(map(payload_bytes, parts))

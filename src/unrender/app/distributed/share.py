@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from unrender.app.distributed.assignment import total
-from unrender.app.distributed.messages import Batch, Call, Difference, Pair, Pilot, References, Reply
+from unrender.app.distributed.messages import Batch, Call, Difference, Pilot, References, Reply
 from unrender.core import arrays, trees
 from unrender.core.trees import Tree
 from unrender.estimators.sample_groups import TREES, GradientRequest, leave_one_out_groups
@@ -117,7 +117,9 @@ class ViewShare:
                 state = replace(state, snapshot=self._snapshot[1])
         elif call.state is not None:
             state = RecursiveControlVariateState(step=call.state.step)
-        pair = call.pair and self._pair_request(call.pair)
+        pair, of = None, call.pair
+        if of is not None:
+            pair = PairRequest(self._tree(of.previous), of.space, of.step, difference_spp=of.difference_spp)
         return GradientRequest(
             parameters,
             call.image,
@@ -129,9 +131,6 @@ class ViewShare:
             tolerance=call.tolerance,
             fresh=call.fresh,
         )
-
-    def _pair_request(self, pair: Pair) -> PairRequest:
-        return PairRequest(self._tree(pair.previous), pair.space, pair.step, difference_spp=pair.difference_spp)
 
     def _full_views(self) -> list[tuple[int, Frame]]:
         return [(index, FullView(self.problem, local)) for local, index in enumerate(self.views)]

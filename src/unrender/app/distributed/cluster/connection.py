@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import logging
 import os
+import queue
 import signal
 import socket
 import sys
@@ -13,15 +14,19 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent import futures
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from unrender.app.distributed.cluster.private import check_private, private_cluster
-from unrender.app.distributed.cluster.waiting import Waiter
+from unrender.app.distributed.cluster.private import (
+    check_cluster,
+    check_private,
+    check_token,
+    has_token,
+    private_cluster,
+)
 from unrender.app.distributed.cluster.workers import Share, Workers, most_by_memory, share
 from unrender.backend import limits, variant
-from unrender.backend.access import can_change, can_read
 from unrender.core.errors import InputError, UnrenderError
 from unrender.core.text import one_line, reason_of
 
@@ -73,6 +78,63 @@ class HeadNode:
                     f"workers: the cluster's head node at {self._address} is lost ({reason}); start one, and continue with unrender resume "
                     "or unrender sweep DIR"
                 ) from error
+
+
+_SLICE = 0.25
+"""Longest wait of one call in seconds, and thereby longest delay of an exception that a handler of signals raises."""
+_ENDS = 10.0
+"""Seconds that a call may take to end after such an exception."""
+
+
+class Waiter:
+    """Carries out the calls of Ray that block, in a thread of its own.
+
+    In the main thread, Ray's compiled code runs the handlers of signals itself while it waits. Where a handler raises `SystemExit`, the
+    process then ends with status 1, and other exceptions than `KeyboardInterrupt` become a `SystemError`. In other threads it runs no
+    handlers.
+    """
+
+    def __init__(self) -> None:
+        self._calls: queue.SimpleQueue[tuple[futures.Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
+        self._started = False
+
+    def call(self, function: Callable[[], Any]) -> Any:
+        """Return the value of a function that soon ends. An exception of a handler is raised after it has ended."""
+        if threading.current_thread() is not threading.main_thread():
+            return function()
+        if not self._started:
+            threading.Thread(target=self._serve, daemon=True).start()
+            self._started = True
+        call: futures.Future[Any] = futures.Future()
+        self._calls.put((call, function))
+        try:
+            # The system may deliver a signal to another thread, which does not wake this one. So the wait ends now and then.
+            while not futures.wait([call], _SLICE).done:
+                pass
+        except BaseException:
+            futures.wait([call], _ENDS)  # nothing may leave Ray while a thread is in it
+            raise
+        return call.result()
+
+    def wait(self, ray: Any, references: list[Any], count: int, seconds: float) -> list[Any]:
+        """Return the references that are ready, once `count` of them are or after the given time."""
+        while True:
+            part = min(seconds, _SLICE)
+            ready = self.call(lambda part=part: ray.wait(references, num_returns=count, timeout=part))[0]
+            seconds -= part
+            if len(ready) >= count or seconds <= 0:
+                return ready
+
+    def _serve(self) -> None:
+        while True:
+            _settle(*self._calls.get())  # without names, which would keep the last result
+
+
+def _settle(call: futures.Future[Any], function: Callable[[], Any]) -> None:
+    try:
+        call.set_result(function())
+    except BaseException as error:
+        call.set_exception(error)
 
 
 _SETTINGS = {
@@ -297,67 +359,3 @@ def _restored_action(number: int) -> Iterator[None]:
     finally:
         ended.set()
         thread.join()
-
-
-_HOW = "; or give --insecure if no other user can reach this machine"
-_SECONDS = 10.0
-
-
-def _token_files() -> list[Path]:
-    """Return the paths where Ray searches for a token of this user."""
-    named = os.environ.get("RAY_AUTH_TOKEN_PATH")
-    return [Path(named)] if named else [Path(os.path.expanduser("~/.ray/auth_token"))]
-
-
-def has_token() -> bool:
-    """Return whether this user has a token in a location that Ray searches."""
-    return bool(os.environ.get("RAY_AUTH_TOKEN")) or any(path.is_file() for path in _token_files())
-
-
-def check_token(address: str) -> None:
-    """Check that the cluster requires a token, and that other users cannot read it.
-
-    Raises:
-        InputError: anyone who can reach the cluster could run programs as this user.
-    """
-    mode = os.environ.get("RAY_AUTH_MODE", "disabled").lower()
-    if mode == "disabled" or (mode == "token" and not has_token()):
-        raise InputError(
-            f"workers: the cluster at {address} does not require a token, so anyone who can reach its ports can run programs as its user; "
-            f"start it with one (docs/guide/workers.md){_HOW}"
-        )
-    if os.environ.get("RAY_AUTH_TOKEN"):
-        return
-    for path in _token_files():
-        if path.is_file() and (reason := can_read(path)):
-            raise InputError(f"workers: the token {reason}; create a new one, and run chmod 600 {path}{_HOW}")
-
-
-def check_cluster(ray: Any, address: str) -> None:
-    """Check that other users of this machine cannot change the folders of the cluster's nodes here.
-
-    Raises:
-        InputError: they can, or the cluster refuses the connection.
-    """
-    for folder in sorted({node.session_dir for node in _nodes(ray, address)}):
-        if folder and os.path.isdir(folder) and (reason := can_change(Path(folder))):
-            raise InputError(
-                f"workers: Ray's folder {reason}; start the cluster with --temp-dir below a folder of mode 0700{_HOW}"
-            )
-
-
-def _nodes(ray: Any, address: str) -> list[Any]:
-    """Return the nodes of the cluster, of which a new one has none for a while. Raises `InputError`."""
-    until = time.monotonic() + _SECONDS
-    try:
-        client = ray._raylet.GcsClient(address=address)
-        while not (nodes := list(client.get_all_node_info(timeout=_SECONDS).values())) and time.monotonic() < until:
-            time.sleep(0.1)
-    except Exception as error:  # of many kinds
-        reason = one_line(reason_of(error, 200))
-        raise InputError(f"workers: Ray cannot be reached at {address}: {reason}") from error
-    if not nodes:
-        raise InputError(
-            f"workers: the cluster at {address} has no node; run ray status to see whether its nodes are alive"
-        )
-    return nodes
