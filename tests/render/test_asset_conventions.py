@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from unrender.app.exporting import formats, gltf, textures, usd
+from unrender.app.exporting import formats, gltf, textures
 from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.app.exporting.materials import Material
 from unrender.display.pictures import png
@@ -85,8 +85,8 @@ def test_obj_and_ply_as_mitsuba_reads_them(tmp_path: Path) -> None:
 
 def test_usd_as_its_own_library_reads_it(tmp_path: Path) -> None:
     kit: Any = pytest.importorskip("pxr.Usd")
-    usd.write(asset(quad()), tmp_path)
-    stage = kit.Stage.Open(str(tmp_path / usd.FILE))
+    formats.write_usd(asset(quad()), tmp_path)
+    stage = kit.Stage.Open(str(tmp_path / formats.USD_FILE))
     mesh = next(prim for prim in stage.Traverse() if prim.GetTypeName() == "Mesh")
     np.testing.assert_allclose(mesh.GetAttribute("primvars:st").Get()[3], [0, 1])
     np.testing.assert_array_equal(mesh.GetAttribute("faceVertexIndices").Get(), [0, 1, 2, 0, 2, 3])

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files, files, image_size, mesh_files, scene_assets, toml_lines, volumes
+from unrender.io import bounded_files, files, image_size, mesh_files, scene_files, toml_lines, volumes
 
 # ---------------------------------------------------------------------- pictures
 
@@ -188,13 +188,13 @@ def test_large_obj_files_of_sound_meshes_pass(tmp_path: Path):
 
 def test_spectra_and_tensors_of_sound_files_pass(tmp_path: Path):
     (tmp_path / "a.spd").write_text("# a comment\n400 0.5\n\n500.5   1e-3 # another\r\n")
-    scene_assets.check_spectrum(tmp_path / "a.spd")
+    scene_files.check_spectrum(tmp_path / "a.spd")
     (tmp_path / "a.spd").write_text("400 0.5 1\n")
     with pytest.raises(InputError, match=r"a\.spd:1: expected a wavelength and a value"):
-        scene_assets.check_spectrum(tmp_path / "a.spd")
+        scene_files.check_spectrum(tmp_path / "a.spd")
     head = b"tensor_file\0\1\0" + struct.pack("<IH", 1, 1) + b"a" + struct.pack("<HBQQ", 1, 10, 46, 2)
     (tmp_path / "a.bsdf").write_bytes(head + bytes(50 - len(head)) + bytes(4))
-    scene_assets.check_tensors(tmp_path / "a.bsdf")
+    scene_files.check_tensors(tmp_path / "a.bsdf")
 
 
 def test_a_sound_grid_is_measured(tmp_path: Path):

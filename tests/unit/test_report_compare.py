@@ -11,7 +11,7 @@ import pytest
 from report_folders import KEY, Page, write_run
 
 from unrender.app import report
-from unrender.app.report import groups, image_metrics
+from unrender.app.report import curves, groups
 from unrender.core.errors import InputError
 from unrender.losses import metrics
 from unrender.runs.folder.reader import read
@@ -239,7 +239,7 @@ def test_metrics_of_some_views_only_are_said(tmp_path, monkeypatch):
     runs = [write_run(tmp_path / m, m, views=views) for m in ("x", "y")]
     said = "Metrics of the last pictures are means over the first 2 of 3 views."
     assert said not in compared(tmp_path, runs)["notices"]
-    monkeypatch.setattr(image_metrics, "MOST_PIXELS", 128)
+    monkeypatch.setattr(curves, "MOST_PIXELS", 128)
     assert said in compared(tmp_path, runs)["notices"]
 
 

@@ -15,8 +15,7 @@ from unrender.app.exporting import asset, ready_made, textures
 from unrender.app.exporting.formats import MITSUBA, OWN
 from unrender.app.exporting.formats import check as check_formats
 from unrender.app.exporting.formats import write as write_formats
-from unrender.app.exporting.graph import SceneGraph
-from unrender.app.exporting.setters import store
+from unrender.app.exporting.graph import SceneGraph, store
 from unrender.backend import variant
 from unrender.core import arrays, periodic
 from unrender.core.errors import InputError

@@ -14,10 +14,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from unrender.app.report import curves, image_metrics, panels, tone_mapping
-from unrender.app.report.curves import Band, Series
+from unrender.app.report import curves, panels, tone_mapping
+from unrender.app.report.curves import Band, ImageMetric, Series
 from unrender.app.report.groups import Group
-from unrender.app.report.image_metrics import ImageMetric
 from unrender.core.errors import InputError
 from unrender.display import formatting, pictures, plots
 from unrender.display.plots import AXES
@@ -185,10 +184,10 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
             f"{first_run.path / 'history.jsonl'}: no truth is known and no loss is finite: nothing to compare"
         )
     images = {g.label: _spread([curves.image_error(run) for run in g.runs]) for g in groups}
-    measured_images = {g.label: [image_metrics.measure_run(run) for run in g.runs] for g in groups}
+    measured_images = {g.label: [curves.measure_run(run) for run in g.runs] for g in groups}
     by_metric = {
         metric.name: {label: _spread([run[metric.name] for run in runs]) for label, runs in measured_images.items()}
-        for metric in image_metrics.available()
+        for metric in curves.available()
     }
     representatives = {g.label: _median_run(g, keys) for g in groups}
     return Comparison(groups, end, ends["samples"], metrics, images, by_metric, representatives)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from unrender.app.report import curves, html, image_metrics, panels, tables
+from unrender.app.report import curves, html, panels, tables
 from unrender.app.report import groups as grouping
 from unrender.app.report.equal_time import Comparison, compare_groups
 from unrender.core.rotations import rotation
@@ -57,7 +57,7 @@ def page(directory: str | Path, open_after: bool = False) -> Path:
         views=[panels.view_of_run(view, of) for view, of in shown.items()],
         more_views=len(run.views) - len(shown),
         view_rows=tables.view_rows(run),
-        measures=image_metrics.available()[1:],
+        measures=curves.available()[1:],
         shapes=shown_shapes,
         more_script="shapes.js" if shown_shapes else "",
         maps=[panels.map_of_run(run, key) for key in maps[:_RUN_MAPS]],
@@ -100,7 +100,7 @@ def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list
     runs = [read(directory) for directory in directories]
     with np.errstate(over="ignore", invalid="ignore"):  # runs that diverged are compared, too
         notices = grouping.check_comparable(runs)
-        count, measured = len(runs[0].views), len(image_metrics.measured_views(runs[0]))
+        count, measured = len(runs[0].views), len(curves.measured_views(runs[0]))
         if measured < count:
             notices.append(f"Metrics of the last pictures are means over the first {measured} of {count} views.")
         return compare_groups(grouping.group(runs)), notices
@@ -131,7 +131,7 @@ def _page(comparison: Comparison, notices: list[str]) -> bytes:
         comparison=comparison,
         notices=notices,
         first=comparison.groups[0].label,
-        measures=image_metrics.available(),
+        measures=curves.available(),
         name=first.record.name,
         facts=html.facts(first.record),
         commands={str(run.path): run.record.command for group in comparison.groups for run in group.runs},

@@ -99,24 +99,20 @@ def _maps_of_view(view: int, shown: ViewPictures, encoder: PictureEncoder) -> li
     figures = []
     if shown.control_weight is not None:
         weight = np.mean(shown.control_weight, axis=-1)
-        picture = encoder.false_colour(
-            weight, 0.0, 1.0, tone_mapping.VALUE_COLORMAP, f"View {view}: control weight per pixel"
-        )
-        bar = tone_mapping.colour_bar(0.0, 1.0, tone_mapping.VALUE_COLORMAP, "Control weight")
+        picture = encoder.false_colour(weight, 0.0, 1.0, f"View {view}: control weight per pixel")
+        bar = tone_mapping.colour_bar(0.0, 1.0, "Control weight")
         note = f"mean {_finite_mean(weight):.2f}; 1 uses the full history, 0 discards it"
         figures.append(Figure(picture, "Control weight", note, bar))
     if shown.pixel_probability is not None:
         density = shown.pixel_probability
         high = tone_mapping.colour_limit(density)
-        picture = encoder.false_colour(
-            density, 0.0, high, tone_mapping.VALUE_COLORMAP, f"View {view}: probability of each pixel"
-        )
-        bar = tone_mapping.colour_bar(0.0, high, tone_mapping.VALUE_COLORMAP, "Probability that a pixel is sampled")
+        picture = encoder.false_colour(density, 0.0, high, f"View {view}: probability of each pixel")
+        bar = tone_mapping.colour_bar(0.0, high, "Probability that a pixel is sampled")
         figures.append(Figure(picture, "Pixel probability", f"mean {formatting.number(_finite_mean(density))}", bar))
     return figures
 
 
-def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: PictureEncoder = INLINE) -> Panel:
+def view_of_methods(view: int, shown: Mapping[str, ViewPictures]) -> Panel:
     """Return the panel of a view of several methods.
 
     It compares the result of each method with the reference and shows its error. All methods share one exposure and one error scale.
@@ -128,12 +124,12 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures], encoder: Pictu
     stacks = tuple(
         (
             Slider(
-                encoder.colour(reference, factor, f"View {view}: the reference"),
-                encoder.colour(of.result, factor, f"View {view}: the result of {label}"),
+                INLINE.colour(reference, factor, f"View {view}: the reference"),
+                INLINE.colour(of.result, factor, f"View {view}: the result of {label}"),
                 "Reference",
                 label,
             ),
-            _error(encoder, errors[label], high, f"Error of {label}", f"View {view}: error of {label}"),
+            _error(INLINE, errors[label], high, f"Error of {label}", f"View {view}: error of {label}"),
         )
         for label, of in shown.items()
     )
@@ -191,9 +187,7 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
     return Panel(key, note, tuple(stacks), len(planes) == 1, len(planes) > 1)
 
 
-def map_of_methods(
-    key: str, results: Mapping[str, np.ndarray], truth: np.ndarray, encoder: PictureEncoder = INLINE
-) -> Panel:
+def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarray) -> Panel:
     """Return the panel of a map of several methods.
 
     It compares the result of each method with the truth and shows its error, on one scale. It shows the middle slice of a volume.
@@ -211,9 +205,9 @@ def map_of_methods(
     for name, plane in planes.items():
         if plane is None:
             continue
-        column: list[Slider | Figure] = [_compare_map(encoder, scale, key, label, plane, None, true_plane, name)]
+        column: list[Slider | Figure] = [_compare_map(INLINE, scale, key, label, plane, None, true_plane, name)]
         if name in errors:
-            column.append(_error(encoder, errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
+            column.append(_error(INLINE, errors[name], high, f"Error of {name}", f"{key} {label}: error of {name}"))
         stacks.append(tuple(column))
     return Panel(key, _map_note(truth, scale), tuple(stacks), False)
 
@@ -235,21 +229,19 @@ class ColourScale:
     def colours(self, plane: np.ndarray) -> np.ndarray:
         """Map (H, W, C) values to (H, W, 3) display colours in [0, 1]."""
         if plane.shape[-1] == 1:
-            return tone_mapping.apply_colormap(plane[..., 0], self.low, self.high, tone_mapping.VALUE_COLORMAP)
+            return tone_mapping.apply_colormap(plane[..., 0], self.low, self.high)
         return tone_mapping.srgb(plane[..., :3] * self.factor)
 
     def picture(self, encoder: PictureEncoder, plane: np.ndarray, alt: str) -> Picture:
         """Encode (H, W, C) values as a picture of the page, in the same colours as `colours`."""
         if plane.shape[-1] == 1:
-            return encoder.false_colour(plane[..., 0], self.low, self.high, tone_mapping.VALUE_COLORMAP, alt)
+            return encoder.false_colour(plane[..., 0], self.low, self.high, alt)
         return encoder.colour(plane[..., :3], self.factor, alt)
 
     @property
     def bar(self) -> ColourBar | None:
         """The legend; None for several channels."""
-        return (
-            tone_mapping.colour_bar(self.low, self.high, tone_mapping.VALUE_COLORMAP, "Value") if self.scalar else None
-        )
+        return tone_mapping.colour_bar(self.low, self.high, "Value") if self.scalar else None
 
 
 def _compare_map(
@@ -280,20 +272,18 @@ def _sensitivity(encoder: PictureEncoder, sensitivity: np.ndarray, greatest: flo
     """Return the figure of the sensitivity of the images to each texel, in powers of ten below the greatest."""
     with np.errstate(divide="ignore", invalid="ignore"):
         tens = np.nan_to_num(np.log10(around(sensitivity) / greatest), nan=_TENS, neginf=_TENS)
-    bar = tone_mapping.colour_bar(
-        _TENS, 0.0, tone_mapping.VALUE_COLORMAP, "Change of the images, log₁₀ of the greatest"
-    )
+    bar = tone_mapping.colour_bar(_TENS, 0.0, "Change of the images, log₁₀ of the greatest")
     note = f"{insensitive(sensitivity).mean():.0%} of the texels hardly change the images"
-    return Figure(encoder.false_colour(tens, _TENS, 0.0, tone_mapping.VALUE_COLORMAP, alt), "Sensitivity", note, bar)
+    return Figure(encoder.false_colour(tens, _TENS, 0.0, alt), "Sensitivity", note, bar)
 
 
 def _uncertainty(encoder: PictureEncoder, deviation: np.ndarray, share: np.ndarray, alt: str) -> list[Slider | Figure]:
     """Return the figures of the standard error of each texel, and of the weight of the references in its value."""
     decided = np.mean(share, axis=-1)
     high = tone_mapping.colour_limit(np.mean(deviation, axis=-1))
-    bar = tone_mapping.colour_bar(0.0, 1.0, tone_mapping.VALUE_COLORMAP, "Weight of the references")
+    bar = tone_mapping.colour_bar(0.0, 1.0, "Weight of the references")
     note = f"{np.mean(decided >= 0.5):.0%} decided by the references; the rest by the start, smoothing or a prior"
-    picture = encoder.false_colour(decided, 0.0, 1.0, tone_mapping.VALUE_COLORMAP, f"{alt}: weight of the references")
+    picture = encoder.false_colour(decided, 0.0, 1.0, f"{alt}: weight of the references")
     return [
         _error(encoder, np.mean(deviation, axis=-1), high, "Standard error", f"{alt}: standard error"),
         Figure(picture, "Decided by the references", note, bar),

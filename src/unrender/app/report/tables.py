@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unrender.app.report import curves, image_metrics, tone_mapping
+from unrender.app.report import curves, tone_mapping
 from unrender.app.report.curves import Series
 from unrender.display import formatting, plots
 from unrender.display.plots import Chart, Line
@@ -219,7 +219,7 @@ def _swatch(array: np.ndarray) -> str:
 
 def view_rows(run: RunFolder) -> list[ViewRow]:
     """Return the lines of all views."""
-    measured = image_metrics.measure_views(run)
+    measured = curves.measure_views(run)
     return [
         ViewRow(
             view,

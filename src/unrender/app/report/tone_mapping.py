@@ -99,9 +99,9 @@ class PictureEncoder:
         """Encode (H, W, 3) linear RGB, multiplied by the exposure `factor`, in sRGB."""
         return self._picture(PictureData(linear, factor), alt)
 
-    def false_colour(self, values: np.ndarray, low: float, high: float, name: str, alt: str) -> Picture:
-        """Encode (H, W) values from `low` to `high` by the colour map `name`."""
-        return self._picture(PictureData(values, 1.0, low, high, name), alt)
+    def false_colour(self, values: np.ndarray, low: float, high: float, alt: str) -> Picture:
+        """Encode (H, W) values from `low` to `high` by the colour map of values."""
+        return self._picture(PictureData(values, 1.0, low, high, VALUE_COLORMAP), alt)
 
     def error(self, error: np.ndarray, high: float, alt: str) -> Picture:
         """Encode (H, W) errors from 0 to `high`.
@@ -136,7 +136,7 @@ class ColourBar:
     label: str
 
 
-def apply_colormap(values: np.ndarray, low: float, high: float, name: str) -> np.ndarray:
+def apply_colormap(values: np.ndarray, low: float, high: float, name: str = VALUE_COLORMAP) -> np.ndarray:
     """Map values from `low` to `high` to colours of the colour map `name`: (H, W) -> (H, W, 3) in [0, 1]."""
     import matplotlib
 
@@ -147,11 +147,11 @@ def apply_colormap(values: np.ndarray, low: float, high: float, name: str) -> np
 
 def error_bar(high: float) -> ColourBar:
     """Return the legend of `PictureEncoder.error`."""
-    return replace(colour_bar(0.0, high, ERROR_COLORMAP, "Mean |difference| over channels"), middle=high / 4)
+    return replace(colour_bar(0.0, high, "Mean |difference| over channels", ERROR_COLORMAP), middle=high / 4)
 
 
-def colour_bar(low: float, high: float, name: str, label: str) -> ColourBar:
-    """Return the legend of `PictureEncoder.false_colour` with the same arguments."""
+def colour_bar(low: float, high: float, label: str, name: str = VALUE_COLORMAP) -> ColourBar:
+    """Return the legend of a picture in a colour map from `low` to `high`."""
     import matplotlib
 
     stops = (matplotlib.colormaps[name](np.linspace(0.0, 1.0, 9))[:, :3] * 255 + 0.5).astype(int)

@@ -23,7 +23,7 @@ import numpy as np
 from unrender.backend import plugins, variant
 from unrender.core.errors import InputError
 from unrender.core.text import one_line, shorten
-from unrender.io import scene_assets, scene_files
+from unrender.io import scene_files
 from unrender.rendering.mitsuba.film_response import is_spectral
 
 _DEEPEST = 128
@@ -50,7 +50,7 @@ class Parsed:
     config: Any
     state: Any
     _unread: Sequence[Sequence[str]]
-    _checks: scene_assets.AssetChecks = field(default_factory=scene_assets.AssetChecks)
+    _checks: scene_files.AssetChecks = field(default_factory=scene_files.AssetChecks)
 
     def instantiate(self) -> Any:
         """Return the object that the description defines. This consumes `state`.
@@ -218,7 +218,7 @@ class _Dictionary:
         path = scene_files.resolve(str(name), [*self.search, *self.others])
         if path is None:
             raise InputError(f"spectrum {shorten(str(name), 200)}: no such file")
-        scene_assets.check_spectrum(path)
+        scene_files.check_spectrum(path)
         return path.absolute()
 
 
