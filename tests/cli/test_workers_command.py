@@ -69,7 +69,7 @@ def test_an_interrupted_comparison_tells_what_was_done(monkeypatch: pytest.Monke
 
     monkeypatch.setattr("unrender.app.distributed.cluster.OnWorkers", Executor)
     runs = [RunTask(f"plain-seed{n}", "plain", {}, None, 1.0, n, None) for n in range(4)]
-    comparison: Any = SimpleNamespace(job=Job("quad", {}, True, "", str(tmp_path)), runs=runs, cluster=object())
-    outcomes = compare._on_workers(Console(quiet=True), comparison)
+    job, cluster = Job("quad", {}, True, "", str(tmp_path)), SimpleNamespace()
+    outcomes = compare._on_workers(Console(quiet=True), job, runs, cluster)  # pyright: ignore[reportArgumentType]
     assert [(of.folder, of.status) for of in outcomes] == [("plain-seed0", "finished"), ("plain-seed1", "interrupted")]
     assert (tmp_path / "plain-seed1" / "run.json").exists()

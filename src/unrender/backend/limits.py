@@ -22,7 +22,7 @@ def cores() -> int:
 
 def free_memory() -> int:
     """Return the available memory of this machine or container in bytes; 0 if unknown."""
-    candidates = list(_memory_left())
+    candidates = [max(limit - used, 1) for limit, used in _group_memory()]
     try:
         lines = _MEMORY.read_text().splitlines()
         candidates += [int(line.split()[1]) << 10 for line in lines if line.startswith("MemAvailable")]
@@ -64,11 +64,6 @@ def _processor_shares() -> Iterator[float]:
         numbers = [int(word) for word in words if word.isdigit()]
         if len(numbers) == 2 and min(numbers) > 0:
             yield numbers[0] / numbers[1]
-
-
-def _memory_left() -> Iterator[int]:
-    """Yield the available bytes of each control group that has a limit."""
-    return (max(limit - used, 1) for limit, used in _group_memory())
 
 
 def _group_memory() -> Iterator[tuple[int, int]]:

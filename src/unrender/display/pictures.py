@@ -36,18 +36,22 @@ def data_uri(colours: Any) -> str:
     return f"data:image/png;base64,{base64.b64encode(png(colours)).decode('ascii')}"
 
 
-def shown_image(linear: np.ndarray, like: np.ndarray | None = None, largest: int = 320) -> np.ndarray:
-    """Convert linear RGB (H, W, 3) to sRGB in [0, 1] at the exposure of `like` (default: itself), with sides of at most `largest`."""
+_LARGEST = 320
+"""Limit of the sides of a picture in a notebook."""
+
+
+def shown_image(linear: np.ndarray, like: np.ndarray | None = None) -> np.ndarray:
+    """Convert linear RGB (H, W, 3) to sRGB in [0, 1] at the exposure of `like` (default: itself), with sides of at most 320."""
     factor = exposure(np.asarray(linear if like is None else like)[..., :3])
     with np.errstate(over="ignore", invalid="ignore"):
-        return srgb(reduced(np.asarray(linear)[..., :3], largest) * factor)
+        return srgb(reduced(np.asarray(linear)[..., :3], _LARGEST) * factor)
 
 
-def shown_map(values: np.ndarray, like: np.ndarray | None = None, largest: int = 320) -> np.ndarray | None:
+def shown_map(values: np.ndarray, like: np.ndarray | None = None) -> np.ndarray | None:
     """Convert a texture, or the middle slice of a volume, to colours (H, W, 3) in [0, 1]; None for what `is_map` excludes.
 
     One channel is grey over the range of `like` (default: its own). Three or four channels are sRGB of the first three, divided by the
-    maximum of `like` if that exceeds 1. Sides are at most `largest`.
+    maximum of `like` if that exceeds 1. Sides are at most 320.
     """
     picture = plane(np.asarray(values))
     if picture is None:
@@ -55,7 +59,7 @@ def shown_map(values: np.ndarray, like: np.ndarray | None = None, largest: int =
     scale = np.asarray(values if like is None else like)
     finite = scale[np.isfinite(scale)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    small = reduced(picture, largest)
+    small = reduced(picture, _LARGEST)
     with np.errstate(over="ignore", invalid="ignore"):
         if picture.shape[-1] == 1:
             span = high - low if high > low else 1.0

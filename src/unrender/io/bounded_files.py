@@ -338,15 +338,12 @@ class _BoundedReads:
         return data
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Set the position, as a file does."""
         return self.file.seek(offset, whence)
 
     def tell(self) -> int:
-        """Return the position, as a file does."""
         return self.file.tell()
 
     def seekable(self) -> bool:
-        """Return True."""
         return True
 
 

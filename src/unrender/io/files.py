@@ -109,9 +109,9 @@ def write_arrays(
     return write(path, buffer.getvalue(), durable, name_too)
 
 
-def temporary(path: Path, end: str = PARTIAL) -> Path:
-    """Return the temporary name next to `path` under which this process writes or removes it; `end` is `PARTIAL` or `RETIRED`."""
-    return path.with_name(f"{path.name}.{os.getpid()}.{end}")
+def temporary(path: Path) -> Path:
+    """Return the temporary name next to `path` under which this process writes it."""
+    return path.with_name(f"{path.name}.{os.getpid()}.{PARTIAL}")
 
 
 def flush(descriptor: int) -> None:
@@ -263,7 +263,9 @@ def remove_leftovers(folder: Path, names: Collection[str] | None = None) -> None
     with contextlib.suppress(OSError):
         for path in sorted(folder.iterdir()):
             match = _TEMPORARY.fullmatch(path.name)
-            if match is None or (names is not None and match[1] not in names) or _is_alive_elsewhere(int(match[2])):
+            if match is None or (names is not None and match[1] not in names):
+                continue
+            if int(match[2]) not in (0, os.getpid()) and is_alive(int(match[2])):
                 continue
             place = path.with_name(match[1])
             if match[3] == PARTIAL:
@@ -285,9 +287,8 @@ def remove(path: Path) -> None:
             path.unlink()
 
 
-def _is_alive_elsewhere(pid: int) -> bool:
-    if pid in (0, os.getpid()):
-        return False
+def is_alive(pid: int) -> bool:
+    """Return whether a process of this machine exists; True if the system does not tell."""
     try:
         os.kill(pid, 0)  # signal 0 only checks for existence
     except (ProcessLookupError, OverflowError):

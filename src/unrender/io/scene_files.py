@@ -283,7 +283,6 @@ class _File:
     _nested: int = 0
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        """Handle the start of an element."""
         self._nested += 1
         if self._nested > _DEEPEST:
             raise InputError(f"scene {self.shown}: nested more than {_DEEPEST} deep")
@@ -301,11 +300,9 @@ class _File:
             self._spectrum(values["filename"])
 
     def end(self, _: str) -> None:
-        """Handle the end of an element."""
         self._nested -= 1
 
     def declared(self, *_: Any) -> None:
-        """Refuse a document type."""
         raise InputError(f"scene {self.shown}: it declares a document type or entities, which no scene needs")
 
     def _include(self, name: str) -> None:

@@ -26,7 +26,6 @@ from unrender.own_loop.values import Exchange, LoopParameters, with_drjit, with_
 from unrender.pixels.all import All
 from unrender.pixels.base import PixelSampler
 from unrender.scene.bounds import off_ends
-from unrender.scene.problem import Problem
 from unrender.scene.render import render as render_view
 from unrender.scene.validation import longest_path
 
@@ -354,11 +353,9 @@ class Renderer:
     def _stream(self, name: str) -> Stream:
         if name not in self._streams:
             sensors = self._options.sensors if name == _MINI_BATCHES else (_sensor(name),)
-            self._streams[name] = Stream(self._problem(sensors), self._options)
+            problem = problem_of(self._port, self._options, sensors, self._scene)
+            self._streams[name] = Stream(problem, self._options)
         return self._streams[name]
-
-    def _problem(self, sensors: tuple[int, ...]) -> Problem:
-        return problem_of(self._port, self._options, sensors, self._scene)
 
     def __repr__(self) -> str:
         shown: Mapping[str, Any] = self._options.describe()

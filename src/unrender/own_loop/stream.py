@@ -38,21 +38,6 @@ class CoupledState:
     elements: dict[str, meta.State] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class CoupledGradient:
-    """Result of a coupled step.
-
-    Attributes:
-        gradient: {key: array}.
-        variance: variance of `gradient` per element, by the recurrence.
-        state: next state.
-    """
-
-    gradient: Tree
-    variance: Tree
-    state: CoupledState
-
-
 def coupled_gradient(
     session: RenderSession,
     space: Space,
@@ -60,13 +45,13 @@ def coupled_gradient(
     request: SampleRequest,
     derivative: Array,
     state: CoupledState,
-) -> CoupledGradient:
-    """Return M_n = F_n + w (M_{n−1} − H_n), with F_n = J(θ_n)ᵀ g_n and H_n = J(θ_{n−1})ᵀ g_{n−1} from the same paths.
+) -> tuple[Tree, Tree, CoupledState]:
+    """Return the gradient M_n, its variance per element by the recurrence, and the next state.
 
-    The loss is external, so its derivatives g_n are inputs, and H_n uses the one of the last step. For fixed derivatives, the recursion
-    reduces the noise of the paths of J; the noise of g_n depends on the image estimator. It is the recursion of
-    `MetaEstimator(coupled=True)`, per element, with w from the covariance of F and H. Differences are not divided by the step length (Eq.
-    13), because g_n − g_{n−1} need not vanish with it.
+    M_n = F_n + w (M_{n−1} − H_n), with F_n = J(θ_n)ᵀ g_n and H_n = J(θ_{n−1})ᵀ g_{n−1} from the same paths. The loss is external, so its
+    derivatives g_n are inputs, and H_n uses the one of the last step. For fixed derivatives, the recursion reduces the noise of the paths
+    of J; the noise of g_n depends on the image estimator. It is the recursion of `MetaEstimator(coupled=True)`, per element, with w from
+    the covariance of F and H. Differences are not divided by the step length (Eq. 13), because g_n − g_{n−1} need not vanish with it.
 
     Bias: the weight w depends on the samples that it weights. This shrinks the gradient toward zero, most in the first steps.
 
@@ -86,7 +71,7 @@ def coupled_gradient(
     estimates = {key: meta.update_coupled(elements[key], F[key], H[key], 1.0, decouple=False) for key in parameters}
     gradient, variance, _, next_elements = ({key: parts[n] for key, parts in estimates.items()} for n in range(4))
     arrays.evaluate(gradient, variance, next_elements)
-    return CoupledGradient(gradient, variance, CoupledState(parameters, derivative, next_elements))
+    return gradient, variance, CoupledState(parameters, derivative, next_elements)
 
 
 @dataclass(frozen=True)
@@ -234,9 +219,11 @@ class Stream:
             return session.adjoint(parameters, session.image(parameters, request).paths, weights)
         space = self._space()
         session = self.problem.renderer.prepare(keys, space)
-        coupled = coupled_gradient(session, space, parameters, request, weights, self.state.coupled)
-        self.variance, self.state = coupled.variance, replace(self.state, coupled=coupled.state)
-        return coupled.gradient
+        gradient, self.variance, coupled = coupled_gradient(
+            session, space, parameters, request, weights, self.state.coupled
+        )
+        self.state = replace(self.state, coupled=coupled)
+        return gradient
 
     def _space(self) -> Space:
         if self._options.image.space is not None:

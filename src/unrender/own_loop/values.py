@@ -24,7 +24,6 @@ class _Render(dr.CustomOp):
     """Operation from parameters, tensors attached to the graph, to images that are already rendered."""
 
     def eval(self, backward: Callable[[tuple[Any, ...]], Tree], images: tuple[Any, ...], values: Tree) -> Any:
-        """Return the images, see `dr.CustomOp`."""
         del values
         self._backward = backward
         self._shapes = [tuple(image.shape) for image in images]
@@ -48,7 +47,6 @@ class _Render(dr.CustomOp):
         raise RuntimeError("Renderer: forward-mode derivatives are not supported; use dr.backward")
 
     def name(self) -> str:
-        """Return the name of the operation in graphs."""
         return "unrender.Renderer"
 
 

@@ -119,7 +119,6 @@ class _Watch:
         self._before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
 
     def close(self) -> None:
-        """End the thread."""
         signal.set_wakeup_fd(self._before)
         os.close(self._write)
 

@@ -175,7 +175,6 @@ class _State:
     advised: bool = False
 
     def save(self, folder: Path, status: str = "running") -> None:
-        """Write the current sweep.json."""
         best = self.trials.best
         ended = [trial for _, trial in sorted(self.trials.ended.items())]
         changes = {
@@ -357,7 +356,6 @@ def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
 
 
 def _page(console: Console, folder: Path, state: _State) -> None:
-    """Write a page that compares the best trials."""
     if best_folders(folder, state.record):
         page = report.write_page(folder, state.record)
         console.say(f"page: {page}")

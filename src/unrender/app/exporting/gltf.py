@@ -21,7 +21,7 @@ from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.display.pictures import png
 
 if TYPE_CHECKING:
-    import pygltflib
+    pass
 
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
@@ -46,7 +46,7 @@ def glb(asset: Asset) -> bytes:
     check_installed()
     import pygltflib
 
-    writer = _Writer(pygltflib.GLTF2(asset=pygltflib.Asset(version="2.0", generator="unrender")))
+    writer = _Writer(pygltflib)
     for part in asset.parts:
         writer.add(part)
     return writer.finish()
@@ -55,86 +55,73 @@ def glb(asset: Asset) -> bytes:
 class _Writer:
     """A writer that collects the arrays and images of the binary chunk and refers to them from the glTF document."""
 
-    def __init__(self, gltf: pygltflib.GLTF2):
-        self._gltf: Any = gltf
+    def __init__(self, kit: Any):
+        self._kit = kit  # pygltflib, which may be missing
+        self._gltf: Any = kit.GLTF2(asset=kit.Asset(version="2.0", generator="unrender"))
         self._blob = bytearray()
 
     def add(self, part: Part) -> None:
-        """Add a node with its mesh and its material."""
-        import pygltflib as kit
-
-        attributes = kit.Attributes(POSITION=self._array(part.vertices, _FLOAT, _VERTICES, bounds=True))
+        attributes = self._kit.Attributes(POSITION=self._array(part.vertices, _FLOAT, _VERTICES, bounds=True))
         if part.normals is not None:
             attributes.NORMAL = self._array(part.normals, _FLOAT, _VERTICES)
         if part.uv is not None:
             attributes.TEXCOORD_0 = self._array(part.uv, _FLOAT, _VERTICES)
         indices = self._array(part.faces.reshape(-1, 1), _UNSIGNED, _INDICES)
-        primitive = kit.Primitive(attributes=attributes, indices=indices, material=self._material(part))
-        self._gltf.meshes.append(kit.Mesh(name=part.name, primitives=[primitive]))
-        self._gltf.nodes.append(kit.Node(name=part.name, mesh=len(self._gltf.meshes) - 1))
+        primitive = self._kit.Primitive(attributes=attributes, indices=indices, material=self._material(part))
+        self._gltf.meshes.append(self._kit.Mesh(name=part.name, primitives=[primitive]))
+        self._gltf.nodes.append(self._kit.Node(name=part.name, mesh=len(self._gltf.meshes) - 1))
 
     def finish(self) -> bytes:
-        """Return the content of the file."""
-        import pygltflib as kit
-
-        self._gltf.scenes = [kit.Scene(nodes=list(range(len(self._gltf.nodes))))]
+        self._gltf.scenes = [self._kit.Scene(nodes=list(range(len(self._gltf.nodes))))]
         self._gltf.scene = 0
-        self._gltf.buffers = [kit.Buffer(byteLength=len(self._blob))]
+        self._gltf.buffers = [self._kit.Buffer(byteLength=len(self._blob))]
         self._gltf.set_binary_blob(bytes(self._blob))
         return b"".join(self._gltf.save_to_bytes())
 
     def _view(self, data: bytes, target: int | None = None) -> int:
-        import pygltflib as kit
-
         self._blob += b"\0" * (-len(self._blob) % 4)
-        view = kit.BufferView(buffer=0, byteOffset=len(self._blob), byteLength=len(data), target=target)
+        view = self._kit.BufferView(buffer=0, byteOffset=len(self._blob), byteLength=len(data), target=target)
         self._blob += data
         self._gltf.bufferViews.append(view)
         return len(self._gltf.bufferViews) - 1
 
     def _array(self, values: np.ndarray, component: int, target: int, bounds: bool = False) -> int:
-        import pygltflib as kit
-
         stored = np.ascontiguousarray(values, "<f4" if component == _FLOAT else "<u4")
         view = self._view(stored.tobytes(), target)
         kind = _KINDS[stored.shape[1]]
-        accessor = kit.Accessor(bufferView=view, componentType=component, count=len(stored), type=kind)
+        accessor = self._kit.Accessor(bufferView=view, componentType=component, count=len(stored), type=kind)
         if bounds:
             accessor.min, accessor.max = stored.min(0).tolist(), stored.max(0).tolist()
         self._gltf.accessors.append(accessor)
         return len(self._gltf.accessors) - 1
 
     def _texture(self, pixels: np.ndarray, part: Part, name: str) -> int:
-        import pygltflib as kit
-
         view = self._view(png(pixels))
-        self._gltf.images.append(kit.Image(bufferView=view, mimeType="image/png", name=f"{part.name} {name}"))
+        self._gltf.images.append(self._kit.Image(bufferView=view, mimeType="image/png", name=f"{part.name} {name}"))
         inside = part.uv is not None and part.uv.min() >= 0 and part.uv.max() <= 1
         wrap = _CLAMP if inside else _REPEAT
-        self._gltf.samplers.append(kit.Sampler(magFilter=_LINEAR, minFilter=_MIPMAPS, wrapS=wrap, wrapT=wrap))
+        self._gltf.samplers.append(self._kit.Sampler(magFilter=_LINEAR, minFilter=_MIPMAPS, wrapS=wrap, wrapT=wrap))
         count = len(self._gltf.samplers) - 1
-        self._gltf.textures.append(kit.Texture(sampler=count, source=len(self._gltf.images) - 1))
+        self._gltf.textures.append(self._kit.Texture(sampler=count, source=len(self._gltf.images) - 1))
         return len(self._gltf.textures) - 1
 
     def _material(self, part: Part) -> int:
-        import pygltflib as kit
-
         source = part.material
-        model = kit.PbrMetallicRoughness(baseColorFactor=[1.0] * 4, roughnessFactor=1.0, metallicFactor=1.0)
+        model = self._kit.PbrMetallicRoughness(baseColorFactor=[1.0] * 4, roughnessFactor=1.0, metallicFactor=1.0)
         if source.base_colour.ndim == 3:
             index = self._texture(textures.base_colour(part), part, "base colour")
-            model.baseColorTexture = kit.TextureInfo(index=index)
+            model.baseColorTexture = self._kit.TextureInfo(index=index)
         else:
             model.baseColorFactor = [*map(float, source.base_colour), 1.0]
         if source.roughness.ndim or source.metallic.ndim:
             index = self._texture(textures.metallic_roughness(part), part, "metallic roughness")
-            model.metallicRoughnessTexture = kit.TextureInfo(index=index)
+            model.metallicRoughnessTexture = self._kit.TextureInfo(index=index)
         else:
             model.roughnessFactor, model.metallicFactor = float(source.roughness), float(source.metallic)
-        material = kit.Material(name=part.name, pbrMetallicRoughness=model, doubleSided=source.two_sided)
+        material = self._kit.Material(name=part.name, pbrMetallicRoughness=model, doubleSided=source.two_sided)
         material.alphaCutoff = None  # pygltflib would write it although alphaMode is OPAQUE
         if (normals := textures.normal_map(part)) is not None:
-            material.normalTexture = kit.NormalMaterialTexture(index=self._texture(normals, part, "normal map"))
+            material.normalTexture = self._kit.NormalMaterialTexture(index=self._texture(normals, part, "normal map"))
         self._extend(material, source.ior)
         self._gltf.materials.append(material)
         return len(self._gltf.materials) - 1

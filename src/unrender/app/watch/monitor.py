@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unrender.core.errors import InputError
-from unrender.io import bounded_files
+from unrender.io import bounded_files, files
 from unrender.runs.folder import schema
 from unrender.runs.folder.history import History, HistoryReader
 from unrender.runs.folder.reader import RunFolder, ViewPictures, pictures_by_view, read, read_record
@@ -189,12 +189,4 @@ def _views(start: dict[str, np.ndarray], now: dict[str, np.ndarray], where: Path
 
 def _alive(status: LiveStatus) -> bool:
     """Return whether the process of the run is alive; True if this machine cannot tell."""
-    if status.process is None or status.host != platform.node():
-        return True
-    try:
-        os.kill(status.process, 0)  # signal 0 only tests for existence
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+    return status.process is None or status.host != platform.node() or files.is_alive(status.process)

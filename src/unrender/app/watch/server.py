@@ -213,7 +213,6 @@ class _Page:
         self._rendered: dict[tuple[str, int, int], _RenderedPage] = {}
 
     def full(self, request: Request) -> Response:
-        """Respond with the page."""
         return Response(self._render("watch.html", request)[0], media_type="text/html")
 
     def update(self, request: Request) -> Response:

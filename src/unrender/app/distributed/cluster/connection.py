@@ -269,7 +269,6 @@ def connect(
 
 
 def _init(ray: Any, address: str | None, init_options: dict[str, Any]) -> None:
-    """Start or join the cluster. Raises `InputError`."""
     where = "cannot start on this machine" if address is None else f"cannot be reached at {address}"
     quiet = {"logging_level": logging.ERROR, "log_to_driver": False, "configure_logging": True}
     with _own_signals():
