@@ -11,18 +11,9 @@ from xml.etree import ElementTree as Xml
 
 import numpy as np
 
+from unrender.app.capture import writing
 from unrender.app.capture.capture import INSIDE, CapturedView, StoredViews
 from unrender.app.capture.problem_folder import sensor_element
-from unrender.app.capture.writing import (
-    MASKS,
-    PROBLEM,
-    REFERENCES,
-    SCENE,
-    add_value,
-    encoded,
-    write_mask,
-    write_problems,
-)
 from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
@@ -36,7 +27,7 @@ NAMES = ("field", "light", "exposure")
 """Possible unknowns of such a problem; the field is always one."""
 GRIDS, EXTINCTION, LIGHT = "grids", "grids/extinction.vol", "grids/light.exr"
 _HARMONICS = ["emission", *(f"{COEFFICIENT}{k}" for k in range(1, 9))]
-OWN = frozenset({PROBLEM, HELD_OUT, SCENE, REFERENCES, MASKS, GRIDS, stages_file.FILE})
+OWN = frozenset({writing.PROBLEM, HELD_OUT, writing.SCENE, writing.REFERENCES, writing.MASKS, GRIDS, stages_file.FILE})
 """Names that `write` creates in a folder."""
 _FIELD = "field"
 """Id of the medium in the scene."""
@@ -104,17 +95,17 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
     bare = views.bare()
     middle, half = cube_of(np.array([view.camera_to_world for view in bare]))
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(bare)]
-    for part in (REFERENCES, MASKS, GRIDS):
+    for part in (writing.REFERENCES, writing.MASKS, GRIDS):
         (folder / part).mkdir()
     means, masked = [], []
     for view, stem in zip(views, stems, strict=True):
         shown = view.shown > INSIDE
         if not view.held_out:
             means.append(float(view.values[shown].mean()))
-        images.write(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
+        images.write(view.values, folder / writing.REFERENCES / f"{stem}.exr", half=True)
         masked.append(not shown.all())
         if masked[-1]:
-            write_mask(shown, folder / MASKS / f"{stem}.png")
+            writing.write_mask(shown, folder / writing.MASKS / f"{stem}.png")
     level = max(float(np.mean(means)), 1e-4)
     size = (voxels,) * 3
     volumes.write_grid(folder / EXTINCTION, np.full((*size, 1), _DEPTH / (2 * half), np.float32))
@@ -123,7 +114,7 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
         values = np.zeros((*coarse, 3), np.float32) if number else np.full((*size, 3), level, np.float32)
         volumes.write_grid(folder / GRIDS / f"{file}.vol", values)
     images.write(np.full((*_LIGHT_SIZE, 3), level, np.float32), folder / LIGHT)
-    (folder / SCENE).write_bytes(_scene(bare, stems, middle, half))
+    (folder / writing.SCENE).write_bytes(_scene(bare, stems, middle, half))
     rates = {one: rate if one == "extinction" else rate * level for one, rate in _RATES.items()}
     bounds: dict[str, Any] = {"extinction": _LOGARITHM, "light": {"bounds": [0.0, math.inf]}}
     moved = ["extinction", *_HARMONICS, *(one for one in ("light", "exposure") if one in chosen)]
@@ -133,9 +124,9 @@ def write(folder: Path, name: str, views: StoredViews, voxels: int, chosen: Sequ
     ]
     listed = []
     for index, (view, stem) in enumerate(zip(bare, stems, strict=True)):
-        mask = {"mask": f"{MASKS}/{stem}.png"} if masked[index] else {}
-        listed.append((view.held_out, {"reference": f"{REFERENCES}/{stem}.exr", "sensor": index} | mask))
-    write_problems(folder, name, listed, tables, "L2", 1)
+        mask = {"mask": f"{writing.MASKS}/{stem}.png"} if masked[index] else {}
+        listed.append((view.held_out, {"reference": f"{writing.REFERENCES}/{stem}.exr", "sensor": index} | mask))
+    writing.write_problems(folder, name, listed, tables, "L2", 1)
     note = "Each stage has twice the voxels a side. Run all: unrender run stages.toml. Written by `unrender import`."
     (folder / stages_file.FILE).write_text(stages_file.text(_stages(voxels, moved), note), encoding="utf-8")
 
@@ -152,7 +143,7 @@ def _stages(voxels: int, moved: Sequence[str]) -> Stages:
             break
         coarser *= 2
     result[1:] = [replace(stage, share=2.0**number) for number, stage in enumerate(result[1:])]
-    return Stages(Path(PROBLEM), tuple(result), _METHOD, dict(_SETTINGS), seconds=600.0)
+    return Stages(Path(writing.PROBLEM), tuple(result), _METHOD, dict(_SETTINGS), seconds=600.0)
 
 
 def _scene(views: Sequence[CapturedView], stems: Sequence[str], middle: np.ndarray, half: float) -> bytes:
@@ -160,8 +151,8 @@ def _scene(views: Sequence[CapturedView], stems: Sequence[str], middle: np.ndarr
     medium = Xml.SubElement(root, "medium", type="emissive", id=_FIELD)
     for name, file in (("sigma_t", EXTINCTION), *((one, f"{GRIDS}/{one}.vol") for one in _HARMONICS)):
         volume = Xml.SubElement(medium, "volume", type="gridvolume", name=name)
-        add_value(volume, "string", "filename", file)
-        add_value(volume, "boolean", "raw", "true")
+        writing.add_value(volume, "string", "filename", file)
+        writing.add_value(volume, "boolean", "raw", "true")
         _place(volume, middle - half, 2 * half)
     shape = Xml.SubElement(root, "shape", type="cube", id="cube")
     _place(shape, middle, half)
@@ -173,8 +164,8 @@ def _scene(views: Sequence[CapturedView], stems: Sequence[str], middle: np.ndarr
             Xml.SubElement(sensor, "ref", id=_FIELD)
         root.append(sensor)
     light = Xml.SubElement(root, "emitter", type="envmap", id="light")
-    add_value(light, "string", "filename", LIGHT)
-    return encoded(root)
+    writing.add_value(light, "string", "filename", LIGHT)
+    return writing.encoded(root)
 
 
 def _place(parent: Xml.Element, corner: np.ndarray, scale: float) -> None:

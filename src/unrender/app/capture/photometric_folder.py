@@ -21,23 +21,10 @@ from xml.etree import ElementTree as Xml
 import numpy as np
 from scipy import ndimage
 
-from unrender.app.capture import pictures
+from unrender.app.capture import pictures, writing
 from unrender.app.capture.cameras import Lens
 from unrender.app.capture.formats.lights import LitCapture
 from unrender.app.capture.views import Resampling, pinhole
-from unrender.app.capture.writing import (
-    MASKS,
-    PROBLEM,
-    REFERENCES,
-    SCENE,
-    TEXTURES,
-    add_film,
-    add_texture,
-    add_value,
-    encoded,
-    write_mask,
-    write_problems,
-)
 from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.core.errors import InputError
@@ -164,7 +151,7 @@ def least_squares(values: np.ndarray, directions: Sequence[np.ndarray] | np.ndar
 NAMES = ("colour", "normal", "exposure")
 """Possible unknowns of such a problem."""
 _COLOUR, _NORMAL = "base-colour.exr", "normal.exr"
-OWN = frozenset({PROBLEM, HELD_OUT, SCENE, REFERENCES, MASKS, TEXTURES})
+OWN = frozenset({writing.PROBLEM, HELD_OUT, writing.SCENE, writing.REFERENCES, writing.MASKS, writing.TEXTURES})
 """Names that `write` creates in a folder."""
 _KEYS = {
     "colour": "plate.bsdf.nested_bsdf.reflectance.data",
@@ -191,7 +178,7 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
         raise InputError(
             f"--unknowns {others[0]}: for one camera under known lights, expected some of {', '.join(NAMES)}"
         )
-    for part in (REFERENCES, MASKS, TEXTURES):
+    for part in (writing.REFERENCES, writing.MASKS, writing.TEXTURES):
         (folder / part).mkdir()
     inside: np.ndarray = np.asarray(ndimage.binary_erosion(views.mask > 0.999, np.ones((3, 3)), border_value=1))
     if not inside.any():
@@ -201,19 +188,23 @@ def write(folder: Path, name: str, views: LitViews, chosen: Sequence[str]) -> No
     _, colour = least_squares(training_values[:, inside], views.directions[chosen_views])
     strength = max(float(np.quantile(colour.max(1), 0.99)) / _BRIGHTEST, 1e-4)
     height, width = views.mask.shape
-    images.write(np.full((height, width, 3), np.median(colour) / strength, np.float32), folder / TEXTURES / _COLOUR)
     images.write(
-        np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), (height, width, 3)), folder / TEXTURES / _NORMAL
+        np.full((height, width, 3), np.median(colour) / strength, np.float32), folder / writing.TEXTURES / _COLOUR
     )
-    (folder / SCENE).write_bytes(_scene(views, strength))
-    write_mask(inside, folder / MASKS / "mask.png")
+    images.write(
+        np.broadcast_to(np.array([0.5, 0.5, 1.0], np.float32), (height, width, 3)), folder / writing.TEXTURES / _NORMAL
+    )
+    (folder / writing.SCENE).write_bytes(_scene(views, strength))
+    writing.write_mask(inside, folder / writing.MASKS / "mask.png")
     listed = []
     for index, (photograph, values) in enumerate(zip(views.names, views.values, strict=True)):
-        file = f"{REFERENCES}/{index:04d}-{file_name(Path(photograph).stem)}.exr"
+        file = f"{writing.REFERENCES}/{index:04d}-{file_name(Path(photograph).stem)}.exr"
         images.write(values, folder / file, half=True)
-        listed.append((views.held_out[index], {"reference": file, "sensor": index, "mask": f"{MASKS}/mask.png"}))
+        listed.append(
+            (views.held_out[index], {"reference": file, "sensor": index, "mask": f"{writing.MASKS}/mask.png"})
+        )
     unknowns = [{"key": _KEYS[one], **({} if one == "exposure" else {"bounds": [0.0, 1.0]})} for one in chosen]
-    write_problems(folder, name, listed, unknowns, "L1", 2)
+    writing.write_problems(folder, name, listed, unknowns, "L1", 2)
 
 
 def _scene(views: LitViews, strength: float) -> bytes:
@@ -225,26 +216,26 @@ def _scene(views: LitViews, strength: float) -> bytes:
             root, "sensor", type="perspective", id=f"light-{index:04d}-{file_name(Path(photograph).stem)}"
         )
         for name in ("shutter_open", "shutter_close"):
-            add_value(sensor, "float", name, float(index))
-        add_value(sensor, "string", "fov_axis", "x")
-        add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(1 / _DISTANCE)))
+            writing.add_value(sensor, "float", name, float(index))
+        writing.add_value(sensor, "string", "fov_axis", "x")
+        writing.add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(1 / _DISTANCE)))
         transform = Xml.SubElement(sensor, "transform", name="to_world")
         Xml.SubElement(transform, "lookat", origin=f"0, 0, {_DISTANCE:g}", target="0, 0, 0", up="0, 1, 0")
-        add_film(sensor, width, height)
+        writing.add_film(sensor, width, height)
     plate = Xml.SubElement(root, "shape", type="rectangle", id="plate")
     transform = Xml.SubElement(plate, "transform", name="to_world")
     Xml.SubElement(transform, "scale", x="1", y=repr(height / width), z="1")
     normal = Xml.SubElement(plate, "bsdf", type="normalmap")
-    add_value(normal, "boolean", "use_shadowing_function", "false")
-    add_texture(normal, "normalmap", _NORMAL, raw=True, pixels=True)
-    add_texture(Xml.SubElement(normal, "bsdf", type="diffuse"), "reflectance", _COLOUR, raw=True, pixels=True)
+    writing.add_value(normal, "boolean", "use_shadowing_function", "false")
+    writing.add_texture(normal, "normalmap", _NORMAL, raw=True, pixels=True)
+    writing.add_texture(Xml.SubElement(normal, "bsdf", type="diffuse"), "reflectance", _COLOUR, raw=True, pixels=True)
     light = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
-    add_value(light, "string", "turns", turntable_light.text(np.array([_towards(d) for d in views.directions])))
-    add_value(light, "float", "distance", _FAR)
+    writing.add_value(light, "string", "turns", turntable_light.text(np.array([_towards(d) for d in views.directions])))
+    writing.add_value(light, "float", "distance", _FAR)
     lamp = Xml.SubElement(light, "emitter", type="directional", name="map")
     Xml.SubElement(lamp, "vector", name="direction", x="0", y="0", z="-1")
     Xml.SubElement(lamp, "rgb", name="irradiance", value=repr(np.pi * strength))
-    return encoded(root)
+    return writing.encoded(root)
 
 
 def _towards(direction: np.ndarray) -> np.ndarray:

@@ -9,24 +9,11 @@ from xml.etree import ElementTree as Xml
 
 import numpy as np
 
-from unrender.app.capture import unknowns
+from unrender.app.capture import unknowns, writing
 from unrender.app.capture.capture import INSIDE, CapturedView, CapturedViews
 from unrender.app.capture.mesh import Mesh, ply
 from unrender.app.capture.silhouettes import Silhouettes
 from unrender.app.capture.turntable import light_turns
-from unrender.app.capture.writing import (
-    MASKS,
-    PROBLEM,
-    REFERENCES,
-    SCENE,
-    TEXTURES,
-    add_film,
-    add_texture,
-    add_value,
-    encoded,
-    write_mask,
-    write_problems,
-)
 from unrender.app.evaluation.scenes import HELD_OUT
 from unrender.app.exporting.ready_made import file_name
 from unrender.app.stages import stages_file
@@ -38,8 +25,8 @@ from unrender.rendering.mitsuba import turntable_light
 
 MESH = "asset.ply"
 LIGHT = "textures/light.exr"
-_FOLDERS = (REFERENCES, MASKS, TEXTURES)
-OWN = frozenset({PROBLEM, HELD_OUT, SCENE, MESH, stages_file.FILE, *_FOLDERS})
+_FOLDERS = (writing.REFERENCES, writing.MASKS, writing.TEXTURES)
+OWN = frozenset({writing.PROBLEM, HELD_OUT, writing.SCENE, MESH, stages_file.FILE, *_FOLDERS})
 """Names that `write` creates in a folder."""
 _LIGHT_SIZE = 16, 32
 _MAX_DEPTH = 3
@@ -74,7 +61,7 @@ def write(
     """
     stems = [f"{index:04d}-{file_name(Path(view.name).stem)}" for index, view in enumerate(views)]
     (folder / MESH).write_bytes(ply(mesh))
-    (folder / SCENE).write_bytes(_scene(views, stems, mesh, chosen, turntable))
+    (folder / writing.SCENE).write_bytes(_scene(views, stems, mesh, chosen, turntable))
     for part in _FOLDERS:
         (folder / part).mkdir()
     level, clipped, brightest = [], False, 0.0
@@ -83,11 +70,11 @@ def write(
         level.append(float(view.values[mask].mean()))
         clipped |= bool((view.values[mask] >= _WHITE).any())
         brightest = max(brightest, float(view.values.max()))
-        images.write(view.values, folder / REFERENCES / f"{stem}.exr", half=True)
+        images.write(view.values, folder / writing.REFERENCES / f"{stem}.exr", half=True)
         weights = _banded(mask, 0 if view.held_out else band)
-        write_mask(weights, folder / MASKS / f"{stem}.png")
+        writing.write_mask(weights, folder / writing.MASKS / f"{stem}.png")
     for file, values in unknowns.textures(chosen, texture).values():
-        images.write(values, folder / TEXTURES / file)
+        images.write(values, folder / writing.TEXTURES / file)
     # Under uniform light, a surface shows its base colour times the light's radiance.
     radiance = max(float(np.median(level)) / unknowns.COLOUR, 1e-4)
     images.write(np.full((*_LIGHT_SIZE, 3), radiance, np.float32), folder / LIGHT)
@@ -96,12 +83,15 @@ def write(
     loss = {"type": "Censored", "loss": "L1", "white": _WHITE} if white else "L1"
     tables = unknowns.parameters(chosen, float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))), turntable)
     listed = [
-        (view.held_out, {"reference": f"{REFERENCES}/{stem}.exr", "sensor": i, "mask": f"{MASKS}/{stem}.png"})
+        (
+            view.held_out,
+            {"reference": f"{writing.REFERENCES}/{stem}.exr", "sensor": i, "mask": f"{writing.MASKS}/{stem}.png"},
+        )
         for i, (view, stem) in enumerate(zip(views, stems, strict=True))
     ]
-    write_problems(folder, name, listed, tables, loss, _MAX_DEPTH)
+    writing.write_problems(folder, name, listed, tables, loss, _MAX_DEPTH)
     note = "Each stage starts from the result of the previous stage. Run all: unrender run stages.toml"
-    stages = unknowns.stages(chosen, Path(PROBLEM), turntable)
+    stages = unknowns.stages(chosen, Path(writing.PROBLEM), turntable)
     text = stages_file.text(stages, f"{note}. Written by `unrender import`.")
     (folder / stages_file.FILE).write_text(text, encoding="utf-8")
 
@@ -150,13 +140,13 @@ def _scene(views: CapturedViews, stems: Sequence[str], mesh: Mesh, chosen: Seque
     for index, (view, stem) in enumerate(zip(views, stems, strict=True)):
         sensor = sensor_element(view, stem, *clip)
         for name in ("shutter_open", "shutter_close") if turntable else ():
-            add_value(sensor, "float", name, float(index))
+            writing.add_value(sensor, "float", name, float(index))
         root.append(sensor)
     shape = Xml.SubElement(root, "shape", type="ply", id="asset")
-    add_value(shape, "string", "filename", MESH)
+    writing.add_value(shape, "string", "filename", MESH)
     _material(shape, chosen)
     _light(root, views, radius, turntable)
-    return encoded(root)
+    return writing.encoded(root)
 
 
 def _light(root: Xml.Element, views: CapturedViews, radius: float, turntable: bool) -> None:
@@ -164,12 +154,12 @@ def _light(root: Xml.Element, views: CapturedViews, radius: float, turntable: bo
     if turntable:
         root = Xml.SubElement(root, "emitter", type=turntable_light.PLUGIN, id="light")
         turns = light_turns(np.array([view.camera_to_world for view in views]))
-        add_value(root, "string", "turns", turntable_light.text(turns))
-        add_value(root, "float", "distance", 1e4 * radius)
+        writing.add_value(root, "string", "turns", turntable_light.text(turns))
+        writing.add_value(root, "float", "distance", 1e4 * radius)
         light = Xml.SubElement(root, "emitter", type="envmap", name="map")
     else:
         light = Xml.SubElement(root, "emitter", type="envmap", id="light")
-    add_value(light, "string", "filename", LIGHT)
+    writing.add_value(light, "string", "filename", LIGHT)
 
 
 def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
@@ -177,27 +167,27 @@ def _material(shape: Xml.Element, chosen: Sequence[str]) -> None:
     textures = unknowns.textures(chosen, 1)
     if "normalmap" in textures:
         shape = Xml.SubElement(shape, "bsdf", type="normalmap")
-        add_texture(shape, "normalmap", textures.pop("normalmap")[0], raw=True)
+        writing.add_texture(shape, "normalmap", textures.pop("normalmap")[0], raw=True)
     bsdf = Xml.SubElement(shape, "bsdf", type="principled")
     for name, (file, values) in textures.items():
-        add_texture(bsdf, name, file, raw=values.shape[2] == 1)
+        writing.add_texture(bsdf, name, file, raw=values.shape[2] == 1)
     if "roughness" not in textures:
-        add_value(bsdf, "float", "roughness", unknowns.ROUGHNESS)
+        writing.add_value(bsdf, "float", "roughness", unknowns.ROUGHNESS)
 
 
 def sensor_element(view: CapturedView, stem: str, near: float, far: float) -> Xml.Element:
     """Return the sensor of a view as a scene element."""
     lens = view.lens
     sensor = Xml.Element("sensor", type="perspective", id=f"camera-{stem}")
-    add_value(sensor, "string", "fov_axis", "x")
-    add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(lens.width / (2 * lens.fx))))
+    writing.add_value(sensor, "string", "fov_axis", "x")
+    writing.add_value(sensor, "float", "fov", 2 * math.degrees(math.atan(lens.width / (2 * lens.fx))))
     # Mitsuba shifts the picture opposite to the principal point, in units of its sides.
-    add_value(sensor, "float", "principal_point_offset_x", 0.5 - lens.cx / lens.width)
-    add_value(sensor, "float", "principal_point_offset_y", 0.5 - lens.cy / lens.height)
-    add_value(sensor, "float", "near_clip", near)
-    add_value(sensor, "float", "far_clip", far)
+    writing.add_value(sensor, "float", "principal_point_offset_x", 0.5 - lens.cx / lens.width)
+    writing.add_value(sensor, "float", "principal_point_offset_y", 0.5 - lens.cy / lens.height)
+    writing.add_value(sensor, "float", "near_clip", near)
+    writing.add_value(sensor, "float", "far_clip", far)
     transform = Xml.SubElement(sensor, "transform", name="to_world")
     numbers = " ".join(repr(float(number)) for number in to_world(view.camera_to_world).ravel())
     Xml.SubElement(transform, "matrix", value=numbers)
-    add_film(sensor, lens.width, lens.height)
+    writing.add_film(sensor, lens.width, lens.height)
     return sensor

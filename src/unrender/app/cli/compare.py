@@ -13,17 +13,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.cli.arguments import (
-    MOST_SEEDS,
-    AllowOutside,
-    FinalSpp,
-    Insecure,
-    NoCache,
-    Overwrite,
-    ProblemSettings,
-    Variant,
-    WorkersOption,
-)
 from unrender.app.cli.run import exit_status
 from unrender.app.cli.signals import FAILED
 from unrender.core import phases
@@ -74,17 +63,17 @@ def compare(
     ] = None,
     seconds: _Seconds = None,
     steps: _Steps = None,
-    seeds: Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each method.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, max=arguments.MOST_SEEDS, help="Number of runs of each method.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="The first run's seed.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Output folder. Default: a new folder in out/.")] = None,
-    problem_settings: ProblemSettings = None,
-    workers: WorkersOption = None,
-    insecure: Insecure = False,
-    variant: Variant = "auto",
-    final_spp: FinalSpp = None,
-    overwrite: Overwrite = False,
-    no_cache: NoCache = False,
-    allow_outside: AllowOutside = False,
+    problem_settings: arguments.ProblemSettings = None,
+    workers: arguments.WorkersOption = None,
+    insecure: arguments.Insecure = False,
+    variant: arguments.Variant = "auto",
+    final_spp: arguments.FinalSpp = None,
+    overwrite: arguments.Overwrite = False,
+    no_cache: arguments.NoCache = False,
+    allow_outside: arguments.AllowOutside = False,
 ) -> None:
     """Compare methods at equal time or steps on one problem, or compare earlier runs.
 

@@ -11,20 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from unrender.app.cli import arguments, stages
-from unrender.app.cli.arguments import (
-    AllowOutside,
-    CheckpointEvery,
-    FinalSpp,
-    Insecure,
-    NoCache,
-    Overwrite,
-    ProblemName,
-    ProblemSettings,
-    Seed,
-    Threads,
-    Variant,
-    WorkersOption,
-)
 from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, TERMINATED
 from unrender.core import phases
 from unrender.core.errors import InputError
@@ -104,24 +90,24 @@ _Out = Annotated[Path | None, typer.Option(help="The run folder. Default: a new 
 
 def run(
     context: typer.Context,
-    problem: ProblemName,
+    problem: arguments.ProblemName,
     method_name: _MethodName = "auto",
     settings: _Settings = None,
     steps: _Steps = None,
     seconds: _Seconds = None,
-    seed: Seed = 0,
+    seed: arguments.Seed = 0,
     out: _Out = None,
-    problem_settings: ProblemSettings = None,
-    variant: Variant = "auto",
-    final_spp: FinalSpp = None,
-    overwrite: Overwrite = False,
-    checkpoint_every: CheckpointEvery = None,
-    threads: Threads = None,
-    no_cache: NoCache = False,
-    workers: WorkersOption = None,
+    problem_settings: arguments.ProblemSettings = None,
+    variant: arguments.Variant = "auto",
+    final_spp: arguments.FinalSpp = None,
+    overwrite: arguments.Overwrite = False,
+    checkpoint_every: arguments.CheckpointEvery = None,
+    threads: arguments.Threads = None,
+    no_cache: arguments.NoCache = False,
+    workers: arguments.WorkersOption = None,
     compress: Compress = False,
-    allow_outside: AllowOutside = False,
-    insecure: Insecure = False,
+    allow_outside: arguments.AllowOutside = False,
+    insecure: arguments.Insecure = False,
 ) -> None:
     """Recover a problem's parameters, and write a run folder with a page that shows the result.
 
@@ -248,11 +234,11 @@ def resume(
         bool, typer.Option("--force", help="Continue even if the problem, its files or versions have changed.")
     ] = False,
     variant: Annotated[str | None, typer.Option(help="Mitsuba's variant. [default: the run's]")] = None,
-    threads: Threads = None,
-    workers: WorkersOption = None,
+    threads: arguments.Threads = None,
+    workers: arguments.WorkersOption = None,
     compress: Compress = False,
-    allow_outside: AllowOutside = False,
-    insecure: Insecure = False,
+    allow_outside: arguments.AllowOutside = False,
+    insecure: arguments.Insecure = False,
 ) -> None:
     """Continue an interrupted or killed run, or extend a finished one.
 

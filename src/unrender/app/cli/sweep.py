@@ -9,19 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from unrender.app.cli import arguments
-from unrender.app.cli.arguments import (
-    MOST_SEEDS,
-    MOST_TRIALS,
-    AllowOutside,
-    FinalSpp,
-    Insecure,
-    NoCache,
-    Overwrite,
-    ProblemSettings,
-    Threads,
-    Variant,
-    WorkersOption,
-)
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
@@ -57,7 +44,7 @@ _SearchName = Annotated[
     typer.Option(metavar="grid|random|tpe", help="Search strategy. [default: grid; random if a range has no POINTS]"),
 ]
 _Trials = Annotated[
-    int | None, typer.Option(min=1, max=MOST_TRIALS, help="Number of trials of random and tpe. [default: 16]")
+    int | None, typer.Option(min=1, max=arguments.MOST_TRIALS, help="Number of trials of random and tpe. [default: 16]")
 ]
 _Prune = Annotated[
     bool, typer.Option("--prune", help="Stop runs whose error is, and would end, above the median of earlier trials.")
@@ -65,12 +52,14 @@ _Prune = Annotated[
 _Window = Annotated[
     int | None,
     typer.Option(
-        min=1, max=MOST_TRIALS, help="With --prune or tpe: limit of concurrent trials. [default: 4, or two per worker]"
+        min=1,
+        max=arguments.MOST_TRIALS,
+        help="With --prune or tpe: limit of concurrent trials. [default: 4, or two per worker]",
     ),
 ]
 _Steps = Annotated[int | None, typer.Option(help="Steps of each run. [default: 300 without --seconds]")]
 _Seconds = Annotated[float | None, typer.Option(help="Time for each run, with compilation and final pictures.")]
-_Seeds = Annotated[int, typer.Option(min=1, max=MOST_SEEDS, help="Number of runs of each trial.")]
+_Seeds = Annotated[int, typer.Option(min=1, max=arguments.MOST_SEEDS, help="Number of runs of each trial.")]
 _Seed = Annotated[int, typer.Option(min=0, help="Seed of the search, and of the first run of each trial.")]
 _Out = Annotated[Path | None, typer.Option(help="Output folder. Default: a new folder in out/.")]
 
@@ -89,16 +78,16 @@ def sweep_command(
     seconds: _Seconds = None,
     seeds: _Seeds = 1,
     seed: _Seed = 0,
-    workers: WorkersOption = None,
-    insecure: Insecure = False,
+    workers: arguments.WorkersOption = None,
+    insecure: arguments.Insecure = False,
     out: _Out = None,
-    problem_settings: ProblemSettings = None,
-    variant: Variant = "auto",
-    final_spp: FinalSpp = None,
-    overwrite: Overwrite = False,
-    threads: Threads = None,
-    no_cache: NoCache = False,
-    allow_outside: AllowOutside = False,
+    problem_settings: arguments.ProblemSettings = None,
+    variant: arguments.Variant = "auto",
+    final_spp: arguments.FinalSpp = None,
+    overwrite: arguments.Overwrite = False,
+    threads: arguments.Threads = None,
+    no_cache: arguments.NoCache = False,
+    allow_outside: arguments.AllowOutside = False,
 ) -> None:
     """Search a method's options for the smallest error on one problem.
 
