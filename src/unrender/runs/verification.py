@@ -22,8 +22,9 @@ DIFFERS = "the final picture differs from the references"
 _FEW_PIXELS, _OF_FEW = 96, 0.2
 """Number of pixels below which the difference is also judged pixel by pixel, which includes the references' noise; its smallest size
 relative to the image in this case."""
-_FEW_NUMBERS, _OF_PICTURE = 24, 0.01
-"""Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image."""
+_FEW_NUMBERS, _OF_PICTURE, _OF_CONCENTRATED = 24, 0.01, 0.1
+"""Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image; that of
+one in few pixels."""
 
 _ROWS, _PAIRS = (3, 1), (1, 0)
 """Layout for `paired_losses.systematic` of rows of pixels, and of pairs of a sample."""
@@ -90,7 +91,7 @@ def misfit(
         least: smallest difference relative to the references.
         halves: differences of K >= 2 images each at the end, with independent noise, (K, N, 3). With these, few pixels are also judged
             one by one.
-        by_pixel: whether many pixels are, too.
+        by_pixel: whether many pixels are, too. Without halves, only a difference that few of them hold counts.
     """
     one, other = residuals.mean(axis=0), others.mean(axis=0)
     if not (np.isfinite(one).all() and np.isfinite(other).all()):
@@ -106,9 +107,11 @@ def misfit(
     edges = (paired_losses.nearby(one, weights, sizes, axes, other) for axes in ((0,), (1,), (0, 1)))
     scales = (significant(part, least, False) for part in (tiles, *edges))
     difference = max(filter(None, scales), key=lambda found: found.error, default=None)
-    if difference or halves is None or not (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
-        return difference
-    return significant(paired_losses.repeated(*halves, weights), _OF_FEW, True)
+    if difference is None and halves is not None and (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
+        difference = significant(paired_losses.repeated(*halves, weights), _OF_FEW, True)
+    if difference is None and by_pixel:
+        difference = significant(paired_losses.concentrated(one, other, weights), _OF_CONCENTRATED, True)
+    return difference
 
 
 def misfit_of_numbers(

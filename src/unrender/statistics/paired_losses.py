@@ -16,6 +16,10 @@ _OF_FILTER, _OF_PRODUCTS = 0.03, 1.25
 """Correlation at a distance of 2 pixels that counts as noise, and the standard deviation of the sum of products of such pixels relative to
 that of independent products. Mitsuba's default filter, a Gaussian, leaves exp(-4) = 0.018 and 1.23 to 1.31."""
 
+_OF_NOISE, _LEVEL = 4.0, 1e-5
+"""Smallest mean square of a difference in few pixels, relative to the reference's noise as the other pixels suggest it; false positive
+rate of its test."""
+
 
 @dataclass(frozen=True)
 class Difference:
@@ -37,9 +41,13 @@ class Difference:
             return False
         if math.isinf(self.value):
             return self.value > 0
+        return self.value > self.quantile(level) * self.standard_error
+
+    def quantile(self, level: float) -> float:
+        """Return the number of standard errors that noise exceeds with probability `level`, by the t-distribution."""
         from scipy.special import stdtrit  # takes long to import
 
-        return self.value > -float(stdtrit(max(self.degrees, 1.0), level)) * self.standard_error
+        return -float(stdtrit(max(self.degrees, 1.0), level))
 
 
 SIGNIFICANT = 4.5
@@ -130,6 +138,31 @@ def repeated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> Systema
     noise = float(np.sqrt(((errors[0] * errors[1]).sum(axis=1) ** 2).sum()))
     total, count = float(products.sum()), max(float(weights.sum()) * one.shape[2], 1e-300)
     return SystematicDifference(total / count, total / noise if noise > 0 else math.inf * np.sign(total))
+
+
+def concentrated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> SystematicDifference:
+    """Return the part of two pictures' differences from one reference that both share, if few pixels hold it; a score of 0 otherwise.
+
+    A misplaced reflection or highlight changes its sign from pixel to pixel, which `systematic` and `nearby` miss. Noise of the reference
+    is shared as well. Its variance is taken to be proportional to that of the pictures, with the median ratio of tiles of pixels; only four
+    times as much counts. The largest pixel does not count, since it may be an outlier of the reference.
+
+    Args:
+        one, other: differences of two independent pictures, (N, C).
+        weights: (N,), how much each pixel counts, in [0, 1].
+    """
+    one, other = (np.asarray(of, np.float64) * weights[:, None] for of in (one, other))
+    products, variances = (one * other).sum(axis=1), np.square(one - other).sum(axis=1) / 2
+    starts = np.linspace(0, len(one), min(len(one), _TILES), endpoint=False).astype(np.int64)
+    shared, noise = (np.maximum(np.add.reduceat(of, starts), 1e-300) for of in (products, variances))
+    total = float(products.sum() - products.max(initial=0.0))
+    if not total > _OF_NOISE * float(np.median(shared / noise)) * float(variances.sum()):
+        return SystematicDifference(0.0, 0.0)
+    error = math.sqrt(float(np.square((one**2 - other**2).sum(axis=1)).sum())) / 2
+    square = float(products.sum()) / max(float(weights.sum()) * one.shape[1], 1e-300)
+    # Two pictures tell the noise of a pixel with one degree of freedom.
+    needed = Difference(1.0, 1.0, float(products.sum() ** 2 / np.square(products).sum())).quantile(_LEVEL)
+    return SystematicDifference(square, SIGNIFICANT * total / (needed * error) if error > 0 else math.inf)
 
 
 def systematic(
