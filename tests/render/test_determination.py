@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.app import report
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
+from unrender.runs.least_squares import checked_keys
 
 SIZE = 8
 LIGHT, COLOUR = "lamp.intensity.value", "wall.bsdf.reflectance.value"
@@ -140,3 +142,48 @@ def test_a_run_that_ended_early_is_warned_in_its_folder(tmp_path: Any):
     result = ur.optimize(made, steps=2, run_directory=tmp_path / "run")
     (line,) = [line for line in result.warnings if "ended before it settled" in line]
     assert line.startswith(f"{COLOUR}: ")
+
+
+def test_vertices_that_the_picture_does_not_show_keep_their_normals_and_are_named(tmp_path: Any):
+    """The run starts at the truth, so that its gradients are noise. Five of a cube's six faces are hardly seen."""
+    key, cube = "box.vertex_normals", {"type": "cube", "to_world": mi.ScalarTransform4f().scale(0.7), "bsdf": GREY}
+    described = scene(GREY, box=cube)
+    described["wall"]["to_world"] = mi.ScalarTransform4f().translate([0, 0, -1]).scale(3)
+    view = ur.View(ur.render(problem(described, key), spp=1024))
+    made = ur.Problem(described, [ur.Parameter(key)], [view], max_depth=3)
+    result = ur.optimize(made, "auto", steps=30, run_directory=tmp_path)
+    moved = np.abs(result.parameters[key] - result.initial[key]).reshape(-1, 3).max(axis=1)
+    front = result.initial[key].reshape(-1, 3)[:, 2] > 0.5
+    assert moved[~front].max() < 0.05
+    assert any(line.startswith(f"{key}: ") and "hardly changes the pictures" in line for line in result.undetermined)
+    for which, told in ((result.initial[key].reshape(-1, 3)[:, 2] < -0.5, True), (front, False)):
+        turned = np.where(which[:, None], [0.8, 0.6, 0.0], result.initial[key].reshape(-1, 3)).astype(np.float32)
+        lines = undetermined(made, {key: turned.ravel()}, 16)
+        assert any("its initial values change the pictures by less than" in line for line in lines) is told
+
+
+def test_pictures_show_only_the_ratios_of_a_tabulated_phase_functions_values():
+    """A common factor changes no picture; the result has the initial length, and the error none of the factor."""
+    phase = {"type": "tabphase", "values": "0.3, 0.5, 1, 2"}
+    medium = {"type": "homogeneous", "albedo": 0.9, "sigma_t": 2.0, "phase": phase}
+    described = scene(GREY, fog={"type": "cube", "bsdf": {"type": "null"}, "interior": medium})
+    described["integrator"] = {"type": "volpath", "max_depth": 4}
+    key = "fog.interior_medium.phase_function.values"
+    made = problem(described, key, truth={key: problem(described, key).initial_values()[key]})
+    assert any(f"{key}: pictures show only the ratios" in line for line in made.notices)
+    initial = made.initial_values()[key]
+    one, other = (ur.render(made, {key: np.float32(factor) * initial}, spp=64) for factor in (1.0, 1.5))
+    np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
+    assert made.parameter_error({key: 1.5 * initial})[key] == pytest.approx(0.0, abs=1e-6)
+    factors = made.unknowns[key].normalised(1.5 * initial)
+    assert factors is not None
+    np.testing.assert_allclose(1.5 * initial * factors, initial, rtol=1e-5)
+
+
+def test_lists_of_few_numbers_are_tested_by_least_squares():
+    """A number and a list of five; a list that is too long is left out, and the number stays."""
+    for size, count in ((5, 2), (24, 1)):
+        values = {"x": np.full((), 0.5), "list": np.full(size, 0.5)}
+        renderer = AnalyticRenderer(values, np.random.default_rng(0).random((192, 1 + size)), shape=(8, 8))
+        made = ur.Problem(renderer, [ur.Parameter(key) for key in values], [ur.View(renderer.exact(values))])
+        assert len(checked_keys(made, values, values)) == count

@@ -37,6 +37,15 @@ def test_heights_have_the_standard_deviation_of_the_difference():
     assert (height.unit, parameter_errors.title([height, PLAIN])) == ("", "Parameter error (RMSE)")
 
 
+def test_ratios_have_the_difference_after_the_best_factor_of_each_vector():
+    ratios, truth = ErrorMeasure("ratios"), np.array([[1.0, 2.0, 2.0], [3.0, 0.0, 4.0]])
+    assert ratios.error(truth * [[0.5], [7.0]], truth) == pytest.approx(0.0, abs=1e-12)
+    assert ratios.error(np.array([[2.0, 0.0]]), np.array([[1.0, 1.0]])) == pytest.approx(np.sqrt(0.5))
+    assert ratios.error(np.zeros((1, 2)), np.array([[1.0, 1.0]])) == pytest.approx(1.0)
+    assert (ratios.name, ratios.unit) == ("RMSE up to a factor", "")
+    assert parameter_errors.from_record(ratios.record()) == ratios
+
+
 @pytest.mark.parametrize("length", [0.3, 1.0, 2.5])
 def test_a_normal_map_has_the_mean_angle_whatever_the_length_of_its_normals(length: float):
     angles = np.array([[0.0, 10.0], [20.0, 90.0]])

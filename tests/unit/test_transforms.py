@@ -135,6 +135,18 @@ def test_adam_is_a_mean_over_a_root_mean_square() -> None:
     assert np.abs(take(swapped, estimates(6))[2]["map"] - take(chain, estimates(6))[2]["map"]).max() > 1e-4
 
 
+def test_elements_of_uniform_keys_are_all_divided_by_the_largest_root() -> None:
+    """An element of a thousandth of the largest gradient moves by a thousandth of its step, not by as much."""
+    gradient = np.array([1.0, 1e-3], np.float32)
+    for keys, ratio in (((), 1.0), (("list",), 1e-3)):
+        recipe = ScheduleFree(0.1, uniform=keys)
+        start = {"list": np.zeros(2, np.float32)}
+        steps, _ = recipe.update(Estimate(1.0, {"list": gradient}), recipe.init(start), start)
+        assert steps["list"][1] / steps["list"][0] == pytest.approx(ratio, rel=1e-4)
+    with pytest.raises(InputError, match="uniform"):
+        ScheduleFree(uniform=("other",)).init({"list": np.zeros(2, np.float32)})
+
+
 def test_schedule_free_is_its_chain() -> None:
     smooth = Sobolev(2.0)
     recipe = ScheduleFree(0.1, preconditioner=smooth, preconditioned=("map",))

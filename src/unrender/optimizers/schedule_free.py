@@ -44,9 +44,9 @@ class ScheduleFree(Recipe):
     - `ScheduleFreeAverage` updates z, x and y.
 
     Adam normalises every element's step, so weakly observed elements follow a random walk, which w prevents. Parameters outside of
-    `preconditioned` have no neighbours from which w can be estimated, and take unscaled steps. Use `wiener=False` with pixel
-    mini-batches: two successive gradients then hardly share a pixel, so their product shows little signal anywhere, and the decaying
-    learning rate averages the noise instead.
+    `preconditioned` have no neighbours from which w can be estimated, and take unscaled steps; those in `uniform` take steps in proportion
+    to their gradients. Use `wiener=False` with pixel mini-batches: two successive gradients then hardly share a pixel, so their product
+    shows little signal anywhere, and the decaying learning rate averages the noise instead.
 
     Where the smoothing becomes weaker, the learning rate restarts at 0.3 η_0 or less, because neighbours no longer average the noise.
     Where it becomes stronger again, or the rate falls by more than a quarter at once, z restarts at x.
@@ -67,6 +67,8 @@ class ScheduleFree(Recipe):
         wiener: whether the steps of these parameters are multiplied by w.
         reparameterised: Keys of parameters with another variable (`unrender.parameterisations`), whose size does not measure their
             progress.
+        uniform: keys of parameters whose elements are all divided by the largest √v̂ among them. Elements that the pictures hardly show
+            then hardly move.
         pulled: {key: weight} of parameters with a `PullToStart` before all other transforms.
     """
 
@@ -82,6 +84,7 @@ class ScheduleFree(Recipe):
     preconditioned: tuple[str, ...] = ()
     wiener: bool = True
     reparameterised: tuple[str, ...] = ()
+    uniform: tuple[str, ...] = ()
     pulled: Mapping[str, float] = field(default_factory=dict)
     _smoothing: FittedSobolev = field(default_factory=FittedSobolev, init=False, repr=False, compare=False)
 
@@ -99,10 +102,11 @@ class ScheduleFree(Recipe):
         object.__setattr__(self, "_smoothing", FittedSobolev(self.preconditioner, keys))
         moved = checked_keys("ScheduleFree: reparameterised", self.reparameterised)
         object.__setattr__(self, "reparameterised", moved)
+        object.__setattr__(self, "uniform", checked_keys("ScheduleFree: uniform", self.uniform))
 
     def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
         """Return the state before the first step. Raises `InputError` for an unknown parameter, or one that S does not support."""
-        for name in ("preconditioned", "reparameterised", "pulled"):
+        for name in ("preconditioned", "reparameterised", "uniform", "pulled"):
             if unknown := next((key for key in getattr(self, name) if key not in parameters), None):
                 raise InputError(f'ScheduleFree: {name}: unknown parameter "{unknown}"')
         return super().init(parameters, learning_rates)
@@ -114,7 +118,7 @@ class ScheduleFree(Recipe):
             self._smoothing,
             LastingAgreement(),
             AgreementRate(self.growth, self.decay, self.reparameterised),
-            ScaleByRms(self.beta_2, self.epsilon, long_memory=True),
+            ScaleByRms(self.beta_2, self.epsilon, self.uniform, long_memory=True),
             ApplyPreconditioner(),
             WienerShrinkage(shrunk),
             ScheduleFreeAverage(self.beta, self.averaging),

@@ -1,4 +1,4 @@
-"""Errors of parameter values by their role: numbers, heights, normals or directions."""
+"""Errors of parameter values by their role: numbers, heights, ratios, normals or directions."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from unrender.core import periodic
 
-Role = Literal["value", "height", "normal", "direction"]
-"""Meaning of a parameter's values: numbers, heights of which only differences matter, a normal map (n = 2 x - 1), or vectors of which
-only the direction matters."""
+Role = Literal["value", "height", "ratios", "normal", "direction"]
+"""Meaning of a parameter's values: numbers, heights of which only differences matter, vectors of which only the ratios of their elements
+matter, a normal map (n = 2 x - 1), or vectors of which only the direction matters."""
 
 _MOST_COLUMNS = 8
 """Maximum number of repeated columns that a record may state."""
 _SHORTEST = 1e-12
-"""Minimum length of a vector that has a direction. A shorter vector has an angle of 90°."""
+"""Minimum length of a vector that has a direction. A shorter vector has an angle of 90°, and no factor."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,12 @@ class ErrorMeasure:
     """Error measure between values and the ground truth.
 
     The error of numbers is the root mean square difference, that of heights the standard deviation of the difference. The error of
+    ratios is the root mean square difference after each vector is multiplied by its best factor. The error of
     normals and directions is the mean angle in degrees after normalisation, since images do not depend on their lengths.
 
     Attributes:
-        role: meaning of the values. Arrays of normals and directions have the vectors' components on the last axis, or are flat.
+        role: meaning of the values. Arrays of ratios have their vectors on the last axis. Arrays of normals and directions have the
+            vectors' components there, or are flat.
         repeated: number of columns at each end that repeat others and are ignored, see `core.periodic`.
     """
 
@@ -43,7 +45,8 @@ class ErrorMeasure:
     @property
     def name(self) -> str:
         """Short name of the error."""
-        return "mean angle" if self.is_angle else "RMSE" if self.role == "value" else "RMSE without the mean"
+        names = {"height": "RMSE without the mean", "ratios": "RMSE up to a factor"}
+        return "mean angle" if self.is_angle else names.get(self.role, "RMSE")
 
     @property
     def unit(self) -> str:
@@ -66,8 +69,9 @@ class ErrorMeasure:
         if values.shape != truth.shape or values.size == 0:
             return None
         with np.errstate(over="ignore", invalid="ignore"):
+            scaled = _fitted(values, truth) if self.role == "ratios" else values
             errors = (
-                self._angles(values, truth) if self.is_angle else np.asarray(self._unknown(values - truth), np.float64)
+                self._angles(values, truth) if self.is_angle else np.asarray(self._unknown(scaled - truth), np.float64)
             )
         if where is not None:
             cells = self._unknown(where)
@@ -107,6 +111,13 @@ class ErrorMeasure:
     def record(self) -> dict[str, Any]:
         """Return the measure as JSON types, the inverse of `from_record`."""
         return asdict(self)
+
+
+def _fitted(values: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return each vector of the last axis times the factor that brings it closest to the true one."""
+    vectors, reference = (np.asarray(x, np.float64) for x in (values, truth))
+    products, squares = ((vectors * x).sum(axis=-1, keepdims=True) for x in (reference, vectors))
+    return vectors * (products / np.maximum(squares, _SHORTEST**2))
 
 
 PLAIN = ErrorMeasure()

@@ -12,7 +12,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.runs.field_directions import TOO_SHORT
-from unrender.runs.image_sensitivity import MAP_AXES, seen_cells
+from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
@@ -25,6 +25,8 @@ _LEAST_OF_FACTOR = 0.1
 """Fraction of the change by brighter emitters that must remain with darker reflectances, if the images distinguish the two."""
 _ERRORS = 2.0
 """Number of standard errors by which a change must be below its limit."""
+_FEW = 24
+"""Number of elements of a list up to which least squares test them one by one."""
 _UNSEEN = 0.05
 """Fraction of unseen cells of a texture or grid from which a line is returned."""
 _SCALE = "scale"
@@ -67,7 +69,7 @@ def undetermined(
     most: float = 0.0,
     sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> list[str]:
-    """Return a line for each parameter that hardly changes the images over its entire range.
+    """Return a line for each parameter that hardly changes the images over its entire range, or, without one, from its initial values.
 
     Parameters of materials and media are tested in sequence while time remains, first those whose sensitivity is 0. All elements of a
     parameter change together. If a map such as a bump map hardly changes the images then, its details are tested: a checkerboard of its
@@ -88,47 +90,59 @@ def undetermined(
     until = {True: started + max(seconds, most), False: started + seconds}
     for key in sorted(problem.unknowns, key=lambda key: key not in unseen):
         info, (low, high) = known[key], problem.unknowns[key].bounds
-        own = np.asarray(values[key], np.float32)
+        own, initial = np.asarray(values[key], np.float32), problem.unknowns[key].initial
         is_map, bounded = own.ndim >= MAP_AXES, low is not None or high is not None
         if is_map and not bounded:
             low, high = float(own.min()), float(own.max())
-        if low is None or high is None or info.rigid or info.viewpoint or info.welded or info.role not in _ROLES:
+        ranged = low is not None and high is not None and info.role in _ROLES
+        if info.rigid or info.viewpoint or info.welded or not (ranged or (initial != own).any()):
             continue
         started = time.perf_counter()
         if longest > 0.0 and started + longest > until[key in unseen]:
             break
-        ends = [project(np.full(own.shape, end, np.float32), low, high) for end in (low, high)]
+        ends = [own, initial]
+        if ranged:
+            ends = [project(np.full(own.shape, end, np.float32), low, high) for end in (low, high)]
         details = np.where(np.indices(own.shape).sum(axis=0) % 2, *ends) if bounded else own
         first, last, detailed = ({**values, key: array} for array in (*ends, details))
         try:
             change = _change(problem, first, last, spp, per_pass)
             hidden = change.is_below(_LEAST)
-            if hidden and is_map:
+            if hidden and is_map and ranged:
                 change = _change(problem, first, detailed, spp, per_pass)
         except InputError:  # the renderer rejects a value at the end of the range
             continue
         longest = max(longest, time.perf_counter() - started)
-        if hidden and change.is_above(_LEAST):
-            lines.append(
-                f"{key}: a constant added to all of it changes the pictures by less than {_LEAST:.1%}; only differences of its elements "
-                "are determined"
-            )
-        elif hidden and bounded and change.is_below(_LEAST):
-            lines.append(
-                f"{key}: over its entire range the pictures change by less than {_LEAST:.1%}; its value is the initial one, or noise"
-            )
+        if line := _words(hidden, change, ranged, bounded):
+            lines.append(f"{key}: {line}")
     return lines
 
 
+def _words(hidden: bool, change: Change, ranged: bool, bounded: bool) -> str:
+    """Return what a change from one end of a range to the other, or to the initial values, tells of a parameter; "" for nothing."""
+    less = f"the pictures by less than {_LEAST:.1%}"
+    if not hidden:
+        return ""
+    if not ranged:
+        return f"its initial values change {less}; its recovered values may be noise"
+    if change.is_above(_LEAST):
+        return f"a constant added to all of it changes {less}; only differences of its elements are determined"
+    if bounded and change.is_below(_LEAST):
+        return f"over its entire range the pictures change by less than {_LEAST:.1%}; its value is the initial one, or noise"
+    return ""
+
+
 def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
-    """Return a line for each texture or grid with a notable part that hardly changes the images.
+    """Return a line for each texture, grid or long list with a notable part that hardly changes the images.
 
     Args:
         sensitivities: {key: array}, see `unrender.runs.sensitivity`.
     """
     lines = []
     for key, sensitivity in sensitivities.items():
-        where = seen_cells(sensitivity)
+        where = (
+            seen_cells(sensitivity) if sensitivity.ndim != 1 or sensitivity.size <= _FEW else seen_elements(sensitivity)
+        )
         if where is not None and (share := 1.0 - float(where.mean())) >= _UNSEEN:
             lines.append(
                 f"{key}: {share:.0%} of it hardly changes the pictures; values there are the initial ones, smoothed, or noise"

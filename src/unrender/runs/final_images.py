@@ -6,23 +6,22 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
-from unrender.core import arrays, phases
-from unrender.display import formatting
-from unrender.estimators.penalties import penalty
+from unrender.core import phases
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
-from unrender.runs.earlier_image import no_improvement
 from unrender.runs.field_directions import TOO_SHORT
+from unrender.runs.final_checks import differs_still, image_name, rise, unexplained_pixels
 from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
-from unrender.runs.verification import DIFFERS, misfit_of_views, residuals_of_views
+from unrender.runs.verification import misfit_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.statistics import debiased
@@ -46,13 +45,6 @@ _PICTURES_SHARE = 0.5
 """Share of the time that is left at the end that final pictures may take."""
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
-
-_ERRORS, _ERRORS_OF_RISE, _OF_START, _OF_PICTURE = 2.0, 4.0, 0.2, 1e-4
-"""Standard errors by which a verified loss must have fallen to be lower; those by which final images must be worse than the initial ones,
-and by how much of the initial mean square error and of the mean square of the references."""
-
-_OF_BIAS = 0.25
-"""Share of the bias from noise that counts as its standard error, since two halves may agree by chance."""
 
 _SEEDS = {"initial": 1, "result": 2}
 _SECOND_HALF = 1 << 16
@@ -127,8 +119,8 @@ def render_final_images(
         samples, chosen = spp or _affordable(problem, result, _PICTURES_SHARE * left()), _chosen(problem)
         pictures, errors, halves_of = _pictures(problem, result, chosen, samples, advance)
         ends = halves_of["result"]
-        if rise := _rise(problem, result, pictures, errors, halves_of):
-            return FinalImages(pictures, errors, samples, {}, rise=rise)
+        if risen := rise(problem, result, pictures, errors, halves_of):
+            return FinalImages(pictures, errors, samples, {}, rise=risen)
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
         seconds = min(_SENSITIVITY_SHARE * max(_SHARE * result.seconds, _LEAST_SECONDS), 0.5 * tests)
         everything = tested and len(chosen) == len(problem.views)
@@ -139,7 +131,7 @@ def render_final_images(
             known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
         sensitivities, deviations = known.sensitivity(), dict(result.standard_error)
         lines, warnings = [], ()
-        differs = misfit_of_views(problem, chosen, ends, result.warnings) if result.steps else ""
+        differs = _differs(problem, result, chosen, halves_of, samples, left)
         if not tested and result.steps and not differs:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
             lines, deviations = [*untested_factor(problem), *late.missing()], _without(deviations, late.unchecked)
@@ -155,7 +147,7 @@ def render_final_images(
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
         warnings += () if differs in result.warnings else (differs,)
     else:
-        warnings += _no_improvement(problem, result, chosen, ends)
+        warnings += tuple(filter(None, [differs_still(problem, result, chosen, ends)]))
     lines += maps.limited
     return FinalImages(
         pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share, maps.missing
@@ -173,84 +165,6 @@ def at_start(result: Result, rise: str) -> Result:
         verification=verification,
         warnings=[*result.warnings, rise],
     )
-
-
-def _rise(
-    problem: Problem,
-    result: Result,
-    pictures: Mapping[str, np.ndarray],
-    errors: Mapping[str, tuple[float, float]],
-    halves: Mapping[str, Sequence[tuple[np.ndarray, ...]]],
-) -> str:
-    """Return a warning if the final images of all views are worse than the initial ones, by more than noise and by a visible amount.
-
-    It is "" where the verification found that the loss has fallen, or that earlier parameters are better, and for losses and priors whose
-    minimum is elsewhere. Losses of full images, of which the verification renders few, are compared themselves.
-    """
-    prior = any(unknown.prior is not None for unknown in problem.unknowns.values())
-    if prior or (problem.loss.pixelwise and not problem.loss.linear):
-        return ""
-    start, end = (result.verification.get(name, [None, None]) for name in ("start", "end"))
-    ended = problem.remeshed_from is None and result.status == "finished" and result.verification.get("best") == "end"
-    if not ended or None in (*start, *end):
-        return ""
-    if end[0] + _ERRORS * math.hypot(start[1], end[1]) < start[0] or len(errors) < 2 * len(problem.views):
-        return ""
-    if not problem.loss.pixelwise:
-        values, views = (result.initial, result.parameters), range(len(problem.views))
-        pairs = zip(values, (halves["initial"], halves["result"]), strict=True)
-        (before, noise), (after, more) = (_loss(problem, own, views, images) for own, images in pairs)
-        rises = after - before > max(_ERRORS_OF_RISE * math.hypot(noise, more), _OF_START * before)
-        return _worse("loss", after, before) if rises else ""
-    totals, variance, size = {"initial": 0.0, "result": 0.0}, 0.0, 0.0
-    for index, view in enumerate(problem.views):
-        share = view.weight / sum(each.weight for each in problem.views)
-        size += share * float(np.mean(np.square(pictures[f"view{index}/reference"])))
-        for which in totals:
-            value, error = errors[image_name(index, which)]
-            totals[which] += share * value**2
-            # Beyond four errors the second number is the error of the value, else an upper bound (see `debiased.rmse`).
-            variance += (share * (2.0 * value * error if value > 4.0 * error else 0.5 * error**2)) ** 2
-    rise = totals["result"] - totals["initial"]
-    if not (
-        rise > _ERRORS_OF_RISE * math.sqrt(variance) and rise > max(_OF_START * totals["initial"], _OF_PICTURE * size)
-    ):
-        return ""
-    return _worse("image error", math.sqrt(totals["result"]), math.sqrt(totals["initial"]))
-
-
-def _worse(measure: str, after: float, before: float) -> str:
-    return (
-        f"the final picture is worse than the initial one: {measure} {formatting.number(after)}, {formatting.number(before)} at the start; "
-        "the result holds the initial parameters; try a lower learning_rate, more samples per pixel, or another method"
-    )
-
-
-def _loss(
-    problem: Problem, values: Mapping[str, np.ndarray], views: Sequence[int], images: Sequence[tuple[np.ndarray, ...]]
-) -> tuple[float, float]:
-    """Return the loss of images of some views without the bias from their noise, and about its standard error, from their halves."""
-    loss, square, array = penalty(problem, values), 0.0, problem.renderer.array
-    for view, (one, other) in zip(views, images, strict=True):
-        both, *parts = (
-            arrays.number(problem.loss_value(view, array(image))) for image in ((one + other) / 2, one, other)
-        )
-        half = sum(parts) / 2.0
-        loss += 2.0 * both - half
-        square += (0.5 * (parts[0] - parts[1])) ** 2 + (_OF_BIAS * (half - both)) ** 2
-    return loss, math.sqrt(square)
-
-
-def _no_improvement(
-    problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
-) -> tuple[str, ...]:
-    """Return `earlier_image.no_improvement` of the final images; () if it is known or they are not all."""
-    known = any(DIFFERS in line for line in result.warnings) or result.verification.get("best") != "end"
-    if known or len(views) < len(problem.views) or len(ends[0]) < 2:
-        return ()
-    loss, _ = _loss(problem, result.parameters, views, ends)
-    change = result.verification.get("change", {})
-    return tuple(no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends)))
 
 
 def _untested(problem: Problem, result: Result, reason: str) -> Uncertainty:
@@ -344,11 +258,6 @@ def _chosen(problem: Problem) -> list[int]:
     return sorted({round(place) for place in np.linspace(0, count - 1, most)})
 
 
-def image_name(view: int, which: str) -> str:
-    """Return the name of a view's "initial" or "result" image."""
-    return f"view{view}/{which}"
-
-
 def _picture(
     problem: Problem, values: Mapping[str, np.ndarray], view: int, spp: int, seed: int
 ) -> tuple[tuple[np.ndarray, ...], tuple[float, float] | None]:
@@ -356,14 +265,40 @@ def _picture(
     first = spp // 2
     if first == 0:
         return (render(problem, values, view, spp, seed),), None
-    pass_spp = _pass_spp(problem)
-    per_pass = pass_spp if first % pass_spp == 0 else None
+    per_pass = _per_pass(problem, first)
     one, other = (
         render(problem, values, view, first, seed + offset, per_pass=per_pass) for offset in (0, _SECOND_HALF)
     )
     own = problem.views[view]
     mask = None if own.mask is None else np.asarray(own.mask)
     return (one, other), debiased.rmse(one, other, np.asarray(own.reference), mask)
+
+
+def _per_pass(problem: Problem, spp: int) -> int | None:
+    """Return the samples per pixel of each pass of a half of an image; None for all at once."""
+    pass_spp = _pass_spp(problem)
+    return pass_spp if spp % pass_spp == 0 else None
+
+
+def _differs(
+    problem: Problem,
+    result: Result,
+    views: Sequence[int],
+    halves: Mapping[str, Sequence[tuple[np.ndarray, ...]]],
+    spp: int,
+    left: Callable[[], float],
+) -> str:
+    """Return a warning that the pictures of a run differ from the references by something that is not among the unknowns; else ""."""
+    ends = halves["result"]
+    line = misfit_of_views(problem, views, ends, result.warnings) if result.steps else ""
+    if line or not result.steps or left() <= 0.0 or result.verification.get("best") != "end":
+        return line
+    return unexplained_pixels(problem, result.parameters, halves["initial"], ends, partial(_first_half, problem, spp))
+
+
+def _first_half(problem: Problem, spp: int, values: Mapping[str, np.ndarray], view: int) -> np.ndarray:
+    """Return an image with the random numbers of the first half of a final image of the result."""
+    return render(problem, values, view, spp // 2, _SEEDS["result"], per_pass=_per_pass(problem, spp // 2))
 
 
 def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:

@@ -252,6 +252,23 @@ def seen_cells(values: np.ndarray) -> np.ndarray | None:
     return ~insensitive(values) if values.ndim >= MAP_AXES and values.size else None
 
 
+def seen_elements(values: np.ndarray) -> np.ndarray:
+    """Return a mask of the elements of a list, such as one of vertices, whose own sensitivity is at least a twentieth of the median of the
+    non-zero ones.
+
+    Args:
+        values: result of `sensitivity`, (N,).
+
+    Returns:
+        (N,), truth values. Few probes leave it uncertain for single elements.
+    """
+    return (
+        values > _INSENSITIVE * np.median(values[values > 0.0])
+        if (values > 0.0).any()
+        else np.zeros(values.shape, bool)
+    )
+
+
 def adjoint_spp(problem: Problem) -> int:
     """Return the samples per pixel of an adjoint: 4, or fewer if the views have more than 2¹⁸ pixels in total."""
     return min(max(_PATHS // problem.pixels, 1), _MOST_SPP)

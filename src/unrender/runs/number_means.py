@@ -68,21 +68,20 @@ def averaged(run: Run, result: Result) -> Result:
     )
 
 
-def unit_directions(problem: Problem, result: Result) -> Result:
-    """Return the result with directions (3,) of length 1, and their standard errors. No picture depends on the length."""
-    lengths = {
-        key: float(np.linalg.norm(result.parameters[key]))
-        for key, unknown in problem.unknowns.items()
-        if unknown.is_direction
-    }
+def normalised(problem: Problem, result: Result) -> Result:
+    """Return the result with directions (3,) of length 1 and ratios of the initial lengths, and their standard errors.
+
+    No picture depends on the lengths.
+    """
+    factors = {key: unknown.normalised(result.parameters[key]) for key, unknown in problem.unknowns.items()}
 
     def scaled(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {
-            key: np.asarray(x / lengths[key], np.float32) if lengths.get(key) else np.asarray(x)
+            key: np.asarray(x) if (factor := factors.get(key)) is None else np.asarray(x * factor, np.float32)
             for key, x in values.items()
         }
 
-    if not lengths:
+    if all(factor is None for factor in factors.values()):
         return result
     return replace(result, parameters=scaled(result.parameters), standard_error=scaled(result.standard_error))
 

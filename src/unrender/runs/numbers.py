@@ -16,7 +16,7 @@ from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, selected_views
 
 _MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
-"""Elements of all numbers and of one, up to which they are tested."""
+"""Elements of all numbers up to which they are tested; elements of a number or colour; longer lists are left out first."""
 _MOST_VALUES = 1 << 25
 """Values of the pictures of one pass, up to which there is a check."""
 _PATHS, _SPP = 1 << 18, (4, 32)
@@ -102,9 +102,9 @@ class Numbers:
     def of(cls, problem: Problem, values: Mapping[str, np.ndarray], start: Mapping[str, np.ndarray]) -> Numbers | None:
         """Return the numbers of a problem without directions of textures and grids.
 
-        Numbers are parameters of at most one axis and four elements that can be perturbed and have no prior. Parameters of sensors count
-        only if one of the tested views shows them. The result is None if there are no numbers, if they have more than 24 elements, or if
-        the pictures of a pass are too large.
+        Numbers are parameters of at most one axis that can be perturbed and have no prior: those of up to four elements, and lists as long
+        as all have at most 24 elements. Parameters of sensors count only if one of the tested views shows them. The result is None if there
+        are no numbers, if they have more than 24 elements, or if the pictures of a pass are too large.
 
         Args:
             values: {key: array} of all unknowns.
@@ -116,11 +116,13 @@ class Numbers:
             key
             for key, x in values.items()
             if x.ndim <= 1
-            and x.size <= _MOST_OF_ONE
             and known[key].perturbable
             and problem.unknowns[key].prior is None
             and (known[key].sensor is None or known[key].sensor in sensors)
         ]
+        lists = [key for key in keys if values[key].size > _MOST_OF_ONE]
+        while lists and sum(values[key].size for key in keys) > _MOST_ELEMENTS:
+            keys.remove(lists.pop())
         elements = sum(values[key].size for key in keys)
         pixels = sum(math.prod(problem.sizes[view]) for view in views)
         if not keys or elements > _MOST_ELEMENTS or 6 * elements * pixels > _MOST_VALUES:
@@ -180,11 +182,11 @@ class Numbers:
         }
 
     def tangents(self) -> np.ndarray:
-        """Return the matrix (n + k, n + k) that removes changes of the lengths of direction vectors; no picture depends on these."""
+        """Return the matrix (n + k, n + k) that removes changes of the lengths of directions and ratios; no picture depends on these."""
         matrix, known = np.eye(self.point.size), self.problem.renderer.parameters()
         for key, of in self.places().items():
             own = self.point[of]
-            if known[key].role == "direction" and own.any():
+            if known[key].role in ("direction", "ratios") and own.any():
                 matrix[of, of] -= np.outer(own, own) / float(own @ own)
         return matrix
 

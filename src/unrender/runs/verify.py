@@ -26,7 +26,7 @@ from unrender.runs.earlier_image import (
     unexplained,
 )
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
-from unrender.runs.number_means import averaged, unit_directions
+from unrender.runs.number_means import averaged, normalised
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
@@ -106,7 +106,7 @@ class Verify(Callback):
             return result
         started = time.perf_counter()
         with phases.phase(callbacks.VERIFYING):
-            result = unit_directions(run.problem, self._verified(run, result))
+            result = normalised(run.problem, self._verified(run, result))
         return callbacks.with_phase(result, callbacks.VERIFYING, time.perf_counter() - started)
 
     def _verified(self, run: Run, result: Result) -> Result:

@@ -77,6 +77,25 @@ class Unknown:
         """Return whether the unknown is one direction (3,), of which no picture shows the length."""
         return self.measure.role == "direction" and self.initial.shape == _VECTOR
 
+    def normalised(self, values: np.ndarray) -> np.ndarray | None:
+        """Return factors, broadcastable to `values`, that no picture shows; None for other unknowns than directions and ratios.
+
+        They give a direction (3,) the length 1, and ratios the length of their initial values, unless these would leave the bounds.
+        """
+        if self.is_direction:
+            lengths, wanted = np.linalg.norm(values), np.float64(1.0)
+        elif self.measure.role == "ratios" and values.shape == self.initial.shape:
+            lengths, wanted = (np.linalg.norm(x, axis=-1, keepdims=True) for x in (values, self.initial))
+        else:
+            return None
+        factors = np.where(lengths > 0.0, wanted / np.where(lengths > 0.0, lengths, 1.0), 1.0)
+        if self.is_direction:
+            return factors
+        low, high = self.bounds
+        scaled = values * factors
+        left = (scaled < (-np.inf if low is None else low)) | (scaled > (np.inf if high is None else high))
+        return np.where(left.any(axis=-1, keepdims=True), 1.0, factors)
+
     def project(self, values: Array) -> Array:
         """Return the nearest values inside the bounds, less the margin."""
         return project(values, *self.bounds, self._scale)

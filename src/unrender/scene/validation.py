@@ -32,6 +32,7 @@ from unrender.scene.parameter import Parameter, ParameterSettings
 from unrender.scene.prior import Prior
 from unrender.scene.unknown import Unknown
 
+_RATIOS = "pictures show only the ratios of its values; the result has the initial length, errors are up to a factor"
 _DEEPEST = 1 << 20
 _LONGEST_KEY = 200
 _SHORTEST_NORMAL = 0.1
@@ -115,10 +116,9 @@ def check_parameter(
         bounds, narrowed = check_bounds(parameter.bounds, info, start)
     with checking("learning_rate"):
         rate = _check_rate(parameter.learning_rate)
-    preconditioner, parameterisation, transform = None, None, None
+    parameterisation, transform = None, None
     with checking("preconditioner"):
-        if parameter.preconditioner is not None:
-            preconditioner = _check_preconditioner(key, parameter.preconditioner, info)
+        preconditioner = _check_preconditioner(key, parameter.preconditioner, info)
     with checking("coarse_to_fine"):
         schedule = _coarse_to_fine(parameter, info)
     initial, moved = move_inside(start, bounds, info)
@@ -126,8 +126,8 @@ def check_parameter(
     with checking("parameterisation"):
         if parameter.parameterisation is not None:
             parameterisation, transform = _check_parameterisation(parameter.parameterisation, bounds, initial)
-    mesh = None if info.moving_mesh is None else info.moving_mesh()
     with checking("regularizer"):
+        mesh = None if info.moving_mesh is None else info.moving_mesh()
         regularizer = check_regularizer(parameter.regularizer, mesh)
     with checking("prior"):
         known_prior = None if parameter.prior is None else _bound_prior(parameter.prior, info, initial)
@@ -135,7 +135,8 @@ def check_parameter(
         remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
     with checking("self_intersection"):
         check_self_intersection(parameter.self_intersection, mesh)
-    changes = (f"initial {notice}" if notice else "", narrowed, *moved, angle_notice(info, start, *bounds))
+    ratios = _RATIOS if info.role == "ratios" else ""
+    changes = (f"initial {notice}" if notice else "", narrowed, *moved, angle_notice(info, start, *bounds), ratios)
     notices = [f"parameter {key}: {line}" for line in changes if line]
     notices += _at_bounds(key, parameterisation, transform, initial, bounds)
     notices += [] if mesh is None else mesh_notices(key, *mesh)
@@ -258,8 +259,10 @@ def texture_coordinates(renderer: Renderer, key: str, size: int) -> np.ndarray |
     return uv if len(uv) == size // 3 else None
 
 
-def _check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner:
-    """Return the preconditioner, bound to the parameter's mesh if there is one. Raises `InputError` if it does not suit."""
+def _check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner | None:
+    """Return the preconditioner, bound to the parameter's mesh if there is one; None for None. Raises `InputError` if it does not suit."""
+    if preconditioner is None:
+        return None
     if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
     preconditioner = bound_to(preconditioner, mesh_topology(info), info.conversion.repeated)

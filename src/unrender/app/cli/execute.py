@@ -17,7 +17,7 @@ from unrender.methods import Method
 from unrender.methods.plan_file import PlanFile
 from unrender.runs import watches
 from unrender.runs.callbacks import RUN_PHASES, Callback
-from unrender.runs.final_images import image_name
+from unrender.runs.final_checks import image_name
 from unrender.runs.image_sensitivity import seen_cells
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations

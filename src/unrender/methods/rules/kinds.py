@@ -53,6 +53,17 @@ def textures(traits: Traits) -> Part:
     return Part(keys, f"Sobolev gradients of {listed(keys)}", smoothed=True) if keys else Part()
 
 
+def unconnected_values(traits: Traits) -> Part:
+    """Use one rate for all elements of long lists without neighbours, such as vertex normals, of which pictures show some hardly."""
+    keys = tuple(
+        key
+        for key, unknown in traits.problem.unknowns.items()
+        if len(unknown.shape()) == 1 and unknown.initial.size > traits.constants.few_numbers
+        if traits.infos[key].mesh is None and key not in traits.block
+    )
+    return Part(keys, f"one rate for all elements of {listed(keys)}") if keys else Part()
+
+
 def volumes(traits: Traits) -> Part:
     """Use coarse resolutions in the first steps for grids without detail at the start, because a few cells have less noise.
 
@@ -107,5 +118,5 @@ def meshes(traits: Traits) -> Part:
     return Part(keys, reason, settings, optimizer=lambda rate: Adam(rate, schedule=schedule, uniform=True))
 
 
-KINDS: tuple[Callable[[Traits], Part], ...] = (textures, volumes, positive_values, lights, meshes)
+KINDS: tuple[Callable[[Traits], Part], ...] = (textures, unconnected_values, volumes, positive_values, lights, meshes)
 """Rules in the order of their reasons."""

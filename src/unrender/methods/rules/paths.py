@@ -15,7 +15,7 @@ from unrender.methods.base import method
 from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling
 from unrender.methods.rules.first_rates import first_rates
-from unrender.methods.rules.kinds import KINDS
+from unrender.methods.rules.kinds import KINDS, unconnected_values
 from unrender.methods.rules.newton import with_separate_block
 from unrender.methods.rules.traits import Traits, refusal
 from unrender.methods.smoothed import parse_widths, widths_of
@@ -80,6 +80,7 @@ def paths(traits: Traits) -> Plan:
         preconditioned=smoothed,
         wiener=not isinstance(sampler, pixels.Uniform),
         reparameterised=tuple(key for key, own in configured.unknowns.items() if own.transform is not None),
+        uniform=unconnected_values(traits).keys,
         pulled=pulled,
     )
     for part in own:

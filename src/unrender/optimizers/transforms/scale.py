@@ -16,6 +16,7 @@ from unrender.optimizers.transforms.base import (
     StepTransform,
     StepUpdate,
     TransformState,
+    checked_keys,
 )
 
 
@@ -40,18 +41,21 @@ class ScaleByRms(StepTransform):
     Args:
         decay: β₂, decay of the mean, in [0, 1).
         epsilon: ε, in units of the gradient, > 0.
-        uniform: Whether all elements of a parameter are divided by the largest √v̂ among them (Nicolet et al. 2021).
+        uniform: Whether all elements of a parameter are divided by the largest √v̂ among them (Nicolet et al. 2021); or keys of the
+            parameters for which this is so.
         long_memory: Whether all gradients have equal weight in v from step 1 / (1 − β₂) on. A constant decay makes steps grow as
             gradients vanish (Reddi et al. 2018, "On the Convergence of Adam and Beyond").
     """
 
     decay: float = 0.999
     epsilon: float = 1e-8
-    uniform: bool = False
+    uniform: bool | tuple[str, ...] = False
     long_memory: bool = False
 
     def __post_init__(self):
         checks.flags(self)
+        if not isinstance(self.uniform, bool):
+            object.__setattr__(self, "uniform", checked_keys("ScaleByRms: uniform", self.uniform))
         checks.number("ScaleByRms", "decay", self.decay, above=0.0, below=1.0, inclusive=True)
         checks.number("ScaleByRms", "epsilon", self.epsilon, above=0.0)
 
@@ -74,7 +78,8 @@ class ScaleByRms(StepTransform):
                 second[key] = before + arrays.scalar(weight, g) * (g * g)
             else:
                 second[key] = self.decay * before + weight * (g * g)
-            square = arrays.largest(second[key]) if self.uniform else second[key]
+            uniform = self.uniform if isinstance(self.uniform, bool) else key in self.uniform
+            square = arrays.largest(second[key]) if uniform else second[key]
             root = arrays.sqrt(square) * arrays.scalar(debias, g)
             direction[key] = update.direction[key] / (root + self.epsilon)
         return replace(update, direction=direction), MeanSquare(second)

@@ -35,6 +35,9 @@ _REFLECTANCE = (
     "reflectance", "diffuse_reflectance", "specular_reflectance", "diffuse_transmittance", "specular_transmittance", "base_color",
 )  # fmt: skip
 _DIRECTIONS = (NORMALS, "sun_direction", "direction")
+_NORMALISED = {"TabulatedPhaseFunction": "values"}
+"""{class of a plugin: list of values that it normalises, so that a common factor changes no image}. Pictures depend on the factor of the
+entries of an SGGX matrix, though little."""
 
 _OUTLINES = {
     "BSplineCurve": ("control_points",),
@@ -226,6 +229,8 @@ def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Ro
     names, node = key.split("."), parameters.properties[key][2]
     if vectors and names[-1] in _DIRECTIONS:
         return "direction"
+    if _NORMALISED.get(node.class_name()) == names[-1] and math.prod(shape) > 1:
+        return "ratios"
     while node is not None:  # find the normal or bump map, however its texture is wrapped
         if isinstance(node, mi.BSDF):
             if node.class_name() == "BumpMap" and "nested_texture" in names and len(shape) > 1:

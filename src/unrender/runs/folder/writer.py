@@ -24,6 +24,7 @@ from unrender.io import files
 from unrender.optimizers.base import Measuring
 from unrender.runs import callbacks
 from unrender.runs.callbacks import Callback
+from unrender.runs.final_checks import joined_warnings
 from unrender.runs.final_images import at_start, render_final_images, warm_up
 from unrender.runs.folder import checkpoint, contents, method_file
 from unrender.runs.folder.history import THINNED_FROM, HistoryFile, thinned
@@ -193,7 +194,7 @@ class RunWriter(Callback):
                 undetermined=images.undetermined,
                 without_errors=images.without_errors,
                 standard_error=images.standard_error,
-                warnings=[*result.warnings, *images.warnings],
+                warnings=joined_warnings(result.warnings, images.warnings),
             )
             result = callbacks.with_phase(result, callbacks.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)

@@ -1,0 +1,261 @@
+"""Checks of the final images of a run: worse than those of the start, or different from the references."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from unrender.core import arrays
+from unrender.display import formatting
+from unrender.estimators.penalties import penalty
+from unrender.runs.earlier_image import no_improvement
+from unrender.runs.result import Result
+from unrender.runs.verification import DIFFERS, Misfit, misfit, residuals_of_views
+from unrender.scene.problem import Problem
+from unrender.statistics.paired_losses import mean_square
+
+_ERRORS, _ERRORS_OF_RISE, _OF_START, _OF_PICTURE = 2.0, 4.0, 0.2, 1e-4
+"""Standard errors by which a verified loss must have fallen to be lower; those by which final images must be worse than the initial ones,
+and by how much of the initial mean square error and of the mean square of the references."""
+
+_OF_BIAS = 0.25
+"""Share of the bias from noise that counts as its standard error, since two halves may agree by chance."""
+
+_STEP = 0.1
+"""Change of the parameters, relative to the range between their bounds, or to the root mean square of their values."""
+_LITTLE = 0.1
+"""Change of a pixel by random changes of all elements, relative to the usual one, up to which the unknowns hardly change it."""
+_FEWEST, _MOST_KEYS = 64, 4
+"""Fewest pixels that are judged, and most unknowns that change as a whole."""
+_LEAST = 0.02
+"""Smallest difference relative to these pixels of the references."""
+_SEED = 7
+_SURE, _OF_FILTER, _OF_NOISE, _MOSTLY = 4.5, 1.8, 0.5, 0.8
+"""Standard errors from which a residual looks like a distorted reference; factor of these for noise that neighbouring pixels share; and
+smallest size relative to the noise of half of the samples, and to the difference whose cause it is."""
+
+Picture = Callable[[Mapping[str, np.ndarray], int], np.ndarray]
+"""Function of values and a view that returns a picture (H, W, 3), with the random numbers of the first of the pictures of the end."""
+
+
+def image_name(view: int, which: str) -> str:
+    """Return the name of a view's "initial" or "result" image."""
+    return f"view{view}/{which}"
+
+
+def rise(
+    problem: Problem,
+    result: Result,
+    pictures: Mapping[str, np.ndarray],
+    errors: Mapping[str, tuple[float, float]],
+    halves: Mapping[str, Sequence[tuple[np.ndarray, ...]]],
+) -> str:
+    """Return a warning if the final images of all views are worse than the initial ones, by more than noise and by a visible amount.
+
+    It is "" where the verification found that the loss has fallen, or that earlier parameters are better, and for losses and priors whose
+    minimum is elsewhere. Losses of full images, of which the verification renders few, are compared themselves.
+    """
+    prior = any(unknown.prior is not None for unknown in problem.unknowns.values())
+    if prior or (problem.loss.pixelwise and not problem.loss.linear):
+        return ""
+    start, end = (result.verification.get(name, [None, None]) for name in ("start", "end"))
+    ended = problem.remeshed_from is None and result.status == "finished" and result.verification.get("best") == "end"
+    if not ended or None in (*start, *end):
+        return ""
+    if end[0] + _ERRORS * math.hypot(start[1], end[1]) < start[0] or len(errors) < 2 * len(problem.views):
+        return ""
+    if not problem.loss.pixelwise:
+        values, views = (result.initial, result.parameters), range(len(problem.views))
+        pairs = zip(values, (halves["initial"], halves["result"]), strict=True)
+        (before, noise), (after, more) = (loss_of_halves(problem, own, views, images) for own, images in pairs)
+        rises = after - before > max(_ERRORS_OF_RISE * math.hypot(noise, more), _OF_START * before)
+        return _worse("loss", after, before) if rises else ""
+    totals, variance, size = {"initial": 0.0, "result": 0.0}, 0.0, 0.0
+    for index, view in enumerate(problem.views):
+        share = view.weight / sum(each.weight for each in problem.views)
+        size += share * float(np.mean(np.square(pictures[f"view{index}/reference"])))
+        for which in totals:
+            value, error = errors[image_name(index, which)]
+            totals[which] += share * value**2
+            # Beyond four errors the second number is the error of the value, else an upper bound (see `debiased.rmse`).
+            variance += (share * (2.0 * value * error if value > 4.0 * error else 0.5 * error**2)) ** 2
+    risen = totals["result"] - totals["initial"]
+    if not (
+        risen > _ERRORS_OF_RISE * math.sqrt(variance) and risen > max(_OF_START * totals["initial"], _OF_PICTURE * size)
+    ):
+        return ""
+    return _worse("image error", math.sqrt(totals["result"]), math.sqrt(totals["initial"]))
+
+
+def _worse(measure: str, after: float, before: float) -> str:
+    return (
+        f"the final picture is worse than the initial one: {measure} {formatting.number(after)}, {formatting.number(before)} at the start; "
+        "the result holds the initial parameters; try a lower learning_rate, more samples per pixel, or another method"
+    )
+
+
+def loss_of_halves(
+    problem: Problem, values: Mapping[str, np.ndarray], views: Sequence[int], images: Sequence[tuple[np.ndarray, ...]]
+) -> tuple[float, float]:
+    """Return the loss of images of some views without the bias from their noise, and about its standard error, from their halves."""
+    loss, square, array = penalty(problem, values), 0.0, problem.renderer.array
+    for view, (one, other) in zip(views, images, strict=True):
+        both, *parts = (
+            arrays.number(problem.loss_value(view, array(image))) for image in ((one + other) / 2, one, other)
+        )
+        half = sum(parts) / 2.0
+        loss += 2.0 * both - half
+        square += (0.5 * (parts[0] - parts[1])) ** 2 + (_OF_BIAS * (half - both)) ** 2
+    return loss, math.sqrt(square)
+
+
+def differs_still(
+    problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
+) -> str:
+    """Return a warning of `no_improvement` by the halves of the final images; "" if one is known or the images are not all."""
+    known = any(DIFFERS in line for line in result.warnings) or result.verification.get("best") != "end"
+    if known or len(views) < len(problem.views) or len(ends[0]) < 2:
+        return ""
+    loss, _ = loss_of_halves(problem, result.parameters, views, ends)
+    change = result.verification.get("change", {})
+    lines = no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends))
+    return lines[0] if lines else ""
+
+
+def joined_warnings(earlier: Sequence[str], later: Sequence[str]) -> list[str]:
+    """Return the warnings of a run with those of its final images, whose line about the references replaces an earlier one."""
+    known = any(DIFFERS in line for line in later)
+    return [*(line for line in earlier if not (known and DIFFERS in line)), *later]
+
+
+def unexplained_pixels(
+    problem: Problem,
+    result: Mapping[str, np.ndarray],
+    starts: Sequence[Sequence[np.ndarray]],
+    ends: Sequence[Sequence[np.ndarray]],
+    picture: Picture,
+) -> str:
+    """Return a warning if pixels that the unknowns hardly change differ from the references by more than noise; else "".
+
+    A run may be short, so its residual r contains what the unknowns will still explain. Random changes of all elements show which pixels
+    depend on them directly. Light that all elements send to the others, such as a wall's to the floor, changes with their mean: what the
+    run's own change of the pictures and constant changes of each unknown explain of r is subtracted, by least squares in each channel.
+
+    Poses, lenses and vertex positions may change any pixel, so problems with such unknowns are not judged.
+
+    Args:
+        result: {key: array} at the end.
+        starts, ends: K >= 2 independent pictures (H, W, 3) of each view at the start and at the end.
+        picture: see `Picture`.
+    """
+    known, views = problem.renderer.parameters(), range(len(problem.views))
+    moving = any(known[key].rigid or known[key].viewpoint or known[key].welded for key in problem.unknowns)
+    if moving or len(problem.unknowns) > _MOST_KEYS or len(ends) < len(views) or len(ends[0]) < 2:
+        return ""
+    residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
+
+    def change(values: Mapping[str, np.ndarray]) -> np.ndarray:
+        return _joined([picture(values, view) - of[0] for view, of in zip(views, ends, strict=True)])
+
+    signs = np.random.default_rng(_SEED)
+    random = {key: _changed(problem, key, x, signs.choice((-1.0, 1.0), x.shape)) for key, x in result.items()}
+    little = _is_little(change(random), weights)
+    if np.count_nonzero(little * weights) < _FEWEST:
+        return ""
+    explained = [_joined([np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)])]
+    explained += [change({**result, key: _changed(problem, key, x, np.ones(x.shape))}) for key, x in result.items()]
+    rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
+    differs = misfit(rest[0::2], rest[1::2], references, weights * little, sizes, _LEAST)
+    cause, shared = _as_if(rest, residuals + references, weights * little, sizes)
+    if differs is None and cause:
+        size, total = (np.sqrt(mean_square(x, weights * little)) for x in (references, rest.mean(axis=0)))
+        if shared > _LEAST * size:
+            differs = Misfit(shared, float(size), float(np.sqrt(max(total**2 - shared**2, 0.0))))
+    if differs is None:
+        return ""
+    cause = cause if shared > _MOSTLY * differs.error else ""
+    share = np.count_nonzero(little * weights) / np.count_nonzero(weights)
+    return (
+        f"{differs.describe()} in the {share:.0%} of its pixels that the unknowns hardly change{cause}: light, depth, alignment or "
+        "something else that is not among the unknowns is wrong"
+    )
+
+
+def _as_if(
+    residuals: np.ndarray, images: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]
+) -> tuple[str, float]:
+    """Return what a view's reference looks like, and the root mean square of the difference over all pixels; "" and 0 for nothing.
+
+    The residual of the first half of the images is fitted by changes of the second half, whose noise is independent of it. Rare bright
+    samples leave most pixels too dark, so a fit below the noise of a half means nothing.
+    """
+    cause, total, start = "", max(float(weights.sum()) * 3, 1e-300), 0
+    noise = (residuals[0::2].mean(axis=0) - residuals[1::2].mean(axis=0)) / math.sqrt(2.0)
+    shared = _OF_NOISE * math.sqrt(mean_square(np.where(np.isfinite(noise), noise, 0.0), weights))
+    for view, (height, width) in enumerate(sizes):
+        part = slice(start, start + height * width)
+        start += height * width
+        root = np.sqrt(weights[part])[:, None]
+        image = images[1::2, part].mean(axis=0).reshape(height, width, 3)
+        wanted = np.ravel(residuals[0::2, part].mean(axis=0) * root)
+        if not (np.isfinite(image).all() and np.isfinite(wanted).all()) or np.count_nonzero(root) < _FEWEST:
+            continue
+        for words, changes in _distortions(image).items():
+            columns = np.stack([np.ravel(change.reshape(-1, 3) * root) for change in changes], axis=1)
+            inverse = np.linalg.pinv(columns.T @ columns, hermitian=True)
+            amounts = inverse @ (columns.T @ wanted)
+            scores = columns * (wanted - columns @ amounts)[:, None]
+            errors = np.sqrt(np.diagonal(inverse @ (scores.T @ scores) @ inverse))
+            fitted = math.sqrt(float(np.square(columns @ amounts).sum()) / total)
+            if fitted > shared and (np.abs(amounts) > _SURE * _OF_FILTER * errors).any():
+                moved = [f"{-x:.2g}" for x in amounts]
+                cause, shared = f", as if the reference of view {view} {words.format(*moved)}", fitted
+    return cause, shared
+
+
+def _distortions(image: np.ndarray) -> dict[str, list[np.ndarray]]:
+    """Return changes of an image (H, W, 3), in units of a pixel where they move it, by their words."""
+    from scipy.ndimage import gaussian_filter  # takes long to import
+
+    down, along = np.gradient(image, axis=(0, 1))
+    height, width = image.shape[:2]
+    y, x = np.mgrid[:height, :width] - np.array([height - 1, width - 1]).reshape(2, 1, 1) / 2
+    return {
+        "were shifted by {} pixels along x and {} along y": [-along, -down],
+        "were blurred": [gaussian_filter(image, (1.0, 1.0, 0.0)) - image],
+        "had another field of view": [x[..., None] * along + y[..., None] * down],
+    }
+
+
+def _joined(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.reshape(picture, (-1, 3)) for picture in pictures]).astype(np.float64)
+
+
+def _changed(problem: Problem, key: str, values: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    """Return values changed by a step of the given signs, which turn where the step would leave the bounds."""
+    low, high = problem.unknowns[key].bounds
+    size = float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))) or 1.0
+    step = _STEP * (size if low is None or high is None else high - low) * signs
+    outside = values + step != np.asarray(problem.unknowns[key].project(values + step))
+    return np.asarray(problem.unknowns[key].project(values + np.where(outside, -step, step)), np.float32)
+
+
+def _is_little(change: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return which pixels a change (N, 3) leaves nearly as they are, relative to the pixels that it changes most, (N,)."""
+    squares = np.square(change).max(axis=1) * (weights > 0)
+    usual = float(np.square(squares).sum()) / max(float(squares.sum()), 1e-300)
+    return squares <= _LITTLE**2 * usual
+
+
+def _projection(residual: np.ndarray, changes: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
+    """Return the combination of changes (N, 3) that is closest to a residual (N, 3), with coefficients of each channel."""
+    roots, closest = np.sqrt(weights), np.zeros_like(residual)
+    for channel in range(residual.shape[1]):
+        columns = np.stack([change[:, channel] for change in changes], axis=1)
+        finite = np.isfinite(columns).all(axis=1) & np.isfinite(residual[:, channel])
+        used = (roots * finite)[:, None] * np.where(finite[:, None], columns, 0.0)
+        wanted = roots * finite * np.where(finite, residual[:, channel], 0.0)
+        closest[:, channel] = np.where(finite[:, None], columns, 0.0) @ np.linalg.lstsq(used, wanted, rcond=1e-8)[0]
+    return closest
