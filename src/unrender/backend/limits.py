@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,6 +31,24 @@ def free_memory() -> int:
     except (OSError, ValueError, IndexError):
         pass
     return min(candidates, default=0)
+
+
+def free_gpu_memory() -> int:
+    """Return the free memory of the visible GPU in bytes; 0 if unknown."""
+    device = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0]
+    free = first_line("nvidia-smi", f"--id={device}", "--query-gpu=memory.free", "--format=csv,noheader,nounits")
+    return int(free) << 20 if free and free.isdigit() else 0
+
+
+def first_line(program: str, *arguments: str) -> str | None:
+    """Return the first line that a program prints; None if there is no such program, or it fails."""
+    if not shutil.which(program):
+        return None
+    try:
+        answer = subprocess.run([program, *arguments], capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip().partition("\n")[0] or None
 
 
 def group_memory() -> int:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import platform
-import sys
+import re
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from unrender.backend.limits import cores
+from unrender.backend.limits import cores, first_line
 from unrender.backend.variant import current, llvm_version
 
 
@@ -50,15 +50,14 @@ def hardware() -> dict[str, Any]:
 
 @cache
 def _hardware() -> dict[str, Any]:
-    return {"processor": _processor(), "cores": cores(), "system": f"{platform.system()} {platform.machine()}"}
+    return {"processor": processor(), "cores": cores(), "system": f"{platform.system()} {platform.machine()}"}
 
 
-def _processor() -> str:
-    if sys.platform == "linux":
-        try:
-            for line in Path("/proc/cpuinfo").read_text().splitlines():
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-        except OSError:
-            pass
-    return platform.processor() or platform.machine()
+def processor() -> str:
+    """Return the name of the processor, or of its kind if the system does not tell it."""
+    try:
+        if match := re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return match[1]
+    except OSError:
+        pass
+    return first_line("sysctl", "-n", "machdep.cpu.brand_string") or platform.processor() or platform.machine()

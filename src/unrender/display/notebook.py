@@ -13,9 +13,8 @@ import numpy as np
 
 from unrender.core import phases
 from unrender.display import pictures
-from unrender.display.plots import Chart
+from unrender.display.plots import COLOURS, Chart
 
-_COLOURS = ("#2a6fdb", "#d9622b", "#1a9a6c", "#8a4fc4", "#b8860b", "#c2407f")
 _FEW_PIXELS = 200
 _SHOWN_WIDTH = 180
 
@@ -80,7 +79,7 @@ def _chart(chart: Chart) -> str:
     )
     legend = []
     for curve in chart.curves:
-        colour = _COLOURS[curve.colour % len(_COLOURS)]
+        colour = COLOURS[curve.colour]
         parts.append(
             f'<path d="{escape(curve.path)}" fill="none" stroke="{colour}" stroke-width="1.6" stroke-linecap="round"/>'
         )

@@ -15,7 +15,7 @@ AXES = ("seconds", "samples")
 WIDTH, HEIGHT = 420, 270
 LEFT, RIGHT, TOP, BOTTOM = 54, 14, 10, 40
 _LOGARITHMIC_FROM = 4.0
-_COLOURS = 6
+COLOURS = ("#2a6fdb", "#d9622b", "#1a9a6c", "#8a4fc4", "#b8860b", "#c2407f")
 _SMALLEST, _LARGEST = 1e-280, 1e280
 """Range of magnitudes: ticks of numbers near the ends of the doubles would overflow or be zero."""
 
@@ -122,7 +122,7 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
     """
     x_label, format_value = axis_format(axis)
     shown = [line for line in lines if np.isfinite(line.y).any()]
-    more, shown = max(0, len(shown) - _COLOURS), shown[:_COLOURS]
+    more, shown = max(0, len(shown) - len(COLOURS)), shown[: len(COLOURS)]
     if not shown:
         return None
     end = min(end, _LARGEST) if end > _SMALLEST else 1.0
@@ -204,7 +204,7 @@ def _curve(line: Line, x_axis: Axis, y_axis: Axis) -> Curve:
         there = zip(across, _to_y(y_axis, line.high[known]), strict=True)
         back = zip(across[::-1], _to_y(y_axis, line.low[known])[::-1], strict=True)
         band = "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in [*there, *back]) + "Z" if known.sum() > 1 else ""
-    return Curve(line.name, _path(line, x_axis, y_axis), band, line.colour % _COLOURS)
+    return Curve(line.name, _path(line, x_axis, y_axis), band, line.colour % len(COLOURS))
 
 
 def _path(line: Line, x_axis: Axis, y_axis: Axis) -> str:

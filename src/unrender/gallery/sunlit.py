@@ -18,7 +18,6 @@ import numpy as np
 
 from unrender.backend import variant
 from unrender.core import checks
-from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.gallery import fields, meshes, parts, textures
@@ -186,10 +185,7 @@ def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int =
         document = {"camera_angle_x": np.radians(_FIELD_OF_VIEW), "frames": frames}
         (made / "transforms.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
-    try:
-        files.write_folder(out, fill)
-    except OSError as error:
-        raise InputError(f"photographs: {out}: {error.strerror or error}") from error
+    files.write_folder(out, fill, f"photographs: {out}")
     return out
 
 

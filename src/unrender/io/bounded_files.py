@@ -139,19 +139,11 @@ def _not_regular(mode: int) -> str:
 
 def read_bytes(path: Path, largest: int, folder: Path | None = None) -> bytes:
     """Return the bytes of a regular file of at most `largest` bytes; see `open_regular`."""
-    try:
-        with open_regular(path, folder) as file:
-            data = file.read(largest + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    with files.input_errors(f"{path}: cannot be read"), open_regular(path, folder) as file:
+        data = file.read(largest + 1)
     if len(data) > largest:
-        size = (
-            f"{largest >> 20} MiB"
-            if largest >= 1 << 20
-            else f"{largest >> 10} KiB"
-            if largest >= 1 << 10
-            else f"{largest} bytes"
-        )
+        units = ((20, "MiB"), (10, "KiB"), (0, "bytes"))
+        size = next(f"{largest >> shift} {unit}" for shift, unit in units if largest >= 1 << shift or not shift)
         raise InputError(f"{path}: larger than {size}, which no such file is")
     return data
 

@@ -17,7 +17,7 @@ import re
 import shutil
 import sys
 import zipfile
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -41,6 +41,15 @@ COMPRESSED_BYTES = 1 << 26
 _HEADERS = 1 << 20
 
 
+@contextlib.contextmanager
+def input_errors(where: str) -> Iterator[None]:
+    """Raise `InputError` with a message that begins with `where` for an `OSError` of the statements inside."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{where}: {error.strerror or error}") from error
+
+
 # ---------------------------------------------------------------------- files
 
 
@@ -59,7 +68,7 @@ def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) 
         InputError: the file cannot be written; a previous file is then unchanged.
     """
     partial = temporary(path)
-    try:
+    with input_errors(f"{path}: cannot be written"):
         make_folder(path.parent, durable)
         if durable:
             remove_leftovers(path.parent, (path.name,))
@@ -74,8 +83,6 @@ def write(path: Path, data: bytes, durable: bool = True, name_too: bool = True) 
                 sync_folder(path.parent)
         finally:
             partial.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path
 
 
@@ -218,32 +225,32 @@ def check_replaceable(place: Path, own: Collection[str], record: str, overwrite:
         what: description of such a folder, e.g. "an earlier judgement".
     """
     remove_leftovers(place.parent, (place.name,))
-    try:
+    with input_errors(label):
         if place.exists() and not place.is_dir():
             raise InputError(f"{label}: a file, expected a folder")
         present = {path.name for path in place.iterdir()} if place.is_dir() else set()
-    except OSError as error:
-        raise InputError(f"{label}: {error.strerror or error}") from error
     if present and (record not in present or not present <= set(own)):
         raise InputError(f"{label}: the folder holds other things; give a new one")
     if present and not overwrite:
         raise InputError(f"{label}: holds {what}; give --overwrite (overwrite=True) to replace it")
 
 
-def write_folder(place: Path, fill: Callable[[Path], _T]) -> _T:
+def write_folder(place: Path, fill: Callable[[Path], _T], label: str) -> _T:
     """Create or replace the folder `place` as `replace_folder` does. If filling it fails, nothing is left behind.
 
     Args:
         place: path of the folder; its parents are created.
         fill: function that writes the contents into an empty folder.
+        label: beginning of the message of an error, e.g. "export to out/room".
 
-    Returns the result of `fill`. Raises `OSError`, and whatever `fill` raises.
+    Returns the result of `fill`. Raises `InputError` if the folder cannot be written, and whatever `fill` raises.
     """
     partial = place.with_name(f".{place.name}.{os.getpid()}.{PARTIAL}")
     try:
-        make_folder(partial)
-        result = fill(partial)
-        replace_folder(partial, place)
+        with input_errors(label):
+            make_folder(partial)
+            result = fill(partial)
+            replace_folder(partial, place)
         return result
     finally:
         shutil.rmtree(partial, ignore_errors=True)

@@ -163,12 +163,9 @@ def _check_size(shape: Shape) -> None:
 
 
 def _read_vol(path: Path, check: Callable[[Shape], None]) -> Grid:
-    try:
-        with bounded_files.open_regular(path) as file:
-            shape, box = _vol_header(file, path, check)
-            data = file.read(4 * math.prod(shape))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    with files.input_errors(f"{path}: cannot be read"), bounded_files.open_regular(path) as file:
+        shape, box = _vol_header(file, path, check)
+        data = file.read(4 * math.prod(shape))
     if len(data) != 4 * math.prod(shape):
         raise InputError(f"{path}: it changed while it was read")
     values = np.frombuffer(data, "<f4").astype(np.float32).reshape(shape)

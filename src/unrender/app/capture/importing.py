@@ -312,10 +312,8 @@ def _check_place(out: Path, folder: Path, options: ImportOptions, own: set[str])
     for what, needed in (("FOLDER", folder), ("--masks", options.masks)):
         if needed is not None and needed.resolve().is_relative_to(place):
             raise InputError(f"--out {out}: {what} {needed} is inside it and would be removed; give a new folder")
-    try:
+    with files.input_errors(f"--out {out}"):
         others = sorted({path.name for path in out.iterdir()} - own) if out.is_dir() else []
-    except OSError as error:
-        raise InputError(f"--out {out}: {error.strerror or error}") from error
     if others:
         raise InputError(f"--out {out}: contains other files, such as {printable(others[0])}; give a new folder")
 
@@ -382,7 +380,4 @@ def _imported(data: _Read, out: Path, mesh: Mesh) -> Imported:
 
 def _write_folder(out: Path, fill: Callable[[Path], None]) -> None:
     files.remove_leftovers(out.parent, (out.name,))
-    try:
-        files.write_folder(out, fill)
-    except OSError as error:
-        raise InputError(f"--out {out}: cannot be written: {error.strerror or error}") from error
+    files.write_folder(out, fill, f"--out {out}: cannot be written")

@@ -5,15 +5,12 @@ from __future__ import annotations
 import os
 import platform
 import re
-import shutil
-import subprocess
 import sys
 from importlib import metadata
-from pathlib import Path
 
 from rich.markup import escape
 
-from unrender.backend import cache, limits, llvm, variant
+from unrender.backend import cache, limits, llvm, variant, versions
 from unrender.core.errors import VariantError
 from unrender.display.terminal import Console, columns
 
@@ -146,10 +143,10 @@ def _llvm() -> str:
 
 def _hardware() -> list[tuple[str, str]]:
     problem = variant.gpu_problem()
-    gpu = _first_line("nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
+    gpu = limits.first_line("nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader")
     cores = limits.cores()
     return [
-        ("CPU", f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"),
+        ("CPU", f"{versions.processor()}, {cores} core{'s' if cores > 1 else ''}"),
         ("GPU", (gpu or "CUDA works") if problem is None else f"not used: {problem}" + (f" ({gpu})" if gpu else "")),
     ]
 
@@ -168,26 +165,6 @@ def _cache() -> list[tuple[str, str]]:
         ]
     sizes = ", ".join(f"{part} {cache.size(part) / 1e6:.0f} MB" for part in (cache.REFERENCES, cache.KERNELS))
     return [("cache", f"{place} ({sizes})")]
-
-
-def _processor() -> str:
-    try:
-        if match := re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
-            return match[1]
-    except OSError:
-        pass
-    return _first_line("sysctl", "-n", "machdep.cpu.brand_string") or platform.processor() or platform.machine()
-
-
-def _first_line(program: str, *arguments: str) -> str | None:
-    """Return the first line that a program prints; None if there is no such program, or it fails."""
-    if not shutil.which(program):
-        return None
-    try:
-        answer = subprocess.run([program, *arguments], capture_output=True, text=True, timeout=20, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return answer.stdout.strip().partition("\n")[0] or None
 
 
 def _missing() -> list[str]:

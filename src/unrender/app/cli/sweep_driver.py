@@ -35,7 +35,6 @@ from unrender.app.sweeps.record import (
 from unrender.app.sweeps.search import Search
 from unrender.app.sweeps.trials import Started, Trials, trial_record
 from unrender.backend.variant import check_threads
-from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.display import formatting
 from unrender.display.terminal import Console, columns
@@ -326,10 +325,7 @@ def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:
     runs, message = [], ended.message
     if not message:
         runs, written = ended.value
-        try:
-            tasks.receive(session.folder, written)
-        except OSError as error:
-            raise InputError(f"sweep {session.folder}: cannot be written: {error.strerror or error}") from error
+        tasks.receive(session.folder, written)
         stopped = next((run.stopped for run in runs if run.status == "interrupted"), "")
         if stopped and session.workers is None:
             state.stopped = stopped

@@ -181,7 +181,7 @@ def on_worker(job: Job, tasks: Sequence[RunTask]) -> tuple[list[RunOutcome], dic
 
 
 def receive(folder: Path, written: Mapping[str, bytes]) -> None:
-    """Write the files that a worker sent back. run.json comes last in each run folder. Raise `OSError`."""
+    """Write the files that a worker sent back. run.json comes last in each run folder. Raise `InputError`."""
     for name in sorted(written, key=lambda name: name.endswith(RECORD)):
         files.write(folder / name, written[name], durable=False)
 

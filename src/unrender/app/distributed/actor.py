@@ -47,7 +47,7 @@ class ViewWorker:
     def place(self) -> Place:
         """Return the location of the worker. The first answer signals that it is ready."""
         gpu = os.environ.get("CUDA_VISIBLE_DEVICES", "") if self._variant.startswith("cuda") else ""
-        free = _free_gpu_memory() if gpu else limits.free_memory()
+        free = limits.free_gpu_memory() if gpu else limits.free_memory()
         return Place(socket.gethostname(), os.getpid(), free, gpu)
 
     def alive(self) -> bool:
@@ -81,16 +81,3 @@ class ViewWorker:
 
     def fetch(self, share: int, number: int) -> Packed:
         return self._shares[share].fetch(number)
-
-
-def _free_gpu_memory() -> int:
-    """Return the free bytes of the visible GPU; 0 if unknown."""
-    import subprocess
-
-    device = os.environ.get("CUDA_VISIBLE_DEVICES", "0").split(",")[0]
-    words = ["nvidia-smi", f"--id={device}", "--query-gpu=memory.free", "--format=csv,noheader,nounits"]
-    try:
-        output = subprocess.run(words, capture_output=True, text=True, timeout=10, check=True).stdout
-        return int(output.split()[0]) << 20
-    except (OSError, subprocess.SubprocessError, ValueError, IndexError):
-        return 0

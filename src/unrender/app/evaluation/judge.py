@@ -131,10 +131,7 @@ def judge(
         (folder / RECORD).write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         return measures, albedo
 
-    try:
-        measures, albedo = files.write_folder(place, fill)
-    except OSError as error:
-        raise InputError(f"judge: {place}: {error.strerror or error}") from error
+    measures, albedo = files.write_folder(place, fill, f"judge: {place}")
     if measured and not metrics.available():
         notices.append(metrics.MISSING)
     if not measured:

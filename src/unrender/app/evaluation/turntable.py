@@ -214,7 +214,7 @@ def check_video(path: Path, overwrite: bool) -> None:
         raise InputError(f"--out {path}: expected a name that ends in .mp4 or .gif, or the name of a folder")
     if path.suffix.lower() == ".mp4" and not has_ffmpeg():
         raise InputError(f"--out {path}: .mp4 needs imageio-ffmpeg: pip install 'unrender[capture]'; .gif does not")
-    try:
+    with files.input_errors(f"--out {path}"):
         if path.is_dir() and path.suffix:
             raise InputError(f"--out {path}: a folder, expected a file's name")
         if path.is_dir() and any(not _is_frame(each) for each in path.iterdir()):
@@ -226,8 +226,6 @@ def check_video(path: Path, overwrite: bool) -> None:
         there = next(each for each in (path.parent, *path.absolute().parents) if each.exists())
         if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
             raise InputError(f"--out {path}: {there} is not a folder that can be written to")
-    except OSError as error:
-        raise InputError(f"--out {path}: {error.strerror or error}") from error
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
@@ -237,17 +235,14 @@ def write_video(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
         InputError: the video cannot be written.
     """
     ending = path.suffix.lower()
-    try:
-        if not ending:
-            files.remove_leftovers(path.parent, (path.name,))
-            files.write_folder(path, lambda folder: _write_frames(folder, frames))
-            return
-        with tempfile.TemporaryDirectory() as scratch:
-            file = Path(scratch) / f"video{ending}"
-            (_write_gif if ending == ".gif" else _write_mp4)(file, frames, rate)
-            files.write(path, file.read_bytes())
-    except OSError as error:
-        raise InputError(f"--out {path}: {error.strerror or error}") from error
+    if not ending:
+        files.remove_leftovers(path.parent, (path.name,))
+        files.write_folder(path, lambda folder: _write_frames(folder, frames), f"--out {path}")
+        return
+    with files.input_errors(f"--out {path}"), tempfile.TemporaryDirectory() as scratch:
+        file = Path(scratch) / f"video{ending}"
+        (_write_gif if ending == ".gif" else _write_mp4)(file, frames, rate)
+        files.write(path, file.read_bytes())
 
 
 def _is_frame(path: Path) -> bool:

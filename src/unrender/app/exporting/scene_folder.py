@@ -110,12 +110,8 @@ def export(
         raise InputError(f"{problem.name}: it is not rendered by Mitsuba, so there is no scene to export")
     as_tree(problem, parameters)
     values = {key: arrays.numpy(value).astype(np.float32) for key, value in parameters.items()}
-    try:
-        notices, renamed = files.write_folder(
-            out, lambda folder: _write(folder, problem, renderer, values, formats_, spp, related)
-        )
-    except OSError as error:
-        raise InputError(f"export to {out}: {error.strerror or error}") from error
+    contents = problem, renderer, values, formats_, spp, related
+    notices, renamed = files.write_folder(out, lambda folder: _write(folder, *contents), f"export to {out}")
     has_scene = MITSUBA in formats_ and not renderer.pair.emissive
     return Exported(out, out / SCENE if has_scene else None, (*changed, *notices), renamed)
 

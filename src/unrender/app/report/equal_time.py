@@ -251,7 +251,6 @@ def _median_run(group: Group, keys: Sequence[str]) -> RunFolder:
     return sorted(group.runs, key=last)[(len(group.runs) - 1) // 2]
 
 
-_COLOURS = ("#2a6fdb", "#d9622b", "#1a9a6c", "#8a4fc4", "#b8860b", "#c2407f")
 _COLUMNS = 6
 _WIDTH = 10.0
 _CURVES_HEIGHT = 3.4
@@ -313,7 +312,7 @@ def _draw(axes: Axes, metric: Metric, axis: str) -> None:
         band: Band = getattr(outcome, f"over_{axis}")
         finite = np.where(np.isfinite(band.median), band.median, np.nan)
         high = np.where(np.isfinite(band.high), band.high, finite)
-        colour = _COLOURS[i % len(_COLOURS)]
+        colour = plots.COLOURS[i % len(plots.COLOURS)]
         axes.plot(band.x, finite, color=colour, label=_plain(name), linewidth=1.6)
         axes.fill_between(band.x, band.low, high, color=colour, alpha=0.18, linewidth=0)
         plotted.append(finite[np.isfinite(finite)])

@@ -166,11 +166,7 @@ def write_sweep(folder: Path, record: SweepRecord) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    data = schema.encode(SweepRecord, record.model_dump(), str(folder / SWEEP))
-    try:
-        files.write(folder / SWEEP, data)
-    except OSError as error:
-        raise InputError(f"sweep {folder}: cannot be written: {error.strerror or error}") from error
+    files.write(folder / SWEEP, schema.encode(SweepRecord, record.model_dump(), str(folder / SWEEP)))
 
 
 RUN_FOLDERS = "trial-*-seed*"

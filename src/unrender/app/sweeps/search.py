@@ -321,7 +321,8 @@ class TPE:
             warnings.simplefilter("ignore")
             trial = self._study.ask(_distributions(self.axes))
         self._asked[number] = trial
-        return {axis.name: _text(axis, trial.params[axis.name]) for axis in self.axes}
+        proposed = [(axis, trial.params[axis.name]) for axis in self.axes]
+        return {axis.name: value if axis.choices else axis.typed(value) for axis, value in proposed}
 
     def tell(self, number: int, outcome: TrialOutcome) -> None:
         from optuna.trial import TrialState
@@ -336,10 +337,6 @@ class TPE:
         for share, error in outcome.rungs.items():
             trial.report(error, round(1000 * share))
         self._study.tell(trial, state=TrialState.PRUNED)
-
-
-def _text(axis: Axis, value: Any) -> str:
-    return value if axis.choices else axis.typed(value)
 
 
 def _distributions(axes: Sequence[Axis]) -> dict[str, Any]:

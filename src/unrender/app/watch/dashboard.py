@@ -20,7 +20,6 @@ from unrender.app.watch.monitor import Snapshot
 from unrender.display import formatting, plots
 from unrender.runs.folder.reader import RunFolder
 
-_COLOURS = 6
 _MAPS = 8
 _CACHED_PAGES = 8
 _STATES = {
@@ -61,7 +60,7 @@ class RunRow:
     @property
     def colour(self) -> int:
         """The index of the colour of its curves."""
-        return self.number % _COLOURS
+        return self.number % len(plots.COLOURS)
 
 
 class PictureCache:
@@ -187,7 +186,7 @@ def _charts(snapshots: Sequence[Snapshot], labels: Sequence[str]) -> dict[str, l
     if len(snapshots) == 1 and runs:
         charts = {axis: tables.charts(next(iter(runs.values())), axis) for axis in plots.AXES}
     else:
-        colours = {label: i % _COLOURS for i, label in enumerate(labels)}
+        colours = {label: i % len(plots.COLOURS) for i, label in enumerate(labels)}
         charts = {axis: tables.charts_of_runs(runs, colours, axis) for axis in plots.AXES}
     return charts
 
