@@ -63,7 +63,6 @@ class Caustic:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the texture, initially grey."""
         return (Parameter("floor.bsdf.reflectance.data", initial=0.4, preconditioner=LargeSteps(1.0)),)
 
 

@@ -79,7 +79,6 @@ class GlossyRoom:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the four maps, initially constant."""
         return (
             Parameter("tile.bsdf.base_color.data", initial=0.5),
             Parameter("tile.bsdf.roughness.data", initial=0.4, preconditioner=LargeSteps(2.0)),
@@ -168,7 +167,6 @@ class Chalice:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the roughness, initially constant."""
         return (Parameter("chalice.bsdf.brdf_0.roughness.data", initial=0.65, preconditioner=LargeSteps(2.0)),)
 
 
@@ -309,7 +307,6 @@ class Spiral:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return colour, metalness and roughness."""
         leaf = "value" if self.texture_resolution == 1 else "data"
         start = {"base_color": 0.5, "metallic": 0.3, "roughness": 0.6}
         return tuple(Parameter(f"spiral.bsdf.brdf_0.{name}.{leaf}", initial=value) for name, value in start.items())

@@ -51,11 +51,9 @@ class Lenses:
         return self._stage(np.full(len(_CENTRES), _START))
 
     def target(self) -> dict[str, Any]:
-        """Return the true lenses."""
         return self._stage(np.array(_HEIGHTS))
 
     def problem(self, name: str) -> Problem:
-        """Return the problem, with a reference of the true lenses by Mitsuba's `path` integrator."""
         picture = reference(load(self.target), 0, self.reference_spp, self.max_depth)
         grid, shapes = meshes.height_grid(self.mesh_resolution), _shapes(self.mesh_resolution)
         return Problem(
@@ -129,11 +127,9 @@ class Relief:
         return self._stage(np.zeros((self.height_resolution, self.height_resolution)))
 
     def target(self) -> dict[str, Any]:
-        """Return the true plaque."""
         return self._stage(_heights(self.height_resolution))
 
     def problem(self, name: str) -> Problem:
-        """Return the problem: the flat plaque, and references of the true one by Mitsuba's `path` integrator."""
         truth = _heights(self.height_resolution)
         views = []
         for lit in range(len(_LAMPS)):

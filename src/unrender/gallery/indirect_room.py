@@ -72,5 +72,4 @@ class Wall:
         return {**room, "camera": parts.camera((0, 0, 2.1), (0, 0, -1), fov, self.resolution)}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the wall's texture, initially grey."""
         return (Parameter("back.bsdf.reflectance.data", initial=0.5),)

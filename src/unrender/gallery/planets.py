@@ -61,7 +61,6 @@ class TwoPlanets:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the textures, initially exchanged."""
         smooth = LargeSteps(1.0)
         return (
             Parameter("free.bsdf.reflectance.data", initial=red(self.texture_resolution), preconditioner=smooth),
@@ -172,7 +171,6 @@ class GlobeAndMirror:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the texture, initially grey."""
         return (Parameter("globe.bsdf.reflectance.data", initial=0.5, preconditioner=LargeSteps(1.0)),)
 
 
@@ -216,7 +214,6 @@ class ThreeTextures:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the three paints, initially grey."""
         smooth = LargeSteps(1.0)
         return tuple(
             Parameter(f"{name}.bsdf.reflectance.data", initial=0.5, preconditioner=smooth)

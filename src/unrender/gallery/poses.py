@@ -282,7 +282,6 @@ class Box2:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """Return the scene, see `_scene`."""
         return _scene(_ONE, 0.2, self.resolution)
 
     def parameters(self) -> tuple[Parameter, ...]:
@@ -305,7 +304,6 @@ class Box10:
     loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
-        """Return the scene, see `_scene`."""
         return _scene(_FIVE, 0.18, self.resolution)
 
     def parameters(self) -> tuple[Parameter, ...]:

@@ -54,5 +54,4 @@ class Poster:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the texture, initially grey."""
         return (Parameter("poster.bsdf.reflectance.data", initial=0.5),)

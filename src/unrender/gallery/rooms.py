@@ -121,7 +121,6 @@ class Ajar:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the three textures, initially grey."""
         return (
             Parameter("back.bsdf.reflectance.data", initial=0.4, preconditioner=LargeSteps(2.0)),
             Parameter("pot.bsdf.brdf_0.reflectance.data", initial=0.4, preconditioner=LargeSteps(2.0)),
@@ -233,7 +232,6 @@ class PlainAndTextured:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return both reflectances, initially grey."""
         return (
             Parameter("bin.bsdf.brdf_0.reflectance.value", initial=0.5),
             Parameter("cushion.bsdf.brdf_0.reflectance.data", initial=0.5, preconditioner=LargeSteps(1.0)),

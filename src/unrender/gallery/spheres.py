@@ -59,12 +59,10 @@ class SphereToMesh:
         return self._stage() | {"body": meshes.triangles("body", _body(points), faces, _clay())}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the vertices of the sphere."""
         smooth = LargeSteps(float(self.strength)) if self.strength else None
         return (Parameter("sphere.vertex_positions", preconditioner=smooth),)
 
     def problem(self, name: str) -> Problem:
-        """Return the problem: the sphere's scene, and references of the body by Mitsuba's `path` integrator."""
         return reconstruction(name, self, "" if self.pictures == "colour" else self.pictures)
 
     def _stage(self) -> dict[str, Any]:
@@ -139,11 +137,9 @@ class SphereToBunny:
         return self._stage() | {"body": meshes.triangles("body", *_animal(), _fur())}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the vertices of the sphere."""
         return (Parameter("sphere.vertex_positions", remeshing=(self.remesh_at,) if self.remesh_at else None),)
 
     def problem(self, name: str) -> Problem:
-        """Return the problem: the sphere's scene, references of the animal by Mitsuba's `path` integrator, and its surface."""
         return reconstruction(name, self, surface_of="sphere.vertex_positions")
 
     def _stage(self) -> dict[str, Any]:
@@ -197,11 +193,9 @@ class ShadowArt:
         return self._stage() | {"body": meshes.triangles("body", points, faces, parts.twosided(parts.diffuse(0.5)))}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the vertices of the sphere."""
         return (Parameter("sphere.vertex_positions"),)
 
     def problem(self, name: str) -> Problem:
-        """Return the problem: the sphere's scene, and references of the two shadows by Mitsuba's `path` integrator."""
         return reconstruction(name, self)
 
     def _stage(self) -> dict[str, Any]:
@@ -286,11 +280,9 @@ class Statue:
         return self._stage() | {"statue": _statue(_bust, _FINE, _stone(4 * self.texture_resolution))}
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return vertices and texture of the grey sphere."""
         return Parameter("statue.vertex_positions"), Parameter("statue.bsdf.brdf_0.reflectance.data")
 
     def problem(self, name: str) -> Problem:
-        """Return the problem: the sphere's scene, references of the bust by Mitsuba's `path` integrator, and its surface."""
         return reconstruction(name, self, surface_of="statue.vertex_positions")
 
     def _stage(self) -> dict[str, Any]:

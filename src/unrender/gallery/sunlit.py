@@ -59,7 +59,6 @@ class SunlitVase:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the glaze, initially grey."""
         return (Parameter("vase.bsdf.brdf_0.base_color.data", initial=0.5),)
 
 
@@ -230,7 +229,6 @@ class SunGlossy:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the paint, initially grey."""
         return (Parameter("doll.bsdf.diffuse_reflectance.data", initial=0.4, preconditioner=LargeSteps(1.0)),)
 
 

@@ -309,7 +309,6 @@ class Tea:
         }
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return both unknowns, initially thin and grey."""
         return (
             Parameter("tea.interior_medium.sigma_t.value.value", initial=0.15),
             Parameter("tea.interior_medium.albedo.value.value", initial=0.6),

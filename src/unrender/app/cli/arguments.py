@@ -191,9 +191,7 @@ def check_file(name: str) -> None:
         from unrender.io import bounded_files  # imports NumPy
 
         raise InputError(f"{name}: {bounded_files.no_file(file)}")
-    from unrender.app.stages import stages_file
-
-    if not stages_file.is_stages(file):
+    if not is_stages(name):
         from unrender.scene import toml_file
 
         toml_file.check(file)
@@ -239,11 +237,18 @@ def _in_folder(folder: Path) -> str:
     return f"; did you mean {files[0]}?" if len(files) == 1 else ""
 
 
-def refuse_stages(file: str) -> None:
-    """Raise `InputError` for a file of stages if a problem file is expected."""
+def is_stages(name: str) -> bool:
+    """Return whether the argument PROBLEM is a file of stages."""
+    if Path(name).suffix.lower() != ".toml" or not Path(name).is_file():
+        return False
     from unrender.app.stages import stages_file
 
-    if Path(file).is_file() and stages_file.is_stages(Path(file)):
+    return stages_file.is_stages(Path(name))
+
+
+def refuse_stages(file: str) -> None:
+    """Raise `InputError` for a file of stages if a problem file is expected."""
+    if is_stages(file):
         raise InputError(f"{file}: a file of stages, which only `unrender run` accepts; expected a problem file")
 
 

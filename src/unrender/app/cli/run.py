@@ -124,7 +124,7 @@ def run(
     console, command = Console(highlight=False), arguments.command_line(context)
     with Progress(console) as progress:  # options are refused before the slow imports of "loading"
         chosen, processes = _method(method_name), check_workers(workers, compress, insecure)
-        if stages.is_stages(problem):
+        if arguments.is_stages(problem):
             stages.refuse_settings(method_name, values, options, workers, no_cache)
             first = seed if "--seed" in arguments.typed_options(context) else None
             plan = (steps, seconds), first, out, overwrite, variant, threads, command, checkpoint_every, final_spp

@@ -57,15 +57,6 @@ class StagesRun:
         return self.stages.run
 
 
-def is_stages(problem: str) -> bool:
-    """Return whether the argument PROBLEM is a file of stages."""
-    if not problem.endswith(".toml") or not Path(problem).is_file():
-        return False
-    from unrender.app.stages import stages_file
-
-    return stages_file.is_stages(Path(problem))
-
-
 def refuse_workers(workers: str | None) -> None:
     """Raise `InputError` if --workers is given."""
     if workers is not None:

@@ -34,11 +34,7 @@ def _usd(name: str) -> Any:
 
 
 def write_usd(asset: Asset, folder: Path) -> None:
-    """Write asset.usdz without light. As in UsdPreviewSurface, +Y and v point upwards and roughness is perceptual.
-
-    Raises `InputError` if usd-core is missing.
-    """
-    check_usd_installed()
+    """Write asset.usdz without light. As in UsdPreviewSurface, +Y and v point upwards and roughness is perceptual."""
     Usd, UsdGeom, UsdUtils = map(_usd, ("Usd", "UsdGeom", "UsdUtils"))
 
     with tempfile.TemporaryDirectory() as scratch:

@@ -38,12 +38,7 @@ def check_installed() -> None:
 
 
 def glb(asset: Asset) -> bytes:
-    """Return the parts of an asset as a .glb file, without light and cameras.
-
-    Raises:
-        InputError: pygltflib is missing.
-    """
-    check_installed()
+    """Return the parts of an asset as a .glb file, without light and cameras. Call `check_installed` before."""
     import pygltflib
 
     writer = _Writer(pygltflib)
