@@ -239,7 +239,7 @@ def _in_folder(folder: Path) -> str:
 
 def is_stages(name: str) -> bool:
     """Return whether the argument PROBLEM is a file of stages."""
-    if Path(name).suffix.lower() != ".toml" or not Path(name).is_file():
+    if Path(name).suffix.lower() not in ("", ".toml") or not Path(name).is_file():
         return False
     from unrender.app.stages import stages_file
 
