@@ -84,6 +84,16 @@ def test_pictures_are_accessible(tmp_path):
     assert radios == {label["for"] for label in page.all("label") if "for" in label}
 
 
+def test_page_opens_only_when_asked(tmp_path, monkeypatch):
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    run = write_run(tmp_path / "run")
+    report.page(run)
+    assert opened == []
+    path = report.page(run, open_after=True)
+    assert opened == [path.as_uri()]
+
+
 # Pictures
 
 

@@ -215,7 +215,8 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
                 _drive(console, session, state, executor, job)
         state.save(session.folder, "finished" if trials.done else "interrupted")
         show(console, state.record)
-        _page(console, session.folder, state)
+        if best_folders(session.folder, state.record):
+            console.say(f"page: {report.write_page(session.folder, state.record)}")
     finally:
         if not trials.done and (session.folder / SWEEP).exists():
             state.save(session.folder, "interrupted")
@@ -349,9 +350,3 @@ def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
         )
         for i in range(plan.seeds)
     ]
-
-
-def _page(console: Console, folder: Path, state: _State) -> None:
-    if best_folders(folder, state.record):
-        page = report.write_page(folder, state.record)
-        console.say(f"page: {page}")

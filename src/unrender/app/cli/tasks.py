@@ -151,12 +151,6 @@ def outcome(folder: Path, task: RunTask, wall_seconds: float) -> RunOutcome:
     )
 
 
-def quiet() -> tuple[Console, Progress]:
-    """Return a console without visible output, and a progress listener that prints there."""
-    console = Console(file=io.StringIO(), force_terminal=False)
-    return console, Progress(console)
-
-
 # ---------------------------------------------------------------------- worker
 
 
@@ -189,8 +183,8 @@ def receive(folder: Path, written: Mapping[str, bytes]) -> None:
 def in_turn(job: Job, tasks: Sequence[RunTask], problem: Problem) -> list[RunOutcome]:
     """Run tasks in turn, without output, until one does not complete."""
     outcomes: list[RunOutcome] = []
-    console, progress = quiet()
-    with progress:
+    console = Console(file=io.StringIO(), force_terminal=False)
+    with Progress(console) as progress:
         for task in tasks:
             outcomes.append(carry_out(job, task, problem, console, progress))
             if outcomes[-1].status not in ENDED:

@@ -217,7 +217,7 @@ def check_video(path: Path, overwrite: bool) -> None:
     with files.input_errors(f"--out {path}"):
         if path.is_dir() and path.suffix:
             raise InputError(f"--out {path}: a folder, expected a file's name")
-        if path.is_dir() and any(not _is_frame(each) for each in path.iterdir()):
+        if path.is_dir() and any(each.suffix != ".png" or not each.stem.isdigit() for each in path.iterdir()):
             raise InputError(f"--out {path}: the folder contains other files; give a new folder")
         if path.is_file() and not path.suffix:
             raise InputError(f"--out {path}: a file, expected a folder's name")
@@ -243,10 +243,6 @@ def write_video(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
         file = Path(scratch) / f"video{ending}"
         (_write_gif if ending == ".gif" else _write_mp4)(file, frames, rate)
         files.write(path, file.read_bytes())
-
-
-def _is_frame(path: Path) -> bool:
-    return path.suffix == ".png" and path.stem.isdigit()
 
 
 def _write_frames(folder: Path, frames: Iterable[np.ndarray]) -> None:

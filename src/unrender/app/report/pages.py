@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
@@ -28,11 +29,12 @@ _RUN_MAPS = 24
 _SHAPES = 6
 
 
-def page(directory: str | Path) -> Path:
+def page(directory: str | Path, open_after: bool = False) -> Path:
     """Write report.html into a run folder: one file, no network needed.
 
     Args:
         directory: the run folder.
+        open_after: show it in the web browser.
 
     Returns:
         The path of the page.
@@ -63,7 +65,10 @@ def page(directory: str | Path) -> Path:
         rows=[tables.parameter_row(run, key) for key in run.parameters],
         charts={axis: tables.charts(run, axis) for axis in plots.AXES},
     )
-    return write(run.path / "report.html", content)
+    path = write(run.path / "report.html", content)
+    if open_after:
+        webbrowser.open(path.resolve().as_uri())
+    return path
 
 
 _COMPARED_VIEWS = 4
