@@ -70,19 +70,9 @@ def split(problem: Problem, sample: PixelSample, shares: Sequence[Sequence[int]]
             result.append(None)
             continue
         fill = -len(own) % unit if len(shares) > 1 else 0
-
-        def filled(values: np.ndarray, fill: int = fill) -> np.ndarray:
-            return np.concatenate([values, np.zeros(fill, values.dtype)])
-
-        result.append(
-            Batch(
-                filled(local[views[own]]),
-                filled(pixels[own]),
-                filled(weights[own]),
-                filled(own.astype(np.uint32)),
-                len(views),
-            )
-        )
+        parts = local[views[own]], pixels[own], weights[own], own.astype(np.uint32)
+        local_views, own_pixels, own_weights, positions = (np.pad(part, (0, fill)) for part in parts)
+        result.append(Batch(local_views, own_pixels, own_weights, positions, len(views)))
     return result
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from unrender.app.distributed import assignment
 from unrender.app.distributed.assignment import joined, split, total
-from unrender.app.distributed.messages import Call, ImageState, Pair, Pilot, Reply, payload_bytes
+from unrender.app.distributed.messages import Call, ImageState, Pair, Reply, payload_bytes
 from unrender.app.distributed.share import Hosts
 from unrender.app.distributed.worker_state import Memories, Memory, Outbox, Recipe, Sent
 from unrender.core import arrays
@@ -150,7 +150,7 @@ class DistributedExecutor:
         parts = split(self._problem, request.sample, self._shares)
         used = {share: part.positions[part.weights > 0] for share, part in enumerate(parts) if part is not None}
         calls = {
-            share: replace(call, batch=part, pilot=Pilot(tuple(own[part.positions] for own in references)))
+            share: replace(call, batch=part, pilot=tuple(own[part.positions] for own in references))
             for share, part in enumerate(parts)
             if part is not None
         }

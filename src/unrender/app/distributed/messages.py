@@ -79,17 +79,6 @@ class Batch:
 
 
 @dataclass(frozen=True)
-class Pilot:
-    """Data of a `PilotRequest` that a `Call` does not contain.
-
-    Attributes:
-        references: (N, 3) each, of the call's pixels.
-    """
-
-    references: tuple[np.ndarray, ...]
-
-
-@dataclass(frozen=True)
 class Call:
     """Request for the gradient of a share of the views: a `GradientRequest` with numbered arrays.
 
@@ -104,7 +93,7 @@ class Call:
         single: whether gradients are returned in single instead of double precision.
         spp, adjoint_spp, key, pair, tolerance, fresh: fields of the request.
         batch: the pixels; None for full views.
-        pilot: whether the paths of these pixels are requested instead of a gradient.
+        pilot: references of these pixels, (N, 3) each, if their paths are requested instead of a gradient, see `PilotRequest`.
         tangents: tangents for the squared derivatives of the pixels; {} if they are not requested.
     """
 
@@ -116,7 +105,7 @@ class Call:
     adjoint_spp: int | None = None
     pair: Pair | None = None
     batch: Batch | None = None
-    pilot: Pilot | None = None
+    pilot: tuple[np.ndarray, ...] | None = None
     tangents: References = field(default_factory=dict)
     tolerance: float = 0.0
     fresh: bool = False
@@ -161,7 +150,7 @@ def payload_bytes(message: Any) -> int:
     """Return the bytes of the arrays in a message."""
     if isinstance(message, np.ndarray):
         return message.nbytes
-    if isinstance(message, (Call, Reply, Difference, Batch, DrawStatistics, Pilot)):
+    if isinstance(message, (Call, Reply, Difference, Batch, DrawStatistics)):
         message = vars(message)
     parts = message.values() if isinstance(message, dict) else message if isinstance(message, tuple) else ()
     return sum(map(payload_bytes, parts))

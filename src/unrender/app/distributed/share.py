@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from unrender.app.distributed.assignment import total
-from unrender.app.distributed.messages import Batch, Call, Difference, Pilot, References, Reply
+from unrender.app.distributed.messages import Batch, Call, Difference, References, Reply
 from unrender.core import arrays, trees
 from unrender.core.trees import Tree
 from unrender.estimators.sample_groups import TREES, GradientRequest, leave_one_out_groups
@@ -45,7 +45,7 @@ class ViewShare:
         started = time.perf_counter()
         self._receive(call)
         if call.pilot is not None:
-            return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started, paths=self._pilot(call, call.pilot))
+            return Reply({}, {}, {}, {}, 0, {}, {}, time.perf_counter() - started, paths=self._pilot(call))
         request = self._request(call)
         if call.replay:
             self._remember(call, self._replayed(call, request))
@@ -143,9 +143,9 @@ class ViewShare:
 
         return PixelSample(integers(batch.views), integers(batch.pixels), like, integers(batch.positions))
 
-    def _pilot(self, call: Call, pilot: Pilot) -> tuple[np.ndarray, ...]:
+    def _pilot(self, call: Call) -> tuple[np.ndarray, ...]:
         assert call.batch is not None
-        references = tuple(self.problem.renderer.array(reference) for reference in pilot.references)
+        references = tuple(map(self.problem.renderer.array, call.pilot or ()))
         sample, tangents = self._sample(call.batch), self._tree(call.tangents)
         request = PilotRequest(self._tree(call.parameters), sample, call.key, references, tangents)
         return tuple(request.carry_out(self.problem))
