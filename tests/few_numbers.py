@@ -107,10 +107,11 @@ def polished(bsdf: Scene) -> Scene:
 
 
 def plastic() -> Case:
-    """A roughness and an index of refraction without path gradients."""
+    """A roughness and an index of refraction without path gradients, and a colour below."""
     paint = {"type": "roughplastic", "diffuse_reflectance": rgb(0.3, 0.1, 0.1), "alpha": 0.15, "int_ior": 1.7}
     made = polished(paint | {"ext_ior": 1.0})
-    return made, {"ball.bsdf.alpha": 0.15, "ball.bsdf.eta": 1.7}, {"ball.bsdf.alpha": 0.4, "ball.bsdf.eta": 1.3}, 0.02
+    alpha, eta, colour = (f"ball.bsdf.{name}" for name in ("alpha", "eta", "diffuse_reflectance.value"))
+    return made, {alpha: 0.15, eta: 1.7, colour: [0.3, 0.1, 0.1]}, {alpha: 0.4, eta: 1.3, colour: 0.5}, 0.02
 
 
 def metal() -> Case:

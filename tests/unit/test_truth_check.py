@@ -65,6 +65,16 @@ def test_the_noise_of_the_references_is_no_walk() -> None:
     assert len(lines(problem, changed(problem, 0.6, 0.0), near)) == 1
 
 
+@pytest.mark.parametrize(("error", "count"), [(0.1, 0), (0.02, 1)])
+def test_a_walk_within_the_standard_errors_is_noise(error: float, count: int) -> None:
+    """A position of `box10` that began at the truth was said to walk away, 0.7 standard errors."""
+    problem, noise = made(), np.random.default_rng(1).normal(0, 0.1, (CELLS, CELLS, 1))
+    first, last = ({"x": x.astype(np.float32)} for x in (changed(problem, 0.01, 0.01), problem.truth["x"] + noise))
+    errors = {"x": np.full((CELLS, CELLS, 1), error)}
+    found = further_from_truth(problem, FreshPictures(problem, 0, 0), first, last, False, 1.0, errors)
+    assert len(found) == count
+
+
 def test_a_wrong_model_is_no_noise() -> None:
     """The residual at the truth is then the model's error, which neighbouring pixels share."""
     walked = np.random.default_rng(1).normal(0, 0.1, (CELLS, CELLS, 1))

@@ -34,7 +34,7 @@ PROBLEMS: dict[str, Callable[[], ur.Problem]] = {
     "glass ball": lambda: uncertain.with_own_references(uncertain.problem("glass"), 4096, 0),
     **{name: partial(lights.problem, name, 1, 0, 24, 4096) for name in ("projector", "area")},
 }
-NO_LOOP = ("lamps", "lens", "view", "pose", "projector", "area")
+NO_LOOP = ("lamps", "lens", "view", "plastic", "pose", "projector", "area")
 """Problems with unknowns by which `prb` has no derivatives."""
 OPTIONS = ("spp=16", "spp=256", "model-steps")
 """Fixed settings: of `auto`, and its plan without Gauss-Newton steps, see `ablation`."""

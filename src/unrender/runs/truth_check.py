@@ -33,6 +33,7 @@ def further_from_truth(
     last: Mapping[str, np.ndarray],
     few: bool,
     seconds: float,
+    errors: Mapping[str, np.ndarray] | None = None,
 ) -> list[str]:
     """Return a line for each parameter whose error has grown, if the images determine it.
 
@@ -44,6 +45,7 @@ def further_from_truth(
         pictures: source of a new image at the truth, for the noise of the references.
         first, last: {key: array}, the parameters at the start and at the end.
         few: whether the run had fewer than `FEW_STEPS` steps; errors must then exceed the first by a half.
+        errors: {key: array}, standard errors of the run, for parameters without a sensitivity, such as poses.
     """
     ratio = _FURTHER_EARLY if few else _FURTHER
     before, after = problem.parameter_error(first), problem.parameter_error(last)
@@ -59,6 +61,8 @@ def further_from_truth(
     for key in suspects:
         measure, where, noise, words = problem.unknowns[key].measure, None, 0.0, ""
         start, end = before[key], after[key]
+        if errors and key in errors:
+            noise = float(np.sqrt(np.mean(np.square(errors[key]))))
         sensitivity_of_key = sensitivities.get(key)
         if sensitivity_of_key is not None and key in problem.truth:
             where = seen_cells(sensitivity_of_key)
@@ -66,7 +70,7 @@ def further_from_truth(
                 words = " where the pictures show it"
             known = problem.truth[key]
             start, end = (measure.error(np.asarray(x[key]), known, where) or 0.0 for x in (first, last))
-            noise = _noise(problem, key, sensitivity_of_key, where, residual)
+            noise = max(noise, _noise(problem, key, sensitivity_of_key, where, residual))
         if start > 0.0 and math.hypot(ratio * start, _ERRORS * noise) < end:
             lines.append(
                 f"{key} ends further from the truth than it began{words}: error {measure.text(end)}, {measure.text(start)} at the "

@@ -142,7 +142,8 @@ class Verify(Callback):
         few = result.steps < (FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else FEW_STEPS)
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
-            lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds)
+            errors = {} if places else result.standard_error
+            lines += further_from_truth(problem, pictures, result.initial, ends, few, result.seconds, errors)
         lines += _lines(*judged, best, best_loss[0], memory if disagrees else None, worse)
         spp = pictures.paths / (pictures.pixels * len(last.images[0]))
         lines += filter(None, [rare_light(last.images, pictures.weights, spp)])
