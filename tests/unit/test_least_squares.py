@@ -45,6 +45,16 @@ def at(flat: np.ndarray) -> dict[str, np.ndarray]:
     return {"a": flat[:3].astype(np.float32), "b": np.asarray(flat[3], np.float32)}
 
 
+@pytest.mark.parametrize("shown", [0.0, -1.0])
+def test_directions_of_numbers_that_no_picture_shows_are_finite(shown: float):
+    """A ball that turns on sixteen pixels gave NaN, and no line; products of independent noise may be negative."""
+    one = np.full((2, 64, 3), 0.1)
+    limits = np.array([1.0, 0.5])
+    columns, _ = least_squares._directions(Differences(np.eye(2), one, shown * one), limits, 0.1)
+    assert np.isfinite(columns).all()
+    assert (np.abs(columns) <= 1.001 * limits[:, None]).all()
+
+
 def test_standard_errors_and_steps_are_those_of_the_closed_form():
     made = problem(MATRIX)
     solution, away = best(made, MATRIX), np.array([0.05, -0.02, 0.0, 0.03])

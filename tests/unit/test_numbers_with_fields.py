@@ -76,6 +76,14 @@ def test_standard_errors_with_a_texture_are_those_of_all_unknowns(shared: float,
         assert fixed.errors["a"][0] < 0.6 * expected[0]
 
 
+def test_a_texture_that_no_picture_shows_has_a_positive_diagonal():
+    """A view of 4 × 4 pixels that hardly shows the wall gave NaN, and a warning of NumPy's."""
+    for shape in ((4, 4, 3), (3,)):
+        diagonal = field_directions._diagonal(np.zeros(shape))
+        assert diagonal.shape == shape
+        assert (diagonal > 0.0).all()
+
+
 def test_a_number_that_a_texture_can_replace_is_told_with_it(monkeypatch: pytest.MonkeyPatch):
     made, _ = with_a_texture(1.0)
     values = at_truth(made)

@@ -32,6 +32,7 @@ def problem(
     lamp: float = 4.0,
     most: float | None = None,
     prior: Any = None,
+    brightness: str = "light",
     **traits: Any,
 ) -> Problem:
     """Two numbers, by default of the picture's form, and a lamp whose upper bound is `most`."""
@@ -40,7 +41,7 @@ def problem(
     known = renderer.parameters()
     changed = {
         "place": dataclasses.replace(known["place"], **({"nonlinear": True} | traits)),
-        "lamp": dataclasses.replace(known["lamp"], brightness="light"),
+        "lamp": dataclasses.replace(known["lamp"], brightness=brightness),
     }
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: changed)
     unknown = [
@@ -110,6 +111,11 @@ def test_a_far_start_is_left_for_a_place_whose_picture_is_much_better(
         ([9.5, 0.5], None, {}),  # without bounds
         ([9.5, 0.5], (0.0, None), {}),
         ([9.5, 0.5], (0.0, 10.0), {"nonlinear": False}),  # of brightness
+        (
+            [9.5, 0.5],
+            (0.0, 10.0),
+            {"brightness": "reflectance"},
+        ),  # beside a colour, for which another place may make up
     ],
 )
 def test_a_start_is_kept_where_it_is_near_or_places_have_no_bounds(

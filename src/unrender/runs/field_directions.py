@@ -238,7 +238,8 @@ def _diagonal(sensitivity: np.ndarray) -> np.ndarray:
     """Return the smoothed squares of a sensitivity, without cells that are hardly seen."""
     own = around(sensitivity)[..., None] if sensitivity.ndim >= MAP_AXES else np.abs(sensitivity)
     squares = np.square(own, dtype=np.float64)
-    return np.broadcast_to(squares + _RIDGE**2 * np.median(squares[squares > 0.0]), sensitivity.shape)
+    seen = squares[squares > 0.0]
+    return np.broadcast_to(squares + (_RIDGE**2 * np.median(seen) if seen.size else 1.0), sensitivity.shape)
 
 
 def _reach(problem: Problem, key: str, values: np.ndarray) -> float:

@@ -254,11 +254,10 @@ def _directions(differences: Differences, limits: np.ndarray, change: float) -> 
     """Return directions (n, n) along which the pictures change independently and by `change`, within the limits, and the least length that
     these leave, relative to that wanted."""
     matrix, (_, errors) = differences.matrix(), differences.squares()
-    units = np.sqrt(np.maximum(np.maximum(np.diag(matrix), errors), 1e-12 * np.abs(matrix).max())) + 1e-300
+    units = np.sqrt(np.maximum(np.maximum(np.diag(matrix), errors), 1e-12 * np.abs(matrix).max() or 1.0))
     eigenvalues, vectors = np.linalg.eigh(matrix / np.outer(units, units))
-    lengths = (
-        change * math.sqrt(differences.one[0].size) / np.sqrt(np.maximum(eigenvalues, _WEAKEST * eigenvalues.max()))
-    )
+    least = max(_WEAKEST * eigenvalues.max(), 1e-30)  # noise may leave no positive one
+    lengths = change * np.sqrt(differences.one[0].size / np.maximum(eigenvalues, least))
     columns = differences.directions @ (vectors * lengths / units[:, None])
     longer = np.maximum(np.max(np.abs(columns) / limits[:, None], axis=0), 1.0)
     return columns / longer, 1.0 / float(longer.max())

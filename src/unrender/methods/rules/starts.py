@@ -53,7 +53,8 @@ class Place:
 def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = False) -> Plan:
     """Return the plan with the best start among places of some unknowns, if its picture is much better.
 
-    Gauss-Newton steps end in the nearest minimum. Poses of shapes are compared on a plateau alone.
+    Gauss-Newton steps end in the nearest minimum. Poses of shapes are compared on a plateau alone. Beside unknown colours no places are
+    compared, because those of the best picture make up for wrong colours; see `runs.other_start`.
 
     Args:
         traits: Traits of the problem.
@@ -64,7 +65,8 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
     problem = plan.configured()
     varied = [key for key in varied_keys(problem, keys) if plateau or not _is_shape(problem, key)]
     lights = [key for key in traits.lights if key in keys]
-    if not varied:
+    colours = any(traits.infos[key].brightness == "reflectance" for key in keys)
+    if not varied or (colours and not plateau):
         return plan
     initial = {key: u.initial if u.first is None else u.first for key, u in problem.unknowns.items()}
     place = better_place(problem, FreshPictures(traits.problem, 0, _PATHS, _NUMBER), initial, varied, lights, plateau)
