@@ -193,7 +193,9 @@ def test_a_reference_with_saturated_pixels_says_so():
     """Of integers alone: floating-point values have no white."""
     levels = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     levels[1, 2, 0] = 255
-    told = "view 0: 5.0% of the reference's pixels are saturated; the loss Censored treats them as lower bounds"
+    told = (
+        "view 0: 5.0% of the reference's pixels are saturated: set the loss Censored, which treats them as lower bounds"
+    )
     assert told in problem(views=View(levels)).notices
     assert told not in problem(views=View(levels), loss=losses.Censored()).notices
     elsewhere = np.ones((HEIGHT, WIDTH), np.float32)

@@ -33,12 +33,14 @@ def made(
     offset: float = 0.0,
     views: int = 1,
     loss: ur.losses.Loss | None = None,
+    white: float = np.inf,
 ) -> ur.Problem:
-    """A linear problem; `start` None begins at the truth, `offset` is light that the references have and the renderer has not."""
+    """A linear problem; `start` None begins at the truth, `offset` is light that the references have and the renderer has not. References
+    are saturated at `white`."""
     generator = np.random.default_rng(seed)
     matrix, truth = generator.random((SIDE * SIDE * 3, SIZE)), generator.random(SIZE)
     renderer = AnalyticRenderer({"x": np.full(SIZE, 0.5)}, matrix, noise=noise, shape=(SIDE, SIDE), sensors=views)
-    reference = (matrix @ truth + offset).reshape(SIDE, SIDE, 3)
+    reference = np.minimum(matrix @ truth + offset, white).reshape(SIDE, SIDE, 3)
     begin = truth if start is None else np.full(SIZE, start)
     seen = [ur.View(reference, sensor) for sensor in range(views)]
     return ur.Problem(renderer, [ur.Parameter("x", initial=begin)], seen, loss, truth={"x": truth})
@@ -702,6 +704,19 @@ def test_a_difference_in_few_pixels_counts(improved: bool) -> None:
     for images in (residuals, residuals[:2]):  # the two halves of a final picture
         found = verification.misfit_of_numbers(problem, images, *arguments[2:], improved=improved)
         assert "the final picture differs" in found
+
+
+def test_saturated_pixels_are_no_difference_for_a_loss_that_takes_them_as_bounds() -> None:
+    """The true picture is brighter there. A dark pixel that differs counts."""
+    light, generator = np.asarray(made().views[0].reference), np.random.default_rng(0)
+    white = float(np.quantile(light.max(axis=2), 0.2))
+    images = [light + generator.normal(0.0, 0.01, light.shape) for _ in range(2)]
+    for loss, told in ((ur.losses.L2(), True), (ur.losses.Censored(ur.losses.L2(), white), False)):
+        problem = made(loss=loss, white=white)
+        assert bool(verification.misfit_of_views(problem, [0], [images])) is told
+        assert problem.test_weights(0).mean() == pytest.approx(1.0 if told else 0.2, abs=0.05)
+        np.testing.assert_array_equal(FreshPictures(problem, 0, 0).weights, problem.test_weights(0).ravel())
+        assert verification.misfit_of_views(problem, [0], [[image + 0.1 for image in images]])
 
 
 @pytest.mark.parametrize("outliers", [0, 1])

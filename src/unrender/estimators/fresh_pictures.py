@@ -14,6 +14,7 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.penalties import penalty
 from unrender.images.base import leave_one_out
+from unrender.losses.pixelwise import determined_pixels
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.batches import PixelBatch, PixelSample
 from unrender.scene.problem import Problem
@@ -161,8 +162,9 @@ class FreshPictures:
 
     @property
     def weights(self) -> np.ndarray:
-        """Weight of each pixel, (N,), of all frames concatenated; at most 1."""
+        """Weight of each pixel, (N,), of all frames concatenated; at most 1, and 0 for lower bounds of `Censored`."""
         factors = np.concatenate([frame.factors[:, 0] for frame in self.frames])
+        factors = factors * determined_pixels(self._problem.loss, self.references)
         return factors / max(float(factors.max(initial=0.0)), 1e-300)
 
     @property

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
@@ -154,3 +156,9 @@ class Censored:
 
     def _censored(self, image: Array, reference: Array) -> Array:
         return arrays.where(reference >= self.white, arrays.minimum(image, reference), image)
+
+
+def determined_pixels(loss: Loss, reference: np.ndarray) -> np.ndarray:
+    """Return which pixels (...,) of a reference (..., 3) are values, not lower bounds of `Censored`."""
+    white = loss.white if isinstance(loss, Censored) else np.inf
+    return np.asarray(reference.max(axis=-1) < white)

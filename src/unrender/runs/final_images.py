@@ -269,9 +269,8 @@ def _picture(
     one, other = (
         render(problem, values, view, first, seed + offset, per_pass=per_pass) for offset in (0, _SECOND_HALF)
     )
-    own = problem.views[view]
-    mask = None if own.mask is None else np.asarray(own.mask)
-    return (one, other), debiased.rmse(one, other, np.asarray(own.reference), mask)
+    reference = np.asarray(problem.views[view].reference)
+    return (one, other), debiased.rmse(one, other, reference, problem.test_weights(view))
 
 
 def _per_pass(problem: Problem, spp: int) -> int | None:

@@ -189,9 +189,8 @@ def map_keys(problem: Problem) -> list[str]:
 
 
 def mask_roots(problem: Problem, view: int) -> np.ndarray:
-    """Return the roots of the weights of a view's pixels by its mask, (H, W, 1)."""
-    weights = problem.views[view].pixel_weights(problem.sizes[view])
-    return np.sqrt(np.asarray(weights, np.float64))[..., None]
+    """Return the roots of the weights of a view's pixels, (H, W, 1)."""
+    return np.sqrt(np.asarray(problem.test_weights(view), np.float64))[..., None]
 
 
 def transposed(

@@ -291,12 +291,6 @@ class Problem(ViewLosses):
         """Number of pixels of all views."""
         return sum(height * width for height, width in self.sizes)
 
-    @property
-    def sizes(self) -> list[tuple[int, int]]:
-        """(height, width) of each view."""
-        known = self.renderer.resolutions()
-        return [known[view.sensor] for view in self.views]
-
     def initial_values(self) -> dict[str, np.ndarray]:
         """Return copies of the initial values at the scene's resolution."""
         return {key: np.array(unknown.initial) for key, unknown in self.unknowns.items()}

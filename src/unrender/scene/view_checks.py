@@ -265,7 +265,7 @@ def _check_view(
     counted = None if mask is None else np.asarray(mask) > 0
     if tell_saturated and limited is not None and (white := _saturated(limited, counted)) >= _WHITE:
         notices.append(
-            f"{owner}: {white:.1%} of the reference's pixels are saturated; the loss Censored treats them as lower bounds"
+            f"{owner}: {white:.1%} of the reference's pixels are saturated: set the loss Censored, which treats them as lower bounds"
         )
     return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices, loses_alpha
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
-from unrender.losses import Loss
+from unrender.losses import Censored, Loss
+from unrender.losses.pixelwise import determined_pixels
 from unrender.rendering.renderer import Renderer
 from unrender.scene.references import References
 from unrender.scene.view import View
@@ -32,6 +33,12 @@ class ViewLosses:
         warnings.warn("Problem.given_views is now Problem.original_views", DeprecationWarning, stacklevel=2)
         return self.original_views
 
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(height, width) of each view."""
+        known = self.renderer.resolutions()
+        return [known[view.sensor] for view in self.views]
+
     def reference(self, view: int) -> Array:
         """Return the view's reference as an array of the renderer, (H, W, 3)."""
         if view in self._references:
@@ -50,6 +57,13 @@ class ViewLosses:
         if not self.references.in_host_memory:
             self._masks[view] = array
         return array
+
+    def test_weights(self, view: int) -> np.ndarray:
+        """Return the weight (H, W) of each pixel in tests of pictures: the mask's, and 0 for lower bounds of `Censored`."""
+        weights = self.views[view].pixel_weights(self.sizes[view])
+        if not isinstance(self.loss, Censored):
+            return weights
+        return weights * determined_pixels(self.loss, np.asarray(self.views[view].reference))
 
     def loss_value(self, view: int, image: Array) -> Array:
         """Return the view's loss at an image (H, W, 3): weight * mean(mask * loss), a lazy scalar."""
