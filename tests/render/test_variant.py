@@ -130,11 +130,11 @@ def test_an_unknown_variant_is_refused(name: str):
     ],
 )
 def test_a_variant_of_mitsuba_is_refused_with_what_is_missing(fake: FakeMitsuba, name: str, what: str):
-    line = f"'{name}' is not supported, since unrender has {what}: expected"
-    with pytest.raises(VariantError, match=line):
+    line = f"'{name}' is not supported, since unrender has {what}"
+    with pytest.raises(VariantError, match=f"{line}: expected"):
         variant.use(name)
     fake.name = name
-    with pytest.raises(VariantError, match=f"Mitsuba's variant: {line}"):
+    with pytest.raises(VariantError, match=f"Mitsuba's variant: {line}; call"):
         variant.ensure()
 
 
@@ -173,8 +173,9 @@ def test_ensure_chooses_where_nothing_is_set(fake: FakeMitsuba):
 
 def test_ensure_refuses_a_variant_without_derivatives(fake: FakeMitsuba):
     fake.name = "scalar_rgb"
-    with pytest.raises(VariantError, match="'scalar_rgb'"):
+    with pytest.raises(VariantError, match=r"'scalar_rgb'.*call unrender\.use") as told:
         variant.ensure()
+    assert "cuda" not in str(told.value)  # which this machine may not have
 
 
 def test_the_trial_passes_where_kernels_run(mitsuba_variant: str):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
+
+from unrender.runs.result import Result
 
 
 @pytest.mark.mitsuba
@@ -28,3 +31,21 @@ def test_pixels_that_masks_leave_out_do_not_count() -> None:
     assert image_error(result, masks=[0 * mask, mask]).endswith("with noise")
     result.problem["views"] = 4  # of large problems some views alone have final pictures
     assert image_error(result, masks=[mask] * 4) == "0.5 with noise"
+
+
+@pytest.mark.mitsuba
+def test_another_start_is_told_on_the_terminal() -> None:
+    """It decides which values a run returns, so the page is not enough."""
+    from unrender.app.cli.execute import summarise
+    from unrender.display.terminal import Console
+    from unrender.runs.other_start import BEGUN_AGAIN
+    from unrender.runs.progress import Progress
+
+    problem = SimpleNamespace(views=[], unknowns={}, truth={}, parameter_error=lambda _: {})
+    lines = [f"{BEGUN_AGAIN} 24 with other values of alpha", "numbers are means of their last steps: alpha 8"]
+    result: Any = Result({}, {}, [], 1.0, 0.0, "steps", adapted=lines)
+    text = io.StringIO()
+    with Progress(Console(file=text, width=200)) as progress:
+        summarise(Console(file=text, width=200), cast(Any, problem), result, progress)
+    assert f"note: the run {lines[0]}" in text.getvalue()
+    assert lines[1] not in text.getvalue()

@@ -345,6 +345,7 @@ BAD_VIEWS = [
     (View(REFERENCE, mask=np.ones((HEIGHT, WIDTH + 1))), r"view 0: mask: 6x4 pixels"),
     (View(REFERENCE, mask=np.full((HEIGHT, WIDTH), 2.0)), r"mask: expected values from 0 to 1, got 2 to 2"),
     (View(REFERENCE, mask=np.full((HEIGHT, WIDTH), -0.5)), r"mask: expected values from 0 to 1"),
+    (View(REFERENCE, mask=np.full((HEIGHT, WIDTH, 3), (1.0, 0.5, 0.2))), r"mask: it has colours; expected one channel"),
     (View(REFERENCE, mask=np.zeros((HEIGHT, WIDTH))), r"mask: it is 0 everywhere"),
 ]
 

@@ -318,3 +318,20 @@ def test_the_command_of_the_best_trial_repeats_its_first_run() -> None:
         "-s",
         "spp=4",
     ]
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize(
+    ("runs", "status"),
+    [
+        ({"finished": ""}, 0),
+        ({"finished": "", "does not fit": ""}, 5),
+        ({"worse than start": ""}, 5),
+        ({"failed": "non-finite", "memory disagrees": ""}, 4),
+        ({"interrupted": "interrupted", "does not fit": ""}, 130),
+    ],
+)
+def test_a_comparison_has_the_exit_status_of_its_worst_run(runs: dict[str, str], status: int) -> None:
+    from unrender.app.cli.compare import status_of
+
+    assert status_of([run(status=of, stopped=why) for of, why in runs.items()]) == status

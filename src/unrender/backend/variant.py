@@ -230,8 +230,10 @@ def ensure() -> str:
     name = current()
     if name is None:
         return use()
-    if refusal := unsupported(name):
-        raise VariantError(f"Mitsuba's variant: {refusal}; call unrender.use() instead")
+    if unsupported(name):
+        raise VariantError(
+            f"Mitsuba's variant: {_lacking(name).removesuffix(': ')}; call unrender.use(), which chooses one"
+        )
     return use(name)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
-from unrender.runs.verification import Misfit, misfit
+from unrender.runs.verification import MAY_IMPROVE, NOT_CONVERGED, Misfit, misfit
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import difference
 
@@ -134,7 +134,7 @@ def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays:
         cause = f"a prior may be too strong, or {cause}"
     still = "no longer improves"
     if step < FIRST_CANDIDATE or not stays:
-        still = f"has hardly improved since step {step} of {steps}" if stays else "may still improve"
+        still = f"has hardly improved since step {step} of {steps}" if stays else MAY_IMPROVE
         cause = f"it may need more steps, or {cause}"
     return f"{differs.describe()}, and {still}: {cause}"
 
@@ -156,4 +156,4 @@ def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -
     if not value + _SURE * error < 0.0:
         return [unexplained(problem, differs, earlier.step, last.step, stays=False)]
     fallen = f"its loss has fallen by {1 - last.picture.loss[0] / earlier.picture.loss[0]:.0%} since step {earlier.step} of {last.step}"
-    return [f"{differs.describe()}, and the run has not converged: {fallen}; give it more steps or seconds"]
+    return [f"{differs.describe()}, and {NOT_CONVERGED}: {fallen}; give it more steps or seconds"]

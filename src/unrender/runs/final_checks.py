@@ -11,6 +11,7 @@ from unrender.core import arrays
 from unrender.display import formatting
 from unrender.estimators.penalties import penalty
 from unrender.runs.earlier_image import no_improvement
+from unrender.runs.folder.schema import MISFIT
 from unrender.runs.result import Result
 from unrender.runs.verification import DIFFERS, Misfit, misfit, residuals_of_views
 from unrender.scene.problem import Problem
@@ -32,7 +33,7 @@ _FEWEST, _MOST_KEYS = 64, 4
 _LEAST = 0.02
 """Smallest difference relative to these pixels of the references."""
 _SEED = 7
-_SURE, _OF_FILTER, _OF_NOISE, _MOSTLY = 4.5, 1.8, 0.5, 0.8
+_SURE, _OF_FILTER, _OF_NOISE, _MOSTLY = 4.5, 1.8, 1.2, 0.8
 """Standard errors from which a residual looks like a distorted reference; factor of these for noise that neighbouring pixels share; and
 smallest size relative to the noise of half of the samples, and to the difference whose cause it is."""
 
@@ -61,7 +62,11 @@ def rise(
     if prior or (problem.loss.pixelwise and not problem.loss.linear):
         return ""
     start, end = (result.verification.get(name, [None, None]) for name in ("start", "end"))
-    ended = problem.remeshed_from is None and result.status == "finished" and result.verification.get("best") == "end"
+    ended = (
+        problem.remeshed_from is None
+        and result.status in ("finished", MISFIT)
+        and result.verification.get("best") == "end"
+    )
     if not ended or None in (*start, *end):
         return ""
     if end[0] + _ERRORS * math.hypot(start[1], end[1]) < start[0] or len(errors) < 2 * len(problem.views):
@@ -167,12 +172,14 @@ def unexplained_pixels(
     explained = [_joined([np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)])]
     explained += [change({**result, key: _changed(problem, key, x, np.ones(x.shape))}) for key, x in result.items()]
     rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
-    differs = misfit(rest[0::2], rest[1::2], references, weights * little, sizes, _LEAST)
+    size, everywhere = (math.sqrt(mean_square(references, of)) for of in (weights * little, weights))
+    least = _LEAST * max(1.0, everywhere / max(size, 1e-300))
+    differs = misfit(rest[0::2], rest[1::2], references, weights * little, sizes, least)
     cause, shared = _as_if(rest, residuals + references, weights * little, sizes)
     if differs is None and cause:
-        size, total = (np.sqrt(mean_square(x, weights * little)) for x in (references, rest.mean(axis=0)))
-        if shared > _LEAST * size:
-            differs = Misfit(shared, float(size), float(np.sqrt(max(total**2 - shared**2, 0.0))))
+        total = mean_square(rest.mean(axis=0), weights * little)
+        if shared > least * size:
+            differs = Misfit(shared, size, math.sqrt(max(total - shared**2, 0.0)))
     if differs is None:
         return ""
     cause = cause if shared > _MOSTLY * differs.error else ""
@@ -189,11 +196,10 @@ def _as_if(
     """Return what a view's reference looks like, and the root mean square of the difference over all pixels; "" and 0 for nothing.
 
     The residual of the first half of the images is fitted by changes of the second half, whose noise is independent of it. Rare bright
-    samples leave most pixels too dark, so a fit below the noise of a half means nothing.
+    samples leave most pixels too dark, so a fit below the noise of a half in the same pixels means nothing.
     """
-    cause, total, start = "", max(float(weights.sum()) * 3, 1e-300), 0
+    cause, shared, total, start = "", 0.0, max(float(weights.sum()) * 3, 1e-300), 0
     noise = (residuals[0::2].mean(axis=0) - residuals[1::2].mean(axis=0)) / math.sqrt(2.0)
-    shared = _OF_NOISE * math.sqrt(mean_square(np.where(np.isfinite(noise), noise, 0.0), weights))
     for view, (height, width) in enumerate(sizes):
         part = slice(start, start + height * width)
         start += height * width
@@ -208,8 +214,10 @@ def _as_if(
             amounts = inverse @ (columns.T @ wanted)
             scores = columns * (wanted - columns @ amounts)[:, None]
             errors = np.sqrt(np.diagonal(inverse @ (scores.T @ scores) @ inverse))
-            fitted = math.sqrt(float(np.square(columns @ amounts).sum()) / total)
-            if fitted > shared and (np.abs(amounts) > _SURE * _OF_FILTER * errors).any():
+            squares = np.square(columns @ amounts)
+            fitted = math.sqrt(float(squares.sum()) / total)
+            clear = float(squares @ squares) > _OF_NOISE**2 * float(squares @ np.square(np.ravel(noise[part] * root)))
+            if fitted > shared and clear and (np.abs(amounts) > _SURE * _OF_FILTER * errors).any():
                 moved = [f"{-x:.2g}" for x in amounts]
                 cause, shared = f", as if the reference of view {view} {words.format(*moved)}", fitted
     return cause, shared

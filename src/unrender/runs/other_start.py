@@ -21,6 +21,8 @@ _USED, _FEWEST_STEPS = 0.4, 16
 """Fraction of the budget, and number of steps, after which values are compared once."""
 _SHARE, _LEAST_PATHS, _MOST_SHARE = 0.5, 1 << 14, 2.5
 """Paths of all pictures relative to the run's so far, the least number of one, and the share above which a short run is not compared."""
+BEGUN_AGAIN = "begins again at step"
+"""First words of the line about other values."""
 _NUMBER, _KEPT = 4, "kept"
 """Index of the set of random numbers; outcome of a comparison without a better place."""
 
@@ -53,7 +55,7 @@ class OtherStart(Callback):
             begin_at(run, {**run.parameters, **{k: problem.renderer.array(x) for k, x in place.values.items()}})
             state.numbers = NumberTrace()
             state.other_start = (
-                f"begins again at step {run.step} with other values of {listed(list(keys))}, where the loss is {place.share:.0%} of that "
+                f"{BEGUN_AGAIN} {run.step} with other values of {listed(list(keys))}, where the loss is {place.share:.0%} of that "
                 "of the descent so far"
             )
 

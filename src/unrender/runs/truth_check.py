@@ -9,6 +9,8 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.optimizers.averaged_newton import AveragedNewton
+from unrender.optimizers.base import Optimizer
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, sensitivity
 from unrender.runs.verification import misfit
 from unrender.scene.problem import Problem
@@ -24,6 +26,11 @@ _ERRORS = 2.0
 _PROBES, _SECONDS_SHARE = 8, 0.02
 """Probes of the sensitivity; fraction of the run's time after which no further one is started."""
 _SIGNS_SEED = 5
+
+
+def has_few_steps(steps: int, optimizer: Optimizer) -> bool:
+    """Return whether a run is unfinished; a Gauss-Newton step solves for all unknowns, so few of them may converge."""
+    return steps < (FEW_NEWTON_STEPS if isinstance(optimizer, AveragedNewton) else FEW_STEPS)
 
 
 def further_from_truth(

@@ -13,12 +13,15 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
+from unrender.runs.folder.schema import MISFIT
 from unrender.runs.folder.state import parts
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
+MAY_IMPROVE, NOT_CONVERGED, MORE_STEPS = "may still improve", "the run has not converged", "more steps"
+"""Words of those warnings of them that more steps may answer: surely, or after few steps."""
 _FEW_PIXELS, _OF_FEW = 96, 0.2
 """Number of pixels below which the difference is also judged pixel by pixel, which includes the references' noise; its smallest size
 relative to the image in this case."""
@@ -177,6 +180,16 @@ def residuals_of_views(
     residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
     sizes = [(height, width) for height, width, _ in map(np.shape, references)]
     return residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), sizes
+
+
+def fit_status(status: str, warnings: Sequence[str], few: bool) -> str:
+    """Return the status of a run that used up its budget: "does not fit" for a finished one that differs, if more steps are no answer.
+
+    `few` says whether the run had few steps. Lines that suggest more of them then change no status.
+    """
+    answers = (MAY_IMPROVE, NOT_CONVERGED, *((MORE_STEPS,) if few else ()))
+    final = any(DIFFERS in line and not any(words in line for words in answers) for line in warnings)
+    return MISFIT if final and status == "finished" else status
 
 
 def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) -> str:

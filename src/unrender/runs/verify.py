@@ -14,7 +14,6 @@ import numpy as np
 from unrender.core import phases
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture, is_finite
-from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.runs import callbacks
 from unrender.runs.callbacks import Callback
 from unrender.runs.earlier_image import (
@@ -29,8 +28,16 @@ from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.number_means import averaged, normalised
 from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
 from unrender.runs.run import Candidate
-from unrender.runs.truth_check import FEW_NEWTON_STEPS, FEW_STEPS, further_from_truth
-from unrender.runs.verification import Memory, compare_memory, control_variates, misfit, misfit_of_numbers, rare_light
+from unrender.runs.truth_check import further_from_truth, has_few_steps
+from unrender.runs.verification import (
+    Memory,
+    compare_memory,
+    control_variates,
+    fit_status,
+    misfit,
+    misfit_of_numbers,
+    rare_light,
+)
 from unrender.scene.problem import Problem
 from unrender.statistics import paired_losses
 
@@ -138,8 +145,7 @@ class Verify(Callback):
             lines = self._by_more_paths(run, result, pictures, change, seconds)
         if lines:
             result = replace(result, standard_error={})
-        # A Gauss-Newton step solves for all unknowns, so few of them may converge.
-        few = result.steps < (FEW_NEWTON_STEPS if isinstance(run.optimizer, AveragedNewton) else FEW_STEPS)
+        few = has_few_steps(result.steps, run.optimizer)
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
             errors = {} if places else result.standard_error
@@ -148,7 +154,7 @@ class Verify(Callback):
         spp = pictures.paths / (pictures.pixels * len(last.images[0]))
         lines += filter(None, [rare_light(last.images, pictures.weights, spp)])
         verification: dict[str, Any] = {
-            "status": WORSE if worse else MEMORY_DISAGREES if disagrees else "finished",
+            "status": WORSE if worse else MEMORY_DISAGREES if disagrees else fit_status("finished", lines, few),
             "start": _numbers(*judged[0].loss),
             "end": _numbers(*judged[1].loss),
             "best": best,

@@ -41,6 +41,9 @@ from unrender.scene.view import View
 _DARKEST = -1e-4
 """Ratio to the largest value above which negative values count as rounding error."""
 
+_MOST_COLOUR = 0.05
+"""Largest difference of a mask's channels, which compression may leave."""
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -247,14 +250,7 @@ def _check_view(
     mask = view.mask
     if view.mask is not None and not isinstance(view.mask, StoredPicture):
         try:
-            mask = images.read(view.mask, linearise=False).values
-            images.check_metadata(view.mask)
-            _check_size(mask, height, width, view.mask)
-            mask = mask.mean(axis=2)
-            if mask.min() < 0 or mask.max() > 1:
-                raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
-            if not mask.any():
-                raise InputError("it is 0 everywhere, so no pixel would count")
+            mask = _read_mask(view.mask, height, width)
         except InputError as error:
             raise wrong("mask", error) from error
     if alpha is not None:
@@ -268,6 +264,21 @@ def _check_view(
             f"{owner}: {white:.1%} of the reference's pixels are saturated: set the loss Censored, which treats them as lower bounds"
         )
     return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices, loses_alpha
+
+
+def _read_mask(source: Any, height: int, width: int) -> np.ndarray:
+    """Return a mask (H, W) from a file or an array. Raises `InputError` for colours, and values outside [0, 1] or 0 everywhere."""
+    mask = images.read(source, linearise=False).values
+    images.check_metadata(source)
+    _check_size(mask, height, width, source)
+    if np.ptp(mask, axis=2).max(initial=0.0) > _MOST_COLOUR:
+        raise InputError("it has colours; expected one channel, or three equal ones: the weight of each pixel")
+    mask = mask.mean(axis=2)
+    if mask.min() < 0 or mask.max() > 1:
+        raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
+    if not mask.any():
+        raise InputError("it is 0 everywhere, so no pixel would count")
+    return mask
 
 
 def _saturated(reference: np.ndarray, counted: np.ndarray | None) -> float:

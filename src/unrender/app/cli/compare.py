@@ -14,7 +14,7 @@ import typer
 
 from unrender.app.cli import arguments
 from unrender.app.cli.run import exit_status
-from unrender.app.cli.signals import FAILED
+from unrender.app.cli.signals import DOUBTFUL, FAILED
 from unrender.core import phases
 from unrender.core.errors import InputError
 from unrender.core.random import check_seed
@@ -186,10 +186,11 @@ def _run_all(
 ) -> tuple[list[Path], int]:
     """Carry out the runs, here or on workers, until one is interrupted.
 
-    Returns the run folders of runs that took a step, and the exit status: of the one that was interrupted, or of one that failed, else 0.
+    Returns the run folders of runs that took a step, and the exit status: of the one that was interrupted, of one that failed, or of one
+    that is doubtful, else 0.
     """
     from unrender.app.cli.execute import introduce
-    from unrender.runs.folder.schema import RECORD
+    from unrender.runs.folder import schema
 
     folder = Path(job.folder)
     with contextlib.ExitStack() as stack:
@@ -203,16 +204,26 @@ def _run_all(
         problem = arguments.open_problem(job.problem, dict(job.problem_settings), job.cached)
         introduce(console, problem, running if cluster is None else cluster.variant)
         for run in runs:  # no run continues an earlier one
-            (folder / run.name / RECORD).unlink(missing_ok=True)
+            (folder / run.name / schema.RECORD).unlink(missing_ok=True)
         if cluster is None:
             outcomes = _here(console, progress, job, runs, problem)
         else:
             outcomes = _on_workers(console, job, runs, cluster)
     names = [outcome.folder for outcome in outcomes if outcome.steps]
     directories = [folder / run.name for run in runs if run.name in names]
+    return directories, status_of(outcomes)
+
+
+def status_of(outcomes: Sequence[RunOutcome]) -> int:
+    """Return the exit status of runs: of the one that was interrupted, of one that failed, or of one that is doubtful, else 0."""
+    from unrender.runs.folder import schema
+
     interrupted = [outcome for outcome in outcomes if outcome.status == "interrupted"]
-    statuses = [exit_status(outcome.stopped) or (FAILED if outcome.message else 0) for outcome in outcomes]
-    return directories, exit_status(interrupted[0].stopped) if interrupted else max(statuses, default=0)
+    if interrupted:
+        return exit_status(interrupted[0].stopped)
+    failed = any(exit_status(outcome.stopped) or outcome.message for outcome in outcomes)
+    doubtful = any(outcome.status in schema.DOUBTFUL for outcome in outcomes)
+    return FAILED if failed else DOUBTFUL if doubtful else 0
 
 
 def _here(

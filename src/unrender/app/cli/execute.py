@@ -21,6 +21,7 @@ from unrender.runs.final_checks import image_name
 from unrender.runs.image_sensitivity import seen_cells
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
+from unrender.runs.other_start import BEGUN_AGAIN
 from unrender.runs.progress import Progress
 from unrender.runs.result import Result
 from unrender.scene.notebook import describe_views
@@ -187,6 +188,9 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     after = {name: seconds for name, seconds in progress.seconds.items() if name not in result.phases}
     table.add_row("time", f"{formatting.phases({**result.phases, **after})}; {progress.elapsed:.1f} s in all")
     console.print(table)
+    for line in result.adapted:
+        if line.startswith(BEGUN_AGAIN):
+            console.say(f"note: the run {line}")
     for line in result.undetermined:
         console.print(f"[yellow]not determined[/] {escape(line)}", soft_wrap=True)
     for warning in result.warnings:

@@ -16,7 +16,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from unrender.app.cli import arguments, report, tasks
+from unrender.app.cli import arguments, report, signals, tasks
 from unrender.app.cli.execute import introduce
 from unrender.app.cli.signals import FAILED, INTERRUPTED, TERMINATED
 from unrender.app.cli.tasks import Job, RunTask, TaskDisplay
@@ -192,7 +192,7 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
 
     Raises:
         InputError: the folder is in use or cannot be written, or the problem cannot be opened.
-        typer.Exit: with the status of an interrupted sweep, or if no trial completed.
+        typer.Exit: with the status of an interrupted sweep, or if no trial completed, or a run of the best one is doubtful.
     """
     plan = record.plan
     trials = Trials(search, plan.prune, plan.window or _WINDOW)
@@ -225,8 +225,10 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
         lock.release()
     if not trials.done:
         raise typer.Exit(TERMINATED if state.stopped == BY_SIGTERM else INTERRUPTED)
-    if state.trials.best is None:
+    if (best := state.trials.best) is None:
         raise typer.Exit(FAILED)
+    if any(run.status in DOUBTFUL for run in best.runs):
+        raise typer.Exit(signals.DOUBTFUL)
 
 
 def _choose_window(state: _State, executor: Executor) -> None:

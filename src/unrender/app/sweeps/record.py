@@ -74,7 +74,9 @@ class RunOutcome(BaseModel):
 
     folder: _Name
     seed: _Count
-    status: Literal["finished", "worse than start", "memory disagrees", "pruned", "failed", "interrupted"]
+    status: Literal[
+        "finished", "worse than start", "memory disagrees", "does not fit", "pruned", "failed", "interrupted"
+    ]
     stopped: StrictStr = ""
     error: FiniteFloat | None = None
     standard_error: FiniteFloat | None = None

@@ -71,10 +71,12 @@ The last two are null if a step was not finite or they are unknown. A record als
 
 _Count = Annotated[StrictInt, Field(ge=0, lt=2**63)]
 _Seconds = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
-_Status = Literal["running", "finished", "interrupted", "failed", "worse than start", "memory disagrees"]
+_Status = Literal[
+    "running", "finished", "interrupted", "failed", "worse than start", "memory disagrees", "does not fit"
+]
 
-WORSE, MEMORY_DISAGREES = "worse than start", "memory disagrees"
-DOUBTFUL = frozenset({WORSE, MEMORY_DISAGREES})
+WORSE, MEMORY_DISAGREES, MISFIT = "worse than start", "memory disagrees", "does not fit"
+DOUBTFUL = frozenset({WORSE, MEMORY_DISAGREES, MISFIT})
 """Statuses of runs that used up their budget, but that new images contradict."""
 ENDED = DOUBTFUL | {"finished"}
 """Statuses of runs that used up their budget."""

@@ -41,6 +41,7 @@ from unrender.runs.folder.schema import (
     LIVE,
     MESHES,
     METHOD,
+    MISFIT,
     PARAMETERS,
     PICTURES,
     RECORD,
@@ -51,6 +52,8 @@ from unrender.runs.folder.schema import (
 )
 from unrender.runs.folder.state import not_finite, pack
 from unrender.runs.result import PRUNED, TERMINATED, Result
+from unrender.runs.truth_check import has_few_steps
+from unrender.runs.verification import fit_status
 from unrender.scene import serialization
 
 if TYPE_CHECKING:
@@ -185,6 +188,9 @@ class RunWriter(Callback):
             if images.rise:
                 result = at_start(result, images.rise)
                 images = render_final_images(run.problem, result, *given)
+            warnings, verification = joined_warnings(result.warnings, images.warnings), dict(result.verification)
+            if verification and verification["status"] in ("finished", MISFIT):
+                verification["status"] = fit_status("finished", warnings, has_few_steps(result.steps, run.optimizer))
             result = replace(
                 result,
                 pictures=images.pictures,
@@ -194,7 +200,8 @@ class RunWriter(Callback):
                 undetermined=images.undetermined,
                 without_errors=images.without_errors,
                 standard_error=images.standard_error,
-                warnings=joined_warnings(result.warnings, images.warnings),
+                warnings=warnings,
+                verification=verification,
             )
             result = callbacks.with_phase(result, callbacks.PICTURES, time.perf_counter() - started)
         self._save(result, result.status)
