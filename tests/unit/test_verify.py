@@ -86,6 +86,19 @@ def test_a_loss_within_the_noise_of_few_paths_is_judged_by_more(monkeypatch: pyt
     assert ur.optimize(problem, ur.PathGradient(spp=1024), Away(), steps=40).status == "finished"
 
 
+def test_a_larger_loss_at_the_end_of_a_run_of_few_paths_is_judged_by_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A smoothed loss of many numbers rose: 4,000 paths did not tell it, and the values further away were returned."""
+    problem, paths = made(start=None, noise=4.0), ur.PathGradient(spp=16)
+
+    def statuses(pace: float) -> set[str]:
+        return {ur.optimize(problem, paths, Away(pace), steps=40, seed=seed).status for seed in range(4)}
+
+    assert statuses(0.002) == {"worse than start"}
+    assert statuses(1e-9) == {"finished"}
+    monkeypatch.setattr(verify, "_LEAST_DOUBTFUL", verify._LEAST_LARGER)
+    assert "finished" in statuses(0.002)
+
+
 @pytest.mark.parametrize("pace", [0.002, 1e-9])
 def test_all_paths_are_at_most_a_fiftieth_of_the_runs_and_more_paths_have_their_own_random_numbers(
     pace: float, monkeypatch: pytest.MonkeyPatch

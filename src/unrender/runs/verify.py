@@ -50,8 +50,9 @@ _SHARE, _PARTS = 0.0025, 8
 """Fraction of the run's paths for one new image, of which there are at most five: the start, the last values, the means of numbers, a
 candidate and a control variate. Number of parts, with images of their own, of larger images that judge start and end where these do not
 tell them apart: few bright pixels, such as those of a visible lamp, may hold most of the noise. They use the paths that are left."""
-_LEAST_LARGER = 1 << 13
-"""Paths that such an image may have in any run whose images show all pixels: twice as many as others of short runs."""
+_LEAST_LARGER, _LEAST_DOUBTFUL = 1 << 13, 1 << 15
+"""Paths that such an image may have in any run whose images show all pixels: twice as many as others of short runs, and eight times as
+many where the end has the larger loss."""
 _LEVEL, _LEVEL_AGAIN = 1e-4, 1e-3
 """False positive rate of each test; that of the test by more paths, which few runs reach."""
 _LEAST_CHANGE = 1e-3
@@ -70,9 +71,9 @@ class Verify(Callback):
 
     Candidates are the start, the parameters after 64, 128, 256, … steps, and the end. The one with the least loss becomes
     `Result.parameters`; another one than the end must be significantly better. All images together use at most 2 % of the run's paths,
-    if these are a million or more. Each uses 0.25 %, or about 4,000 paths in a short run. Larger images use the
-    paths that are left, if there is time: where start and end are not told apart, and for the end of a run without a run folder, which has
-    no final pictures. The steps are not affected.
+    if these are a million or more. Each uses 0.25 %, or about 4,000 paths in a short run. Larger images use the paths that are left, if
+    there is time: where start and end are not told apart, and for the end of a run without a run folder, which has no final pictures.
+    Images of start and end use up to 33,000 paths each where the end may be worse. The steps are not affected.
     """
 
     _small: FreshPictures | None = field(default=None, init=False)
@@ -202,7 +203,8 @@ class Verify(Callback):
         waiting = (
             0 if self._small is None or self._small is pictures else len(ends) * self._small.paths
         )  # of `_residual`
-        larger = self._larger_pictures(run, pictures, len(ends), waiting, seconds)
+        least = _LEAST_DOUBTFUL if last.loss[0] > first.loss[0] else _LEAST_LARGER
+        larger = self._larger_pictures(run, pictures, len(ends), waiting, seconds, least)
         if larger is None or larger.sampled:
             return ends
         start = run.problem.remeshed_from or run.problem
@@ -229,17 +231,18 @@ class Verify(Callback):
         return no_improvement(run.problem, change.get("change", {}), end.loss[0], result.steps, *of)
 
     def _larger_pictures(
-        self, run: Run, pictures: FreshPictures, count: int, waiting: int, seconds: float
+        self, run: Run, pictures: FreshPictures, count: int, waiting: int, seconds: float, least: int = _LEAST_LARGER
     ) -> FreshPictures | None:
         """Return a renderer of `count` larger images for the paths that are left; None without paths or time.
 
-        `waiting` is the number of paths of images that are still to be rendered; `seconds` is the time of an image of `pictures`.
+        `waiting` is the number of paths of images that are still to be rendered; `seconds` is the time of an image of `pictures`; `least`
+        is the number of paths that each of two images may have in any case.
         """
         spent = pictures.rendered + waiting
         if self._small is not None and self._small is not pictures:
             spent += self._small.rendered
         left = (_MOST_SHARE * run.state.samples - spent) / count
-        left = left if pictures.sampled or count < 2 else max(left, _LEAST_LARGER)
+        left = left if pictures.sampled or count < 2 else max(left, least)
         larger = FreshPictures(run.problem, run.seed, left, _AGAIN, _PARTS)
         expected = count * seconds * larger.paths / pictures.paths
         return larger if pictures.paths < larger.paths <= left and expected <= run.time_left() else None
