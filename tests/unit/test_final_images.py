@@ -16,7 +16,7 @@ from unrender import losses, optimizers
 from unrender.core import phases
 from unrender.estimators.path import PathGradient
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.runs import final_images, least_squares
+from unrender.runs import final_checks, final_images, least_squares
 from unrender.runs.callbacks import RUN_PHASES, Callback
 from unrender.runs.image_sensitivity import Curvature
 from unrender.runs.metadata import RunAnnotations
@@ -372,3 +372,13 @@ def test_pixels_that_the_unknowns_hardly_change_tell_of_wrong_references_at_any_
         )
         assert abs(along - 1.0) < 0.3
         assert abs(down) < 0.1
+
+
+def test_few_highlights_do_not_make_all_other_pixels_unchanged() -> None:
+    """Such as a lamp's reflections in metal, which change a hundred times as much as the walls that the lamp lights."""
+    change = np.full((4096, 3), 0.03)
+    change[:2048] = 0.0001  # hardly lit
+    change[2053::512] = 3.0
+    little = final_checks._is_little(change, np.ones(4096))
+    assert little[:2048].mean() > 0.99
+    assert not little[2048:].any()

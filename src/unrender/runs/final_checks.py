@@ -251,10 +251,14 @@ def _changed(problem: Problem, key: str, values: np.ndarray, signs: np.ndarray) 
 
 
 def _is_little(change: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return which pixels a change (N, 3) leaves nearly as they are, relative to the pixels that it changes most, (N,)."""
-    squares = np.square(change).max(axis=1) * (weights > 0)
-    usual = float(np.square(squares).sum()) / max(float(squares.sum()), 1e-300)
-    return squares <= _LITTLE**2 * usual
+    """Return which pixels a change (N, 3) leaves nearly as they are, relative to the pixels that it changes most, (N,).
+
+    Pixels above the usual change have half of the sum of all changes, so few bright pixels, such as highlights, do not decide it.
+    """
+    changes = np.abs(change).max(axis=1) * (weights > 0)
+    ordered = np.sort(changes)
+    usual = ordered[np.searchsorted(np.cumsum(ordered), 0.5 * float(ordered.sum()))]
+    return changes <= _LITTLE * usual
 
 
 def _projection(residual: np.ndarray, changes: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
