@@ -15,6 +15,7 @@ import tomli_w
 from tests.analytic import AnalyticRenderer
 from unrender import images, losses, optimizers, pixels
 from unrender.core.errors import InputError
+from unrender.estimators.derivative_images import cost
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.path import PathGradient
 from unrender.estimators.smoothed import SmoothedDerivatives
@@ -366,14 +367,12 @@ def test_few_numbers_that_change_the_pictures_form_take_gauss_newton_steps(monke
     formed = dict(known) | {"place": dataclasses.replace(known["place"], nonlinear=True)}
     monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: formed)
     plan = method("auto").plan(made)
-    expected = GaussNewton(
-        CONSTANTS.number_spp[1], CONSTANTS.difference_spp[1], noise_limit=CONSTANTS.noise_limit, remember=True
-    )
+    samples = CONSTANTS.number_spp[1], CONSTANTS.difference_spp[1]
+    expected = GaussNewton(*samples, noise_limit=CONSTANTS.noise_limit, remember=True)
     assert plan.estimator == expected
-    constants(monkeypatch, number_paths=0)  # as on a large film
-    assert chosen(made)[0].spp == 2 * 4 * CONSTANTS.difference_spp[1], (
-        "an image has fewer paths than the derivative images"
-    )
+    constants(monkeypatch, number_paths=0, number_spp=(4, 1 << 20))  # as on a large film
+    renders = 2 * 4 * CONSTANTS.difference_spp[1]
+    assert chosen(made)[0].spp == cost(renders * made.pixels, 16) // made.pixels, "an image takes less than differences"
     constants(monkeypatch)
     lit = {key: dataclasses.replace(info, nonlinear=True, brightness="light") for key, info in known.items()}
     formed.update(lit)

@@ -13,6 +13,7 @@ from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.estimators import derivative_images
 from unrender.estimators import gauss_newton as module
+from unrender.estimators import gauss_newton_system as system
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import GradientNoise, Hessian, HessianNoise, ScoreCovariance, Smoothing
 from unrender.optimizers import AveragedNewton, averaged_newton
@@ -68,8 +69,8 @@ def test_gradient_and_matrix_are_unbiased_and_one_half_alone_is_not(monkeypatch:
     assert off(gradients, hessian @ away) < 4.5
     assert off(hessians, hessian) < 4.5
     assert off(noise, 0.06 * hessian) < 4.5
-    products = module.products
-    monkeypatch.setattr(module, "products", lambda halves, *rest: products([halves[0], halves[0]], *rest))
+    products = system.products
+    monkeypatch.setattr(system, "products", lambda halves, *rest: products([halves[0], halves[0]], *rest))
     _, hessians, _ = estimates(made)
     assert off(hessians, hessian) > 4.5
 
@@ -128,12 +129,12 @@ def test_widths_are_those_of_a_shift_of_the_picture() -> None:
 @pytest.mark.parametrize("grows", [True, False])
 def test_widths_grow_while_differences_change_no_picture(grows: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where few paths hit a lamp behind glass, so that small differences change no sample. The planted fault is a width that stays."""
-    own, step = module._Point._states, 0.05
+    own, step = system.Point._states, 0.05
 
     def rounded(self: Any, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
         return own(self, step * np.round(points / step), view, key, spp)
 
-    monkeypatch.setattr(module._Point, "_states", rounded)
+    monkeypatch.setattr(system.Point, "_states", rounded)
     if not grows:
         monkeypatch.setattr(module, "_BLIND", 0.0)
     made, estimator = problem_of(MATRIX), ur.GaussNewton(spp=2, derivative_spp=2, width=0.01)
@@ -358,7 +359,7 @@ def test_references_of_too_many_pixels_for_mean_residuals_leave_no_standard_erro
 ) -> None:
     """Rather than errors of the run's own noise alone. The problem has 20 pixels."""
     monkeypatch.setattr("unrender.runs.verify.Verify.on_result", lambda self, descent, result: result)
-    monkeypatch.setattr(module, "MOST_AVERAGED", most)
+    monkeypatch.setattr(system, "MOST_AVERAGED", most)
     seen, parts = Residuals(), (ur.GaussNewton(4, 4), AveragedNewton())
     whole = ur.optimize(problem(), *parts, steps=14, callbacks=[seen])
     assert seen.kept == {20 * 24 if most == 20 else 0}
@@ -564,14 +565,14 @@ def test_few_noisy_pixels_do_not_outweigh_the_others() -> None:
 
 def test_noisy_channels_do_not_outweigh_the_others_of_their_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     """One channel has ten times the noise of the others: weights of whole pixels cannot tell them apart."""
-    states = module._Point._states
+    states = system.Point._states
 
     def noisy(point: Any, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
         images = states(point, points, view, key, spp)
         noise = np.random.default_rng(key.uint32()).normal(size=images.shape[1:]) * np.array([1.0, 0.1, 0.1])
         return images + noise if len(points) == 1 else images
 
-    monkeypatch.setattr(module._Point, "_states", noisy)
+    monkeypatch.setattr(system.Point, "_states", noisy)
     made, scatter = problem_of(np.abs(MATRIX)), {}
     for by_channel in (False, True):
         estimator = ur.GaussNewton(2, 2, noise_limit=0.3, by_channel=by_channel)
@@ -582,6 +583,39 @@ def test_noisy_channels_do_not_outweigh_the_others_of_their_pixels(monkeypatch: 
             found.append(np.linalg.solve(matrix, np.concatenate([estimate.gradient[key] for key in TRUTH])))
         scatter[by_channel] = float(np.median(np.abs(np.stack(found[8:]))))
     assert scatter[True] < 0.7 * scatter[False]
+
+
+def test_new_derivative_images_are_worth_their_time() -> None:
+    """The variance (1 + ν / K) / N of each rule at equal time, over the best fixed K; ten times as many or as few are planted."""
+    noise, image, derivative, time = 4.0, 1.0, 6.0, 3000.0
+
+    def variance(factor: float) -> float:
+        images = derivatives = 1.0
+        while images * image + derivatives * derivative < time:
+            needs = derivative_images.needs_derivatives(
+                factor * noise / derivatives, images, derivatives, int(image), int(derivative)
+            )
+            images, derivatives = images + 1.0, derivatives + float(needs)
+        return (1.0 + noise / derivatives) / images
+
+    counts = np.arange(1.0, time / derivative)
+    best = ((1.0 + noise / counts) / ((time - counts * derivative) / image)).min()
+    assert variance(1.0) < 1.02 * best
+    assert variance(100.0) > 1.1 * best
+    assert variance(0.01) > 1.1 * best
+
+
+def test_settled_steps_use_earlier_derivative_images_and_long_ones_new_ones() -> None:
+    made, estimator = problem(), ur.GaussNewton(2, 2, remember=True)
+    state, paths = module.GaussNewtonState({"a": 0.02, "b": 0.03}), []
+    points = [TRUTH] * 40 + [{**TRUTH, "b": TRUTH["b"] + 0.05}]
+    for seed, point in enumerate(points):
+        estimate, state = estimator.estimate(made, point, state, Key(seed))
+        paths.append(estimate.info["samples"])
+    image = made.pixels * estimator.spp
+    assert set(paths) == {image, (1 + 2 * 3) * image}
+    assert paths[0] == paths[-1] == max(paths)
+    assert paths[:40].count(image) > 20
 
 
 def test_gradient_noise_is_the_scatter_of_gradients() -> None:
@@ -607,9 +641,10 @@ def test_derivatives_of_many_steps_leave_the_gradient_less_noise(remember: bool)
     def noisy(images: np.ndarray, distances: np.ndarray) -> np.ndarray:
         return differences(images, distances) + rng.normal(0.0, 0.1, (len(distances), *images.shape[1:]))
 
-    differences, states = module.differences, []
+    differences, states = system.differences, []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "differences", noisy)
+        patch.setattr(system, "differences", noisy)
+        patch.setattr(module, "needs_derivatives", lambda *_: True)
         state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
         for seed in range(200):
             estimate, state = estimator.estimate(made, TRUTH, state, Key(seed))
@@ -629,7 +664,7 @@ def test_widths_stay_within_the_bounds() -> None:
 @pytest.mark.parametrize("earlier", [True, False])
 def test_weights_leave_skewed_noise_without_bias(earlier: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the truth, with rare bright pixels. The planted fault is weights by the image whose residuals they weight."""
-    states = module._Point._states
+    states = system.Point._states
 
     def outliers(point: Any, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
         images = states(point, points, view, key, spp)
@@ -637,7 +672,7 @@ def test_weights_leave_skewed_noise_without_bias(earlier: bool, monkeypatch: pyt
         rare = generator.exponential(1.0, images.shape[1:]) * (generator.random(images.shape[1:]) < 0.2)
         return images + (rare - 0.2) if len(points) == 1 else images
 
-    monkeypatch.setattr(module._Point, "_states", outliers)
+    monkeypatch.setattr(system.Point, "_states", outliers)
     made, estimator = problem_of(np.abs(MATRIX)), ur.GaussNewton(2, 2, noise_limit=0.5)
     state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
     found = []

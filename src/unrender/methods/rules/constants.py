@@ -125,12 +125,13 @@ class Constants:
     Source: `limit`, `numbers` at 16²; on 32² as good at the end and earlier, on 48² with seven numbers and 96² as good and later. Nine
     numbers of a principled BSDF on 32²: 0.80 of the start's error after 2 s, 1.21 by path gradients (`suite.numbers`).
     """
-    number_paths: int = 1 << 16
-    """Path budget of the images of such a step. Source: lamps, lens and frosted glass in 12 s (7adae11)."""
+    number_paths: int = 1 << 17
+    """Least path budget of the images of such a step, for which starting two renders takes an eighth of the time. Source:
+    `suite.numbers`."""
     number_spp: tuple[int, int] = (4, 256)
     """Limits of the samples per pixel of these images. Source: as for `number_paths`."""
     number_images: float = 1.0
-    """Least ratio of the paths of these images to those of their derivative images.
+    """Least ratio of the time of these images to that of their derivative images, see `derivative_images.cost`.
 
     Source: `suite.numbers`, geometric mean of the errors of three seeds after 1 s: `two lamps` 0.0094 in place of 0.0116, `lamps` 0.0096 in
     place of 0.0137. A step of nine numbers takes a tenth more time.
@@ -171,6 +172,8 @@ class Constants:
     """`averaging` of poses, whose first models are far from the solution. Source: as for `pose_shift`."""
     pose_images: float = 2.0
     """Ratio of the paths of the images of poses to those of their derivative images. Source: as for `pose_shift`."""
+    block_paths: int = 1 << 16
+    """Least path budget of the images of a block. Source: lamps, lens and frosted glass in 12 s (7adae11)."""
     block_images: float = 0.5
     """The same ratio for a block, while textures change the images. Source: the block with all else in the room unknown."""
     block_every: int = 2

@@ -12,6 +12,7 @@ from unrender.core.random import Key
 from unrender.core.text import listed
 from unrender.core.trees import Tree
 from unrender.estimators.capabilities import Hessian
+from unrender.estimators.derivative_images import cost
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.hybrid import HybridGradient
 from unrender.estimators.path import PathGradient
@@ -225,8 +226,10 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
     differences = sampling.within(
         constants.difference_spp, constants.difference_paths // (2 * elements * problem.pixels)
     )
-    paths = constants.number_paths // problem.pixels
-    paths = max(paths, round(2 * elements * differences * images))
+    renders, least = 2 * elements * differences * problem.pixels, constants.block_paths
+    if images >= 1.0:  # no block: states that differ in poses only are rendered together
+        renders, least = cost(renders, 4 if len(moved) == len(keys) else 4 * elements), constants.number_paths
+    paths = max(least, round(renders * images)) // problem.pixels
     spp = traits.options.spp or sampling.within(constants.number_spp, paths)
     side = min(min(size) for size in problem.sizes)
     reach = constants.pose_reach if poses else constants.light_reach

@@ -1,0 +1,220 @@
+"""Images and derivative images of a problem at one point, and the sums over them of a Gauss-Newton step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from unrender.core import arrays, trees
+from unrender.core.arrays import Array
+from unrender.core.random import Key
+from unrender.core.trees import Tree
+from unrender.estimators.derivative_images import (
+    MOST_AVERAGED,
+    HalvedImage,
+    HalvesMean,
+    LossWeights,
+    Products,
+    differences,
+    mean_residuals,
+    noise_weights,
+    products,
+    running_mean,
+    squared_slope,
+)
+from unrender.estimators.gradient_sum import damping, smoothed_variance
+from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.scene.problem import Problem
+from unrender.statistics.scores import positive_inverse
+
+if TYPE_CHECKING:
+    from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
+
+_OF_RANGE = 0.125
+"""Largest width relative to the range between a parameter's bounds."""
+_IMAGE = 2
+"""Stream of a view's key for the image. Lower streams are for the two halves of the derivative images."""
+
+
+@dataclass
+class System:
+    """Sums over all views, for n elements.
+
+    Attributes:
+        products: products of derivative images.
+        slopes: squared differences of neighbouring pixels, summed over the views that the element changes, (n,).
+        weighted: derivative images by view, see `DerivativeImages`; {} unless `GaussNewton.derivative_images`.
+        variances: running mean of the variance of each view's image.
+        derivatives: mean derivative images of each view.
+        residuals: mean derivatives of the loss of each view.
+        fresh: whether there are new derivative images.
+    """
+
+    products: Products
+    slopes: np.ndarray
+    fresh: bool = True
+    loss: float = 0.0
+    images: dict[int, Array] = field(default_factory=dict)
+    weighted: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=dict)
+    variances: list[np.ndarray] = field(default_factory=list)
+    derivatives: list[HalvesMean] = field(default_factory=list)
+    residuals: list[HalvesMean] = field(default_factory=list)
+
+
+class Point:
+    """Images and derivative images of a problem at its parameters.
+
+    Attributes:
+        samples: number of paths traced so far.
+        largest: largest width of each parameter, infinite if there is none.
+        scores: whether residuals are averaged over steps.
+    """
+
+    def __init__(self, options: GaussNewton, problem: Problem, parameters: Tree):
+        self.options, self.problem, self.parameters = options, problem, parameters
+        self.session: RenderSession = problem.renderer.prepare(list(parameters), None, derivatives=False)
+        self.theta = trees.ravel(parameters)
+        self.samples = 0
+        self.scores = options.scores and problem.pixels <= MOST_AVERAGED
+        ranges = {key: (unknown.bounds[0], unknown.bounds[1]) for key, unknown in problem.unknowns.items()}
+        self.largest = {
+            key: min(
+                options.largest.get(key, math.inf),
+                math.inf if low is None or high is None else _OF_RANGE * (high - low),
+            )
+            for key, (low, high) in ranges.items()
+        }
+        known = problem.renderer.parameters()
+        sensors = {key: -1 if known[key].sensor is None else known[key].sensor for key in parameters}
+        self._sensors = trees.repeat_per_element(sensors, parameters)  # pyright: ignore[reportArgumentType]
+
+    def since(self, before: np.ndarray | None, state: GaussNewtonState) -> tuple[np.ndarray, float]:
+        """Return the step since a point, (n,), and its length in units of the widths."""
+        step = np.zeros_like(self.theta) if before is None else self.theta - before
+        widths = trees.repeat_per_element(state.widths, self.parameters)
+        return step, float(np.max(np.abs(step) / widths, initial=0.0))
+
+    def system(
+        self,
+        state: GaussNewtonState,
+        key: Key,
+        step: np.ndarray | None = None,
+        moved: float = 0.0,
+        fresh: bool = True,
+    ) -> System:
+        """Return gradient and Hessian for the state's widths, after a step (n,) of length `moved` in units of the widths. Without a step,
+        only compute the quantities that the next widths need.
+
+        With `fresh`, there are new derivative images; otherwise only the mean of earlier ones.
+        """
+        total = System(Products.zero(self.theta.size), np.zeros(self.theta.size), fresh)
+        steps = trees.repeat_per_element(state.widths, self.parameters)
+        inverse = None if state.hessian is None else positive_inverse(state.hessian)
+        for view, sensor_view in enumerate(self.problem.views):
+            elements = np.flatnonzero((self._sensors == -1) | (self._sensors == sensor_view.sensor))
+            seed = key.fold(view)
+            images = self._images(view, seed) if step is not None else None
+            if images:
+                total.images[view] = images.mean
+                total.loss += arrays.number(self.problem.loss_value(view, images.mean))
+            weights = self._noise_weighted(view, images, state, total) if images else None
+            if not elements.size:
+                continue
+            averaged = images is not None and self.options.remember
+            mean = self._mean_derivatives(view, elements, steps, seed, state, total, averaged)
+            if weights is not None and self.options.derivative_images:
+                total.weighted[view] = (elements, 0.5 * (mean.one + mean.other), weights.second)
+            residuals = None
+            if self.scores and weights is not None and step is not None:
+                before = state.residuals[len(total.residuals)] if state.residuals else None
+                residuals = mean_residuals(before, weights, mean, step[elements], moved)
+                total.residuals.append(residuals)
+            own = None if inverse is None else inverse[np.ix_(elements, elements)]
+            parts = [mean.one, mean.other], weights, residuals, int(state.shift), self.options.remember, own
+            total.products.add(products(*parts), elements)
+        return total
+
+    def _mean_derivatives(
+        self,
+        view: int,
+        elements: np.ndarray,
+        steps: np.ndarray,
+        key: Key,
+        state: GaussNewtonState,
+        total: System,
+        averaged: bool,
+    ) -> HalvesMean:
+        """Return the derivative images of a view, in a mean with those of earlier steps if `averaged`."""
+        before = state.derivatives[len(total.derivatives)] if averaged and state.derivatives else None
+        if before is not None and not total.fresh:
+            mean = before
+        else:
+            points, distances = self._points(elements, steps)
+            halves = [self._states(points, view, key.fold(half), self.options.derivative_spp) for half in (0, 1)]
+            total.slopes[elements] += squared_slope(halves)
+            mean = HalvesMean(differences(halves[0], distances), differences(halves[1], distances))
+            mean = before.and_one(mean, self.since(state.origin, state)[1]) if before else mean
+        if averaged:
+            total.derivatives.append(mean)
+        return mean
+
+    def _noise_weighted(self, view: int, images: HalvedImage, state: GaussNewtonState, total: System) -> LossWeights:
+        """Return the derivatives of the loss with the weights of the noise, and add the image's variance to `total`.
+
+        The weights are of earlier images only. A bright outlier has a large residual and a large variance, so weights by this image's
+        variance would shift the solution to darker images.
+        """
+        weights, limit = self._weights(view, images), self.options.noise_limit
+        if limit is None:
+            return weights
+        total.variances.append(
+            running_mean(state.variances, view, arrays.numpy(images.variance), self.options.by_channel)
+        )
+        return weights.times(noise_weights(state.variances[view], limit)) if state.variances else weights
+
+    def _points(self, elements: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parameters with one element increased, then decreased, by its step, (2 m, n), within bounds, and the distances of
+        both, (m,)."""
+        unknowns = self.problem.unknowns
+        offsets = np.zeros((2, elements.size, self.theta.size))
+        offsets[0, np.arange(elements.size), elements] = steps[elements]
+        offsets[1, np.arange(elements.size), elements] = -steps[elements]
+        states = trees.parts(self.theta + offsets, self.parameters)
+        inside = [unknowns[key].project(x).reshape(*x.shape[:2], -1) for key, x in states.items()]
+        points = np.concatenate(inside, axis=-1).astype(np.float32).astype(np.float64)
+        distances = points[0, np.arange(elements.size), elements] - points[1, np.arange(elements.size), elements]
+        return points.reshape(-1, self.theta.size), distances
+
+    def _states(self, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
+        """Render images (B, H, W, 3) at points (B, n) with half of the samples, all with the same random numbers."""
+        request = SampleRequest(self.problem.views[view].sensor, spp // 2, key.uint32())
+        stacked = {key: x.astype(np.float32) for key, x in trees.parts(points, self.parameters).items()}
+        for name, x in stacked.items():
+            if (x == x[:1]).all():  # shared by all, see `RenderSession.image_batch`
+                stacked[name] = np.broadcast_to(x[0], x.shape)
+        images = arrays.numpy(self.session.image_batch(stacked, request))
+        self.samples += images.shape[0] * images.shape[1] * images.shape[2] * request.spp
+        return images
+
+    def _images(self, view: int, key: Key) -> HalvedImage:
+        """Return the image and its two halves."""
+        halves = [self._states(self.theta[None], view, key.fold(_IMAGE + half), self.options.spp)[0] for half in (0, 1)]
+        array = self.problem.renderer.array
+        mean, variance = 0.5 * (halves[0] + halves[1]), 0.25 * np.square(halves[0] - halves[1])
+        return HalvedImage(array(mean), array(variance), array(halves[0]), array(halves[1]))
+
+    def _weights(self, view: int, images: HalvedImage) -> LossWeights:
+        """Return ℓ' and ℓ'' at the image, and ℓ' at its halves, (H, W, 3) each."""
+        problem, image = self.problem, images.mean
+        derivative = problem.loss_derivative(view, image)
+        if problem.loss.linear:
+            second = problem.loss_derivative(view, image + 1.0) - derivative
+            halves = (problem.loss_derivative(view, half) for half in (images.one, images.other))
+            return LossWeights(*map(arrays.numpy, (derivative, second, *halves)))
+        residual = image - problem.reference(view)
+        damped = derivative * damping(residual, smoothed_variance(images.variance), self.options.tolerance)
+        secant = damped * residual / (residual * residual + 1e-12)
+        return LossWeights(*map(arrays.numpy, (damped, secant, damped, damped)))
