@@ -18,7 +18,7 @@ from tests.analytic import AnalyticRenderer
 from tiers import quick, slow
 from unrender.core import registry
 from unrender.core.random import Key
-from unrender.estimators.capabilities import FreshGradient
+from unrender.estimators.capabilities import FreshGradient, NoiseSample
 from unrender.estimators.sample_groups import fresh_weights
 from unrender.images.base import ImageEstimate
 from unrender.optimizers import transforms
@@ -332,6 +332,28 @@ def test_fresh_gradients_know_nothing_of_earlier_samples(noise: float) -> None:
     scale = np.sqrt((before**2).mean(0) * (fresh**2).mean(0)) / np.sqrt(len(found))
     assert np.abs((before * fresh).mean(0) / scale).max() < limit
     assert (before * after).mean() > 0.3 * (before**2).mean(), "gradients that remember agree on their noise"
+
+
+@pytest.mark.parametrize("spp", [2, 8])
+def test_a_noise_sample_has_no_mean_and_the_variance_of_the_gradient(spp: int) -> None:
+    """With two groups, whose weights come from one another, its variance is up to twice as large."""
+    asked = problem(noise=0.5)
+    estimator = ur.PathGradient(CV(), spp=spp, noise_sample=True)
+    rows = []
+    for seed in range(300):
+        found, state = estimator.estimate(asked, asked.initial(), estimator.init(asked, asked.initial()), Key(seed))
+        trees = (found.gradient, found.require("the test", NoiseSample).values)
+        rows.append([np.concatenate([g.ravel() for g in tree.values()]) for tree in trees])
+    gradients, noise = np.array(rows).swapaxes(0, 1)
+    worst, limit = worst_z(noise, np.zeros(noise.shape[1]))
+    assert worst < limit
+    assert worst_z(noise + 0.5 * noise.std(0), np.zeros(noise.shape[1]))[0] > limit, "a planted mean went unseen"
+    assert 0.7 < noise.var(0).sum() / gradients.var(0).sum() < 2.2
+    found, _ = estimator.estimate(asked, asked.initial(), state, Key(1))
+    assert found.get(NoiseSample) is None, "only the first estimate has one"
+    odd = ur.PathGradient(CV(), spp=3, noise_sample=True)
+    found, _ = odd.estimate(asked, asked.initial(), odd.init(asked, asked.initial()), Key(0))
+    assert found.get(NoiseSample) is None, "groups of an odd number do not cancel"
 
 
 def test_a_fresh_gradient_follows_the_secant_of_a_loss_that_is_not_linear() -> None:

@@ -13,7 +13,7 @@ import pytest
 from unrender.core import registry, tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Variance
+from unrender.estimators.capabilities import NoiseSample, Variance
 from unrender.optimizers import Adam, Chain, ScheduleFree
 from unrender.optimizers.transforms import (
     AgreementRate,
@@ -30,7 +30,7 @@ from unrender.optimizers.transforms import (
     WienerShrinkage,
 )
 from unrender.optimizers.transforms.agreement_rate import Agreement
-from unrender.optimizers.transforms.base import checked_keys
+from unrender.optimizers.transforms.base import SmoothingChange, StepUpdate, checked_keys
 from unrender.optimizers.transforms.lasting_agreement import GradientBlocks
 from unrender.preconditioners import Sobolev
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack
@@ -234,6 +234,39 @@ def test_what_agreement_added_to_the_rate_is_taken_back_if_it_does_not_last() ->
     assert late < np.log(np.exp(independent) + 0.2 * np.exp(early))
     signal = reused(0.0, 3.0, 500, steps).of(Agreement)
     assert signal.log_rate["map"] == pytest.approx(signal.log_most["map"], abs=0.1)
+
+
+def test_the_first_rate_is_longer_the_less_noise_the_first_gradient_has() -> None:
+    """The noise in the first step is at most a sixth of an unchanged step, up to a factor of 3; few elements tell nothing of noise."""
+    rng, start = np.random.default_rng(0), {"map": np.zeros((16, 16, 1)), "few": np.zeros(3)}
+    gradient = {key: np.ones_like(x) for key, x in start.items()}
+    chain = Chain((FittedSobolev(), AgreementRate()), 0.1)
+
+    def first_step(noise: float) -> tuple[float, float]:
+        sample = {key: noise * np.sign(rng.normal(size=x.shape)) for key, x in start.items()}
+        steps, state = chain.update(Estimate(0.0, gradient, (NoiseSample(sample),)), chain.init(start), start)
+        again, _ = chain.update(Estimate(0.0, gradient), state, start)
+        np.testing.assert_allclose(again["map"], steps["map"], rtol=0.2)
+        return -float(steps["map"].mean()) / 0.1, -float(steps["few"].mean()) / 0.1
+
+    found = {noise: first_step(noise) for noise in (0.0, 0.01, 1 / 12, 1 / 6, 2.0)}
+    assert [one for one, _ in found.values()] == pytest.approx([3.0, 3.0, 2.0, 1.0, 1.0])
+    assert [few for _, few in found.values()] == pytest.approx([1.0] * 5)
+    steps, _ = chain.update(Estimate(0.0, gradient), chain.init(start), start)
+    assert -steps["map"].mean() / 0.1 == pytest.approx(1.0), "without a sample of the noise"
+
+
+def test_less_smoothing_ends_the_longer_first_rate() -> None:
+    """The noise was measured in smoothed gradients."""
+    update = StepUpdate(
+        Estimate(0.0, {}), START, 1, dict.fromkeys(START, 0.1), START, START, previous=START,
+        smoothing={"map": SmoothingChange(gain=2.0)},
+    )  # fmt: skip
+    part = AgreementRate()
+    state = replace(part.init(START, dict.fromkeys(START, 0.1)), firsts={"map": 3.0, "number": 2.0})
+    after, state = part.update(update, state)
+    assert state.firsts == {"map": 1.0, "number": 2.0}
+    assert after.factors["map"] <= 0.3
 
 
 def test_it_is_told_what_lasts() -> None:

@@ -57,6 +57,18 @@ class FreshGradient(Capability):
 
 
 @dataclass(frozen=True)
+class NoiseSample(Capability):
+    """One sample of the gradient's noise, of mean 0 and about the gradient's variance.
+
+    Attributes:
+        values: {key: array}, with the gradient's keys and shapes.
+    """
+
+    name: ClassVar[str] = "noise_sample"
+    values: Tree
+
+
+@dataclass(frozen=True)
 class Hessian(Capability):
     """Hessian of the loss.
 

@@ -21,6 +21,7 @@ from unrender.estimators.capabilities import (
     HessianNoise,
     HessianProduct,
     LossFunction,
+    NoiseSample,
     ScoreCovariance,
     Smoothing,
     Variance,
@@ -45,8 +46,8 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
     def converted(capability: Capability) -> Capability:
         if isinstance(capability, BlockEstimate):
             return _block(capability, problem, parameters)
-        if isinstance(capability, FreshGradient):
-            return FreshGradient(coordinates.pull_back(capability.values, slopes))
+        if isinstance(capability, (FreshGradient, NoiseSample)):
+            return replace(capability, values=coordinates.pull_back(capability.values, slopes))
         return _second_order(capability, estimate.gradient, problem, parameters, slopes) if slopes else capability
 
     gradient = coordinates.pull_back(estimate.gradient, slopes)

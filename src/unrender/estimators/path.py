@@ -12,7 +12,7 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators import emitter_selection
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient
+from unrender.estimators.capabilities import Capabilities, FreshGradient, Gradient, NoiseSample
 from unrender.estimators.emitter_selection import EmitterSelection, EmitterState
 from unrender.estimators.sample_groups import (
     PIXELS,
@@ -93,6 +93,8 @@ class PathGradient:
         fresh_from: index of the estimate from which eight have `FreshGradient` as well, and again from twice, four times, … this
             index, >= 8; 0 for none. It costs an additional adjoint. Only for full views, with an image estimator that reuses earlier
             samples (otherwise every gradient is fresh), and with a linear derivative or a tolerance.
+        noise_sample: whether the first estimate has a `NoiseSample`: the gradient with the opposite sign in every other group. It costs an
+            additional adjoint, and requires full views and an even number of groups.
         emitters: selection of emitters in next-event estimation: "scene", uniform or by the scene's own sampling weights, or
             "adaptive", to minimise the variance of the gradient, in units of Adam's steps (`emitter_selection.EmitterState`). Both are
             unbiased alike. The first steps, and one in 20, take two additional passes, which update the probabilities. The weight of the
@@ -111,6 +113,7 @@ class PathGradient:
     adjoint_spp: int | None = None
     tolerance: float = 0.0
     fresh_from: int = 0
+    noise_sample: bool = False
     emitters: EmitterSelection = "scene"
     differential_bsdf: bool = False
 
@@ -191,6 +194,7 @@ class PathGradient:
             batch=batch,
             tolerance=self.tolerance,
             fresh=batch.sample is None and self._in_window(state.step) and self._has_secant(problem.loss),
+            noise=batch.sample is None and self.noise_sample and state.step == 0,
             emitters=emitter_request,
         )
         step = problem.executor.estimate_gradient(problem, request)
@@ -203,10 +207,10 @@ class PathGradient:
         if is_full and has_batches:
             image = problem.executor.prepare_images(problem, self.image, image)
         next_state = PathGradientState(image, pixels, 0 if is_full else state.batches + 1, state.step + 1, emitters)
-        arrays.evaluate(step.gradient, step.fresh, step.losses, next_state, step.info)
+        arrays.evaluate(step.gradient, step.fresh, step.noise, step.losses, next_state, step.info)
         loss = sum(arrays.number(value) for value in step.losses)
         info = {"samples": step.samples, "images": step.images, **step.info}
         if emitter_request is not None:
             info["emitter_probability"] = emitter_request.probabilities
-        capabilities = (FreshGradient(step.fresh),) if step.fresh else ()
+        capabilities = tuple(kind(x) for kind, x in ((FreshGradient, step.fresh), (NoiseSample, step.noise)) if x)
         return Estimate(loss, step.gradient, capabilities, info), next_state

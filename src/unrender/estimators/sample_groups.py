@@ -19,7 +19,7 @@ from unrender.core.trees import Tree
 from unrender.estimators import emitter_selection
 from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.gradient_sum import GradientSum, damping, smoothed_variance
-from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest
+from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, leave_one_out
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
@@ -31,7 +31,7 @@ from unrender.scene.sample_counts import SampleCounts
 PIXELS = 1 << 32
 """Stream of a step's key for its pixels; lower streams are for its frames."""
 
-TREES = ("gradient", "paired", "previous", "fresh")
+TREES = ("gradient", "paired", "previous", "fresh", "noise")
 """Trees of a `GradientSample` that are summed over the frames."""
 
 _MOST_GROUPS = 16
@@ -50,6 +50,7 @@ class GradientSample:
         paired: the same on the paths of `previous`, if `PairRequest.difference_spp` requests separate paths; else {}.
         previous: gradient of the loss at the previous parameters, from the same paths; {} if it was not requested.
         fresh: gradient from the samples of this step alone; {} if it was not requested.
+        noise: sample of the gradient's noise; {} if it was not requested, or if the number of groups is odd.
         losses: losses of the current state, one per frame, lazy.
         images: images of the current state that the loss sees, per full view.
         samples: number of paths traced for images, adjoints and the probabilities of pixels.
@@ -63,6 +64,7 @@ class GradientSample:
     paired: Tree
     previous: Tree
     fresh: Tree
+    noise: Tree
     losses: list[Array]
     images: dict[int, Array]
     samples: int
@@ -89,6 +91,7 @@ class GradientRequest:
         batch: Pixel mini-batch, rendered in one launch for all views; None for full views.
         tolerance: See `PathGradient`.
         fresh: Whether to add the gradient from this step's samples alone.
+        noise: Whether to add a sample of the gradient's noise.
         emitters: Selection probabilities of emitters; None for the scene's own.
     """
 
@@ -102,6 +105,7 @@ class GradientRequest:
     batch: MiniBatch | None = None
     tolerance: float = 0.0
     fresh: bool = False
+    noise: bool = False
     emitters: EmitterRequest | None = None
 
     @property
@@ -157,6 +161,11 @@ class GradientRequest:
         fresh: Tree = {}
         if self.fresh and image_estimate.fresh is not None:
             fresh = session.adjoint(parameters, paths, fresh_weights(problem, frame, image_estimate, others, weights))
+        noise: Tree = {}
+        if self.noise and counts is None and groups % 2 == 0:
+            noise = session.adjoint(
+                parameters, paths, _noise_weights(derivative, image_estimate.images, others, weights)
+            )
         draws = None
         if self.tangents and isinstance(frame, PixelBatch):
             draws = _draw_statistics(frame, weights, session.tangent_moment(parameters, paths, self.tangents))
@@ -168,9 +177,8 @@ class GradientRequest:
                 session, parameters, self.emitters.tangents, image_estimate, weights, spp
             )
         pixels = traced * frame.pixels
-        return FrameGradient(
-            gradient, paired, previous, fresh, loss, mean, pixels, image_estimate.info, contribution, draws, connections
-        )
+        trees, info = (gradient, paired, previous, fresh, noise), image_estimate.info
+        return FrameGradient(*trees, loss, mean, pixels, info, contribution, draws, connections)
 
 
 class GatheredFrames:
@@ -279,6 +287,7 @@ class FrameGradient:
     paired: Tree
     previous: Tree
     fresh: Tree
+    noise: Tree
     loss: Array
     image: Array
     samples: int
@@ -330,6 +339,23 @@ def _variance_by_views(variance: Array, complete: Sequence[tuple[slice, tuple[in
     parts = [arrays.rows(smoothed_variance(arrays.reshape(variance[rows], (*size, 3)))) for rows, size in complete]
     rest = variance[complete[-1][0].stop :]
     return arrays.concatenate([*parts, rest * 0.0] if int(arrays.shape(rest)[0]) else parts)
+
+
+def _noise_weights(derivative: Callable[[Array], Array], images: Array, others: Array, weights: Array) -> Array:
+    """Return weights of the adjoint whose gradient has mean 0 and about the variance of the gradient.
+
+    Every other group has the opposite sign. All groups have the same expectation, so the gradient is the noise of the paths. That of the
+    leave-one-out images is in the difference of their derivative: images with alternating signs, without their mean, are added.
+
+    Args:
+        images, others: images of the groups, an even number, and leave-one-out images.
+        weights: loss derivative at `others`.
+    """
+    groups = arrays.shape(images)[0]
+    signs = arrays.like((-1.0) ** np.arange(groups).reshape(-1, *(1,) * (images.ndim - 1)), images)
+    signed = signs * images
+    noise = (arrays.mean_over_first(signed) * groups - signed + signs * leave_one_out(images)) / (groups - 1)
+    return derivative(others + noise) + (signs - 1.0) * weights
 
 
 def fresh_weights(problem: Problem, frame: Frame, image: ImageEstimate, others: Array, weights: Array) -> Array:

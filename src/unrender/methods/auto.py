@@ -41,6 +41,7 @@ class AutoMethod(Options):
     | smoothing | Sobolev gradients over at most an eighth of a texture, grid or mesh, less where gradients confirm detail | `smooth` |
     | steps | schedule-free Adam; the rate follows the agreement of successive gradients | `learning_rate` |
     | first rate | a tenth of the parameter's range or size; 0.3 of that for a number or a colour with two bounds | `learning_rate` |
+    | the same, 64 elements or more | up to 3 times that, the less noise the first gradient has | |
     | logarithms | positive numbers, colours and textures without an upper bound | `parameterise` |
     | grids of media | a quarter of the resolution before step 8, half before step 20 | `coarse` |
     | environment maps | a weak pull to the start, for texels that pictures hardly show | |

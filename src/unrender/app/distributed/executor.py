@@ -237,6 +237,7 @@ class DistributedExecutor:
             tangents=named(self._outbox.once(request.tangents)),
             tolerance=request.tolerance,
             fresh=request.fresh,
+            noise=request.noise,
             pictures=self._calls % _PICTURES_EVERY == 1,
             single=self._outbox.compress,
         )
@@ -368,6 +369,7 @@ class DistributedExecutor:
             paired=summed(lambda reply: reply.paired),
             previous=summed(lambda reply: reply.previous),
             fresh=summed(lambda reply: reply.fresh),
+            noise=summed(lambda reply: reply.noise),
             losses=[loss for _, loss in losses],
             images=images,
             samples=(batch.samples if batch else 0) + sum(reply.samples for reply in replies),

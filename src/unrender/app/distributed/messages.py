@@ -91,7 +91,7 @@ class Call:
         replay: whether only this memory is needed.
         pictures: whether images are requested.
         single: whether gradients are returned in single instead of double precision.
-        spp, adjoint_spp, key, pair, tolerance, fresh: fields of the request.
+        spp, adjoint_spp, key, pair, tolerance, fresh, noise: fields of the request.
         batch: the pixels; None for full views.
         pilot: references of these pixels, (N, 3) each, if their paths are requested instead of a gradient, see `PilotRequest`.
         tangents: tangents for the squared derivatives of the pixels; {} if they are not requested.
@@ -109,6 +109,7 @@ class Call:
     tangents: References = field(default_factory=dict)
     tolerance: float = 0.0
     fresh: bool = False
+    noise: bool = False
     result: int | None = None
     replay: bool = False
     pictures: bool = False
@@ -123,7 +124,7 @@ class Reply:
     """Result of a call.
 
     Attributes:
-        gradient, previous, fresh, paired: sums over the share's views in double precision; {} if not requested.
+        gradient, previous, fresh, noise, paired: sums over the share's views in double precision; {} if not requested.
         losses: {view: loss}, by the problem's own index; for a mini-batch with the key -1.
         samples: number of paths traced.
         images: {view: (H, W, 3)} if requested.
@@ -144,6 +145,7 @@ class Reply:
     paths: tuple[np.ndarray, ...] = ()
     draws: DrawStatistics | None = None
     paired: dict[str, np.ndarray] = field(default_factory=dict)
+    noise: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def payload_bytes(message: Any) -> int:

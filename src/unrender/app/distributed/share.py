@@ -80,6 +80,7 @@ class ViewShare:
             time.perf_counter() - started,
             draws=parts[0].draws if call.batch is not None else None,
             paired=sums["paired"],
+            noise=sums["noise"],
         )
 
     def store(self, number: int, packed: Packed) -> None:
@@ -130,6 +131,7 @@ class ViewShare:
             pair,
             tolerance=call.tolerance,
             fresh=call.fresh,
+            noise=call.noise,
         )
 
     def _full_views(self) -> list[tuple[int, Frame]]:

@@ -22,6 +22,7 @@ from unrender.methods.smoothed import parse_widths, widths_of
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.schedule_free import ScheduleFree
+from unrender.optimizers.transforms.agreement_rate import FEWEST_ELEMENTS
 from unrender.preconditioners import Sobolev
 from unrender.rendering.partial import PartialDerivatives
 from unrender.scene.parameter import ParameterSettings
@@ -102,7 +103,10 @@ def paths(traits: Traits) -> Plan:
         f"{'schedule-free Adam' if len(apart) < len(rates) else 'Adam'}, first rate {first}",
     )
     fresh_from = traits.constants.fresh_from if smoothed and renders_all and not plain else 0
-    estimator = PathGradient(image, sampler, spp, tolerance=tolerance, fresh_from=fresh_from)
+    measured = renders_all and any(
+        u.initial.size >= FEWEST_ELEMENTS for key, u in problem.unknowns.items() if key in rates and key not in apart
+    )
+    estimator = PathGradient(image, sampler, spp, tolerance=tolerance, fresh_from=fresh_from, noise_sample=measured)
     return Plan(problem, estimator, optimizer, settings, tuple(filter(None, reasons)))
 
 

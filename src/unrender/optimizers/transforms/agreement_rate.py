@@ -12,6 +12,7 @@ from unrender.core.memory import inner_products
 from unrender.core.registry import register
 from unrender.core.text import listed
 from unrender.core.trees import Tree
+from unrender.estimators.capabilities import NoiseSample
 from unrender.optimizers.transforms.base import (
     SMOOTHING_UNCHANGED,
     StepTransform,
@@ -33,6 +34,10 @@ _PAIRS = (1 + _MEMORY) / (1 - _MEMORY)
 _LASTING_ERRORS = 2.0
 """Standard errors 1/√n of the lasting fraction that are added to it before growth is taken back; share of the rate that other growth
 leaves."""
+FEWEST_ELEMENTS = 64
+"""Number of elements from which the noise of a gradient is known to a fifth from one sample."""
+_NOISE_IN_STEP, _MOST_FIRST = 1.0 / 6.0, 3.0
+"""Root mean square of the noise in a longer first step, relative to the unchanged step, and largest factor of the first rate."""
 _MOST_GROWTH = 3.0
 """Largest rate relative to the first one, and relative to the growth of the parameters."""
 _FALL = 0.75
@@ -54,6 +59,7 @@ class Agreement(TransformState):
         log_least: {key: the same, as if gradients had not agreed since the last change of smoothing}.
         factors: {key: factor of the rate}.
         sizes: {key: root mean square of the first parameters, 1 where that is 0, and at least the first rate}.
+        firsts: {key: factor of the first rate}.
     """
 
     correlation: dict[str, float]
@@ -62,6 +68,7 @@ class Agreement(TransformState):
     log_least: dict[str, float]
     factors: dict[str, float]
     sizes: dict[str, float]
+    firsts: dict[str, float]
 
 
 @register
@@ -85,6 +92,10 @@ class AgreementRate(StepTransform):
 
     Where the rate falls by more than a quarter from one step to the next, the averaged iterate restarts. With shorter steps it would keep
     the displacement that noise has given it with the longer ones, and the average would move there.
+
+    The first rate is multiplied by min(3, max(1, 1 / (6 √ν))), where ν is the squared length of the noise in the first gradient
+    relative to that of the gradient, from a `NoiseSample`. Without noise a long step ends nearer to the solution, with noise further
+    from it. The factor is 1 for fewer than 64 elements, from which ν is uncertain, and after a step that reduces smoothing.
 
     The rate is at most 3 times the first, times the growth of the parameter. At a step that reduces smoothing it is at most 0.3 times the
     first. Needs a `FittedSobolev` before it, which stores the last gradient.
@@ -110,11 +121,13 @@ class AgreementRate(StepTransform):
             for key, x in parameters.items()
         }
         zeros, ones = dict.fromkeys(parameters, 0.0), dict.fromkeys(parameters, 1.0)
-        return Agreement(ones, zeros, zeros, zeros, ones, sizes)
+        return Agreement(ones, zeros, zeros, zeros, ones, sizes, ones)
 
     def update(self, update: StepUpdate, state: Agreement) -> tuple[StepUpdate, Agreement]:
         """Adapt the learning rates. Waits for the device, because correlations and sizes of the parameters are read."""
         previous = update.require_previous("AgreementRate")
+        if update.made == 0 and (noise := update.estimate.get(NoiseSample)) is not None:
+            state = replace(state, firsts=state.firsts | _first_factors(update, noise.values))
         if update.made > 0:
             correlation, log_rate, log_most, log_least, factors = {}, {}, {}, {}, {}
             for key, (cosine, size) in _measured(update.gradient, previous, update.parameters).items():
@@ -135,13 +148,16 @@ class AgreementRate(StepTransform):
             falls = {key for key, q in factors.items() if q < _FALL * state.factors[key]}
             falls = {key for key in falls if update.smoothing.get(key, SMOOTHING_UNCHANGED).gain == 1.0}
             update = replace(update, restarted=update.restarted | falls)
-            state = Agreement(correlation, log_rate, log_most, log_least, factors, state.sizes)
-        factors = {key: update.factors.get(key, 1.0) * q for key, q in state.factors.items()}
+            weaker = {key for key, fit in update.smoothing.items() if fit.gain > 1.0}
+            firsts = state.firsts | dict.fromkeys(weaker, 1.0)
+            state = Agreement(correlation, log_rate, log_most, log_least, factors, state.sizes, firsts)
+        factors = {key: update.factors.get(key, 1.0) * q * state.firsts[key] for key, q in state.factors.items()}
         return replace(update, factors=factors), state
 
     def choices(self, state: Agreement, made: int) -> tuple[str, ...]:
         """Return the current rates relative to the first."""
-        changed = [f"{key} {factor:.2g}" for key, factor in state.factors.items()] if made > 0 else []
+        rates = {key: factor * state.firsts[key] for key, factor in state.factors.items()}
+        changed = [f"{key} {rate:.2g}" for key, rate in rates.items()] if made > 0 else []
         return (f"learning rate, over the first: {listed(changed)}",) if changed else ()
 
     def _change(self, correlation: float, shape: tuple[int, ...], made: int) -> float:
@@ -152,6 +168,18 @@ class AgreementRate(StepTransform):
         rise = max(0.0, 2.0 * agreement - 1.0) * min(1.0, _EARLY / made)
         change = self.growth * (rise - 2.0 * max(0.0, -correlation - error))
         return change - power / (made + _DELAY)
+
+
+def _first_factors(update: StepUpdate, noise: Tree) -> dict[str, float]:
+    """Return {key: factor of the first rate} from a sample of the first gradient's noise."""
+    factors = {}
+    for key, sample in noise.items():
+        change, g = update.smoothing.get(key, SMOOTHING_UNCHANGED), update.gradient[key]
+        smooth = sample if change.preconditioner is None else change.preconditioner.apply(sample)
+        signal, part = (arrays.number(square) for square in inner_products([(g, g), (smooth, smooth)]))
+        if math.prod(arrays.shape(g)) >= FEWEST_ELEMENTS and signal > 0.0:
+            factors[key] = min(_MOST_FIRST, max(1.0, _NOISE_IN_STEP * math.sqrt(signal / max(part, 1e-9 * signal))))
+    return factors
 
 
 def _root_mean_square(x: Array, square: float) -> float:
