@@ -829,7 +829,7 @@ def test_a_difference_that_more_steps_may_answer_is_no_other_status() -> None:
     for few in (False, True):
         assert status("finished", ["another line", f"{differs}, and no longer improves"], few) == "does not fit"
         assert status("worse than start", [f"{differs}, and no longer improves"], few) == "worse than start"
-        for words in (verification.MAY_IMPROVE, verification.NOT_CONVERGED):
+        for words in (verification.MAY_IMPROVE, verification.NOT_CONVERGED, verification.PRIOR):
             assert status("finished", [f"{differs}, and {words}"], few) == "finished"
         assert status("finished", [f"{differs}: the run needs more steps"], few) == (
             "finished" if few else "does not fit"

@@ -21,7 +21,8 @@ from unrender.statistics import paired_losses
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
 MAY_IMPROVE, NOT_CONVERGED, MORE_STEPS = "may still improve", "the run has not converged", "more steps"
-"""Words of those warnings of them that more steps may answer: surely, or after few steps."""
+PRIOR = "a prior may be too strong"
+"""Words of those warnings of them that more steps may answer: surely, or after few steps; and of those that a prior may answer."""
 _FEW_PIXELS, _OF_FEW = 96, 0.2
 """Number of pixels below which the difference is also judged pixel by pixel, which includes the references' noise; its smallest size
 relative to the image in this case."""
@@ -187,7 +188,7 @@ def fit_status(status: str, warnings: Sequence[str], few: bool) -> str:
 
     `few` says whether the run had few steps. Lines that suggest more of them then change no status.
     """
-    answers = (MAY_IMPROVE, NOT_CONVERGED, *((MORE_STEPS,) if few else ()))
+    answers = (MAY_IMPROVE, NOT_CONVERGED, PRIOR, *((MORE_STEPS,) if few else ()))
     final = any(DIFFERS in line and not any(words in line for words in answers) for line in warnings)
     return MISFIT if final and status == "finished" else status
 

@@ -121,7 +121,11 @@ def _error_line(problem: Problem, result: Result, key: str, before: float, after
     if where is None or key not in problem.truth or where.all():
         return line
     error = measure.error(result.parameters[key], problem.truth[key], where)
-    return line if error is None else f"{line}, {measure.text(error)} where seen ({where.mean():.0%} of it)"
+    return (
+        line
+        if error is None
+        else f"{line}, {measure.text(error)} where seen, also by bounced light ({where.mean():.0%} of it)"
+    )
 
 
 def _map_line(error: np.ndarray, share: np.ndarray) -> str:
