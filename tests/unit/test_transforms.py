@@ -266,6 +266,8 @@ def test_less_smoothing_ends_the_longer_first_rate() -> None:
     state = replace(part.init(START, dict.fromkeys(START, 0.1)), firsts={"map": 3.0, "number": 2.0})
     after, state = part.update(update, state)
     assert state.firsts == {"map": 1.0, "number": 2.0}
+    early, late = (part.update(replace(update, made=n), state)[0].factors["number"] for n in (16, 64))
+    assert late / early < 2**-0.7, "the longer rate fades"
     assert after.factors["map"] <= 0.3
 
 

@@ -38,6 +38,8 @@ FEWEST_ELEMENTS = 64
 """Number of elements from which the noise of a gradient is known to a fifth from one sample."""
 _NOISE_IN_STEP, _MOST_FIRST = 1.0 / 6.0, 3.0
 """Root mean square of the noise in a longer first step, relative to the unchanged step, and largest factor of the first rate."""
+_LONGER = 16.0
+"""Number of steps with this factor. In later ones noise decides the error, which longer steps raise."""
 _MOST_GROWTH = 3.0
 """Largest rate relative to the first one, and relative to the growth of the parameters."""
 _FALL = 0.75
@@ -95,7 +97,8 @@ class AgreementRate(StepTransform):
 
     The first rate is multiplied by min(3, max(1, 1 / (6 √ν))), where ν is the squared length of the noise in the first gradient
     relative to that of the gradient, from a `NoiseSample`. Without noise a long step ends nearer to the solution, with noise further
-    from it. The factor is 1 for fewer than 64 elements, from which ν is uncertain, and after a step that reduces smoothing.
+    from it. After 16 steps the factor has the power 16 / t. It is 1 for fewer than 64 elements, from which ν is uncertain, and after
+    a step that reduces smoothing.
 
     The rate is at most 3 times the first, times the growth of the parameter. At a step that reduces smoothing it is at most 0.3 times the
     first. Needs a `FittedSobolev` before it, which stores the last gradient.
@@ -151,12 +154,16 @@ class AgreementRate(StepTransform):
             weaker = {key for key, fit in update.smoothing.items() if fit.gain > 1.0}
             firsts = state.firsts | dict.fromkeys(weaker, 1.0)
             state = Agreement(correlation, log_rate, log_most, log_least, factors, state.sizes, firsts)
-        factors = {key: update.factors.get(key, 1.0) * q * state.firsts[key] for key, q in state.factors.items()}
+        power = min(1.0, _LONGER / max(update.made, 1))
+        factors = {
+            key: update.factors.get(key, 1.0) * q * state.firsts[key] ** power for key, q in state.factors.items()
+        }
         return replace(update, factors=factors), state
 
     def choices(self, state: Agreement, made: int) -> tuple[str, ...]:
         """Return the current rates relative to the first."""
-        rates = {key: factor * state.firsts[key] for key, factor in state.factors.items()}
+        power = min(1.0, _LONGER / max(made, 1))
+        rates = {key: factor * state.firsts[key] ** power for key, factor in state.factors.items()}
         changed = [f"{key} {rate:.2g}" for key, rate in rates.items()] if made > 0 else []
         return (f"learning rate, over the first: {listed(changed)}",) if changed else ()
 
