@@ -78,7 +78,8 @@ def test_where_there_is_no_boundary_auto_is_smoothed_and_says_why() -> None:
     reference = np.full((SIZE, SIZE, 3), 0.2, np.float32)
     ball = {"type": "sphere", "radius": 0.1}
     for key, why in (("ball.translation", "plateaus"), ("thing.translation", "--method plain has path gradients")):
-        problem = ur.Problem(lambda: scene(ball=ball), [ur.Parameter(key)], [ur.View(reference)], max_depth=2)
+        unknowns, views = [ur.Parameter(key)], [ur.View(reference)]
+        problem = ur.Problem(lambda: scene(ball=ball), unknowns, views, loss=ur.losses.L1(), max_depth=2)
         choice = method("auto").plan(problem)
         assert isinstance(choice.estimator, ur.SmoothedDerivatives)
         assert why in choice.reasons[0]

@@ -103,7 +103,7 @@ class PathContext:
     ):
         self.connections = connections
         self.mode, self.scene, self.tables, self.replay, self.pair = mode, scene, tables, replay, pair
-        self.geometry, self._posed = scene if geometry is None else geometry, geometry
+        self.geometry, self.posed = scene if geometry is None else geometry, geometry
         self.primal, self.forward = mode == dr.ADMode.Primal, mode == dr.ADMode.Forward
         self.states = StatePointers(tables, pair)
         self.bsdf_ctx, self.phase_ctx = mi.BSDFContext(), mi.PhaseFunctionContext()
@@ -119,7 +119,7 @@ class PathContext:
 
     def materials(self, surfaces: list[mi.SurfaceInteraction3f]) -> list[mi.SurfaceInteraction3f]:
         """Return the interactions with which BSDFs are evaluated, see `Assembly.material`."""
-        return surfaces if self._posed is None else [self._posed.material(si) for si in surfaces]
+        return surfaces if self.posed is None else [self.posed.material(si) for si in surfaces]
 
     def initial_radiance(self) -> list[Spectrum]:
         """Return L of each state before the first vertex: 0 or, in a replay, the total radiance."""

@@ -348,7 +348,7 @@ class PathPair:
 
     def _incident(self, context: PathContext) -> Callable[..., Spectrum]:
         """Return the `incident` argument of `DifferentialBsdf.contribution`, which traces standard paths."""
-        primal = PathContext(dr.ADMode.Primal, context.scene, context.tables, (), False, context.geometry)
+        primal = PathContext(dr.ADMode.Primal, context.scene, context.tables, (), False, context.posed)
 
         def trace(branch: BranchVertex, vertex: ScatteringVertex, ray: Any, numbers: Any, active: Bool) -> Spectrum:
             path = self._begin(primal, ray)
