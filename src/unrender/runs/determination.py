@@ -25,6 +25,8 @@ _LEAST_OF_FACTOR = 0.1
 """Fraction of the change by brighter emitters that must remain with darker reflectances, if the images distinguish the two."""
 _ERRORS = 2.0
 """Number of standard errors by which a change must be below its limit."""
+_MOVED = 0.1
+"""Root mean square change from the initial values, relative to the values, from which recovered values may be noise."""
 _FEW = 24
 """Number of elements of a list up to which least squares test them one by one."""
 _UNSEEN = 0.05
@@ -68,8 +70,11 @@ def undetermined(
     per_pass: int | None = None,
     most: float = 0.0,
     sensitivities: Mapping[str, np.ndarray] = MappingProxyType({}),
+    errors: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> list[str]:
     """Return a line for each parameter that hardly changes the images over its entire range, or, without one, from its initial values.
+
+    Parameters without a range are tested if their values have moved far, and have no standard errors.
 
     Parameters of materials and media are tested in sequence while time remains, first those whose sensitivity is 0. All elements of a
     parameter change together. If a map such as a bump map hardly changes the images then, its details are tested: a checkerboard of its
@@ -83,6 +88,7 @@ def undetermined(
         per_pass: see `render`.
         most: time limit for parameters whose sensitivity is 0, if it is longer than `seconds`.
         sensitivities: {key: array}, see `unrender.runs.sensitivity`.
+        errors: {key: array}, standard errors of the values.
     """
     known, lines = problem.renderer.parameters(), []
     unseen = {key for key, sensitivity in sensitivities.items() if not sensitivity.any()}
@@ -95,7 +101,7 @@ def undetermined(
         if is_map and not bounded:
             low, high = float(own.min()), float(own.max())
         ranged = low is not None and high is not None and info.role in _ROLES
-        if info.rigid or info.viewpoint or info.welded or not (ranged or (initial != own).any()):
+        if info.rigid or info.viewpoint or info.welded or not (ranged or (key not in errors and _moved(initial, own))):
             continue
         started = time.perf_counter()
         if longest > 0.0 and started + longest > until[key in unseen]:
@@ -118,13 +124,20 @@ def undetermined(
     return lines
 
 
+def _moved(initial: np.ndarray, values: np.ndarray) -> bool:
+    """Return whether values are far from the initial ones relative to their size."""
+    return bool(np.linalg.norm(values - initial) > _MOVED * np.linalg.norm(values))
+
+
 def _words(hidden: bool, change: Change, ranged: bool, bounded: bool) -> str:
     """Return what a change from one end of a range to the other, or to the initial values, tells of a parameter; "" for nothing."""
     less = f"the pictures by less than {_LEAST:.1%}"
     if not hidden:
         return ""
     if not ranged:
-        return f"its initial values change {less}; its recovered values may be noise"
+        return (
+            f"with its initial values, the pictures change by less than {_LEAST:.1%}; its recovered values may be noise"
+        )
     if change.is_above(_LEAST):
         return f"a constant added to all of it changes {less}; only differences of its elements are determined"
     if bounded and change.is_below(_LEAST):

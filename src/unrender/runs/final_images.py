@@ -228,16 +228,16 @@ def _undetermined(
     spp, seconds = _trial_spp(problem), min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
     per_pass = _pass_spp(problem)
     lines += common_factor(problem, result.parameters, spp, seconds, per_pass, most)
-    lines += undetermined(problem, result.parameters, spp, seconds, per_pass, most, sensitivities)
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities, weights)
-    text = "\n".join(line for line in lines if TOO_SHORT not in line)  # lines about what was tested
     deviations = _without(result.standard_error, numbers.unchecked)
+    deviations |= numbers.standard_errors(result.parameters, deviations, complete)
+    lines += undetermined(problem, result.parameters, spp, seconds, per_pass, most, sensitivities, deviations)
+    text = "\n".join(line for line in lines if TOO_SHORT not in line)  # lines about what was tested
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in text]
         lines += numbers.missing([key for key in numbers.unchecked if key in text] + [*numbers.undetermined])
-    deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
     return lines, unfinished, deviations
