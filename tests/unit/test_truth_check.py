@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.estimators.fresh_pictures import FreshPictures
+from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.truth_check import further_from_truth
 
 SIDE, CELLS = 12, 8
@@ -73,6 +76,27 @@ def test_a_walk_within_the_standard_errors_is_noise(error: float, count: int) ->
     errors = {"x": np.full((CELLS, CELLS, 1), error)}
     found = further_from_truth(problem, FreshPictures(problem, 0, 0), first, last, False, 1.0, errors)
     assert len(found) == count
+
+
+class OfDirections(AnalyticRenderer):
+    """Its parameters are directions."""
+
+    def parameters(self) -> dict[str, ParameterInfo]:
+        return {key: replace(info, role="direction") for key, info in super().parameters().items()}
+
+
+@pytest.mark.parametrize(("error", "count"), [(0.1, 0), (0.02, 1)])
+def test_the_standard_error_of_a_direction_is_an_angle(error: float, count: int) -> None:
+    """Errors of the components by 0.1 turn a unit vector by about 8 degrees. The direction ends 10 degrees from the truth."""
+    truth = np.full(3, 3.0**-0.5)
+    renderer = OfDirections({"x": truth}, np.ones((SIDE * SIDE * 3, 3)), noise=0.02, shape=(SIDE, SIDE))
+    problem = ur.Problem(renderer, [ur.Parameter("x")], [ur.View(renderer.exact({"x": truth}))], truth={"x": truth})
+    across = np.array([1.0, -1.0, 0.0]) / 2.0**0.5
+    first, last = ({"x": truth + np.tan(np.radians(angle)) * across} for angle in (1.0, 10.0))
+    errors = {"x": np.full(3, error)}
+    found = further_from_truth(problem, FreshPictures(problem, 0, 0), first, last, False, 1.0, errors)
+    assert len(found) == count
+    assert not count or "error 10°, 1° at the start" in found[0]
 
 
 def test_a_wrong_model_is_no_noise() -> None:

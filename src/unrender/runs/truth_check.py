@@ -25,7 +25,8 @@ _ERRORS = 2.0
 """Number of standard errors of a parameter that its last error must exceed in addition to its first error."""
 _PROBES, _SECONDS_SHARE = 8, 0.02
 """Probes of the sensitivity; fraction of the run's time after which no further one is started."""
-_SIGNS_SEED = 5
+_SIGNS_SEED, _DRAWS = 5, 8
+"""Seed and number of sets of random signs by which deviations of all elements become an error of the parameter."""
 
 
 def has_few_steps(steps: int, optimizer: Optimizer) -> bool:
@@ -68,8 +69,8 @@ def further_from_truth(
     for key in suspects:
         measure, where, noise, words = problem.unknowns[key].measure, None, 0.0, ""
         start, end = before[key], after[key]
-        if errors and key in errors:
-            noise = float(np.sqrt(np.mean(np.square(errors[key]))))
+        if errors and key in errors and key in problem.truth:
+            noise = _standard_error(problem, key, errors[key])
         sensitivity_of_key = sensitivities.get(key)
         if sensitivity_of_key is not None and key in problem.truth:
             where = seen_cells(sensitivity_of_key)
@@ -114,6 +115,14 @@ def _noise(problem: Problem, key: str, sensitivity: np.ndarray, where: np.ndarra
     square = float(np.mean(np.square(visible, dtype=np.float64))) if visible.size else 0.0
     if not (square > 0.0 and math.isfinite(residual)):
         return 0.0
-    known = np.asarray(problem.truth[key])
-    signs = np.random.default_rng(_SIGNS_SEED).choice((-1.0, 1.0), known.shape)
-    return problem.unknowns[key].measure.error(known + math.sqrt(residual / square) * signs, known, where) or 0.0
+    return _standard_error(problem, key, math.sqrt(residual / square), where)
+
+
+def _standard_error(
+    problem: Problem, key: str, deviations: np.ndarray | float, where: np.ndarray | None = None
+) -> float:
+    """Return standard deviations of the elements as one of the parameter, in the unit of its error measure, such as degrees."""
+    known, measure = np.asarray(problem.truth[key]), problem.unknowns[key].measure
+    signs = np.random.default_rng(_SIGNS_SEED).choice((-1.0, 1.0), (_DRAWS, *known.shape))
+    errors = [measure.error(known + deviations * of, known, where) or 0.0 for of in signs]
+    return float(np.sqrt(np.mean(np.square(errors))))
