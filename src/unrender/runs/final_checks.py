@@ -26,8 +26,9 @@ _OF_BIAS = 0.25
 
 _STEP = 0.1
 """Change of the parameters, relative to the range between their bounds, or to the root mean square of their values."""
-_LITTLE = 0.1
-"""Change of a pixel by random changes of all elements, relative to the usual one, up to which the unknowns hardly change it."""
+_LITTLE, _OF_PIXEL = 0.1, 0.02
+"""Changes of a pixel by random changes of all elements up to which the unknowns hardly change it: relative to the usual one, and relative
+to the pixel."""
 _FEWEST, _MOST_KEYS = 64, 4
 """Fewest pixels that are judged, and most unknowns that change as a whole."""
 _LEAST = 0.02
@@ -166,7 +167,7 @@ def unexplained_pixels(
 
     signs = np.random.default_rng(_SEED)
     random = {key: _changed(problem, key, x, signs.choice((-1.0, 1.0), x.shape)) for key, x in result.items()}
-    little = _is_little(change(random), weights)
+    little = _is_little(_joined([of[0] for of in ends]), change(random), weights)
     if np.count_nonzero(little * weights) < _FEWEST:
         return ""
     explained = [_joined([np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)])]
@@ -250,15 +251,18 @@ def _changed(problem: Problem, key: str, values: np.ndarray, signs: np.ndarray) 
     return np.asarray(problem.unknowns[key].project(values + np.where(outside, -step, step)), np.float32)
 
 
-def _is_little(change: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return which pixels a change (N, 3) leaves nearly as they are, relative to the pixels that it changes most, (N,).
+def _is_little(image: np.ndarray, change: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return which pixels of an image (N, 3) a change (N, 3) leaves nearly as they are, (N,).
 
-    Pixels above the usual change have half of the sum of all changes, so few bright pixels, such as highlights, do not decide it.
+    Changes are relative to the pixel before or after, so highlights count no more than what a lamp lights. Pixels above the usual change
+    have half of the sum of all changes.
     """
-    changes = np.abs(change).max(axis=1) * (weights > 0)
+    before, after = (np.abs(x).max(axis=1) * (weights > 0) for x in (image, image + change))
+    sizes = np.maximum(np.maximum(before, after), _LITTLE * float(before.mean()))
+    changes = np.abs(change).max(axis=1) * (weights > 0) / np.maximum(sizes, 1e-300)
     ordered = np.sort(changes)
     usual = ordered[np.searchsorted(np.cumsum(ordered), 0.5 * float(ordered.sum()))]
-    return changes <= _LITTLE * usual
+    return changes <= min(_LITTLE * usual, _OF_PIXEL)
 
 
 def _projection(residual: np.ndarray, changes: Sequence[np.ndarray], weights: np.ndarray) -> np.ndarray:
