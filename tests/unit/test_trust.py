@@ -129,7 +129,7 @@ def test_ray_folder_that_others_can_change_is_refused(home: Path) -> None:
 
 def test_a_cluster_without_nodes_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """It says nothing of its folders, so it is not joined."""
-    monkeypatch.setattr("unrender.app.distributed.cluster.connection._SECONDS", 0.0)
+    monkeypatch.setattr("unrender.app.distributed.cluster.private._SECONDS", 0.0)
     with pytest.raises(InputError, match="the cluster at a:1 has no node"):
         check_cluster(fake_ray(), "a:1")
 

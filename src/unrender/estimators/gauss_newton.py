@@ -177,7 +177,11 @@ class GaussNewton:
     def estimate(
         self, problem: Problem, parameters: Tree, state: GaussNewtonState, key: Key
     ) -> tuple[Estimate, GaussNewtonState]:
-        """Return an estimate and the next state. `info`: "samples" (paths traced), "images" per view."""
+        """Return an estimate and the next state. `info`: "samples" (paths traced), "images" per view.
+
+        An estimate that is not finite leaves the state unchanged.
+        """
+        before = state
         point = Point(self, problem, parameters)
         if not state.widths:
             widths = {key: self.width * (float(np.abs(arrays.numpy(x)).max()) or 1.0) for key, x in parameters.items()}
@@ -207,7 +211,7 @@ class GaussNewton:
             ),
             {"samples": point.samples, "images": system.images},
         )
-        return estimate, self._next(state, system, point, _CHANGE)
+        return estimate, self._next(state, system, point, _CHANGE) if system.is_finite() else before
 
     def _needs_derivatives(self, point: Point, state: GaussNewtonState) -> bool:
         """Return whether a step has new derivative images: while the mean is of another point or shift, or has too much noise."""
@@ -232,8 +236,9 @@ class GaussNewton:
         widths = dict(state.widths)
         for key, width in state.widths.items() if system.fresh else ():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
-            target = state.shift * math.sqrt(slope / square) if square > 0.0 and slope > 0.0 else width
-            if square <= 0.0 < slope:  # few samples show no small change
+            known = 0.0 < square < math.inf and 0.0 < slope < math.inf
+            target = state.shift * math.sqrt(slope / square) if known else width
+            if square <= 0.0 < slope < math.inf:  # few samples show no small change
                 target = max(width, _BLIND * (float(np.abs(arrays.numpy(point.parameters[key])).max()) or 1.0))
             widths[key] = float(np.clip(target, width / change, min(width * change, point.largest[key])))
         return replace(

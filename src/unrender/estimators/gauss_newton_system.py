@@ -63,6 +63,10 @@ class System:
     derivatives: list[HalvesMean] = field(default_factory=list)
     residuals: list[HalvesMean] = field(default_factory=list)
 
+    def is_finite(self) -> bool:
+        """Return whether all sums are finite."""
+        return all(np.isfinite(x).all() for x in (*vars(self.products).values(), self.slopes))
+
 
 class Point:
     """Images and derivative images of a problem at its parameters.

@@ -10,7 +10,7 @@ import importlib.util
 import json
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from unrender.app.exporting.asset import Asset, Camera, Part
 from unrender.core.errors import InputError
 from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.display.pictures import png
-
-if TYPE_CHECKING:
-    pass
 
 _FLOAT, _UNSIGNED = 5126, 5125
 _VERTICES, _INDICES = 34962, 34963
