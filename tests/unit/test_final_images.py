@@ -6,6 +6,7 @@ import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -372,6 +373,38 @@ def test_pixels_that_the_unknowns_hardly_change_tell_of_wrong_references_at_any_
         )
         assert abs(along - 1.0) < 0.3
         assert abs(down) < 0.1
+
+
+@pytest.mark.parametrize("count", [1, 4])
+@pytest.mark.parametrize(("budget", "spp", "checked"), [(1e9, None, True), (1.0, None, True), (0.15, 64, False)])
+def test_the_check_of_unchanged_pixels_fits_into_the_time_that_is_left(
+    budget: float, spp: int | None, checked: bool, count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a clock that counts a millisecond for each sample per pixel. Samples that the caller gives may leave too little time for it."""
+    values = {f"map{index}": np.full(3, 0.5, np.float32) for index in range(count)}
+    matrix = np.random.default_rng(0).random((768, 3 * count))
+    matrix[384:] = 0.0
+    renderer = AnalyticRenderer(values, matrix, 0.1, noise=0.3, shape=SHAPE)
+    made = Problem(renderer, [Parameter(key, bounds=(0, 1)) for key in values], [View(renderer.exact(values))])
+    own, spent, checks = final_images.render, [0.0], [0.0]
+
+    def render(problem: Problem, values: dict[str, np.ndarray], view: int, samples: int, *rest: int, **options: int):
+        spent[0] += 1e-3 * samples
+        return own(problem, values, view, samples, *rest, **options)
+
+    def check(*given: Any) -> str:
+        before = spent[0]
+        line = final_checks.unexplained_pixels(*given)
+        checks[0] = spent[0] - before
+        return line
+
+    monkeypatch.setattr(final_images, "render", render)
+    monkeypatch.setattr(final_images, "unexplained_pixels", check)
+    monkeypatch.setattr(final_images, "time", SimpleNamespace(perf_counter=lambda: spent[0]))
+    result = Result(values, values, [{}] * 20, 100.0, 0.0, "steps", verification={"best": "end"})
+    final_images.render_final_images(made, result, spp, left=lambda: budget - spent[0], tested=False)
+    assert checked is (checks[0] > 0.0)
+    assert spent[0] <= max(0.5 * budget + 0.04, 0.13)
 
 
 @pytest.mark.parametrize("every", [512, 50, 4])

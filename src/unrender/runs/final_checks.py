@@ -136,6 +136,16 @@ def joined_warnings(earlier: Sequence[str], later: Sequence[str]) -> list[str]:
     return [*(line for line in earlier if not (known and DIFFERS in line)), *later]
 
 
+def renderings_of_check(problem: Problem) -> int:
+    """Return the number of images of each view that `unexplained_pixels` renders: one for all unknowns, and one for each; 0 if it does not.
+
+    Poses, lenses and vertex positions may change any pixel, so problems with such unknowns are not judged.
+    """
+    known, count = problem.renderer.parameters(), len(problem.unknowns)
+    moving = any(known[key].rigid or known[key].viewpoint or known[key].welded for key in problem.unknowns)
+    return 0 if moving or count > _MOST_KEYS else 1 + count
+
+
 def unexplained_pixels(
     problem: Problem,
     result: Mapping[str, np.ndarray],
@@ -149,16 +159,13 @@ def unexplained_pixels(
     depend on them directly. Light that all elements send to the others, such as a wall's to the floor, changes with their mean: what the
     run's own change of the pictures and constant changes of each unknown explain of r is subtracted, by least squares in each channel.
 
-    Poses, lenses and vertex positions may change any pixel, so problems with such unknowns are not judged.
-
     Args:
         result: {key: array} at the end.
         starts, ends: K >= 2 independent pictures (H, W, 3) of each view at the start and at the end.
         picture: see `Picture`.
     """
-    known, views = problem.renderer.parameters(), range(len(problem.views))
-    moving = any(known[key].rigid or known[key].viewpoint or known[key].welded for key in problem.unknowns)
-    if moving or len(problem.unknowns) > _MOST_KEYS or len(ends) < len(views) or len(ends[0]) < 2:
+    views = range(len(problem.views))
+    if not renderings_of_check(problem) or len(ends) < len(views) or len(ends[0]) < 2:
         return ""
     residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
 

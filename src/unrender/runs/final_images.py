@@ -15,7 +15,13 @@ from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
 from unrender.runs.field_directions import TOO_SHORT
-from unrender.runs.final_checks import differs_still, image_name, rise, unexplained_pixels
+from unrender.runs.final_checks import (
+    differs_still,
+    image_name,
+    renderings_of_check,
+    rise,
+    unexplained_pixels,
+)
 from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
@@ -42,7 +48,8 @@ _TRIAL_PATHS = 1 << 18
 _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 """Paths of one pass over all views, and its most samples per pixel."""
 _PICTURES_SHARE = 0.5
-"""Share of the time that is left at the end that final pictures may take."""
+"""Share of the time that is left at the end that final pictures may take with the check of unchanged pixels, and of what is left then that
+this check may take."""
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
@@ -109,15 +116,16 @@ def render_final_images(
     Args:
         spp: samples per pixel. None takes a power of two, at least 2, that fits into a twentieth of the time of the run's steps, or one
             second if that is longer, and into about four million paths per image. That time excludes compiling.
-        left: function that returns the remaining seconds. If few remain, images have fewer samples, and tests of undetermined parameters
-            take about half a second.
+        left: function that returns the remaining seconds. If few remain, images have fewer samples, and the tests take half a second.
         tested: whether to estimate sensitivities and to test what the images determine.
         weights: weights of each view's pixels in the run's steps, see `least_squares.pixel_weights`.
         complete: whether the standard errors of the result contain the references' noise.
     """
     with phases.phase("final pictures") as advance:
-        samples, chosen = spp or _affordable(problem, result, _PICTURES_SHARE * left()), _chosen(problem)
+        samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
+        chosen, began = _chosen(problem), time.perf_counter()
         pictures, errors, halves_of = _pictures(problem, result, chosen, samples, advance)
+        of_check = _cost_of_check(problem) * (time.perf_counter() - began)
         ends = halves_of["result"]
         if risen := rise(problem, result, pictures, errors, halves_of):
             return FinalImages(pictures, errors, samples, {}, rise=risen)
@@ -126,12 +134,11 @@ def render_final_images(
         everything = tested and len(chosen) == len(problem.views)
         halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
         noise = pixel_noise(problem, halves) if halves else ()
-        known, maps = Curvature(), _untested(problem, result, "the end of the run was not tested, or had no time left")
-        if everything:
-            known = curvature(problem, result.parameters, seconds=seconds, noise=noise)
+        maps = _untested(problem, result, "the end of the run was not tested, or had no time left")
+        known = curvature(problem, result.parameters, seconds=seconds, noise=noise) if everything else Curvature()
         sensitivities, deviations = known.sensitivity(), dict(result.standard_error)
         lines, warnings = [], ()
-        differs = _differs(problem, result, chosen, halves_of, samples, left)
+        differs = _differs(problem, result, chosen, halves_of, samples, of_check < _PICTURES_SHARE * left())
         if not tested and result.steps and not differs:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
             lines, deviations = [*untested_factor(problem), *late.missing()], _without(deviations, late.unchecked)
@@ -285,14 +292,22 @@ def _differs(
     views: Sequence[int],
     halves: Mapping[str, Sequence[tuple[np.ndarray, ...]]],
     spp: int,
-    left: Callable[[], float],
+    can_check: bool,
 ) -> str:
-    """Return a warning that the pictures of a run differ from the references by something that is not among the unknowns; else ""."""
+    """Return a warning that the pictures of a run differ from the references by something that is not among the unknowns; else "".
+
+    `can_check` says whether there is time to render images for `unexplained_pixels`.
+    """
     ends = halves["result"]
     line = misfit_of_views(problem, views, ends, result.warnings) if result.steps else ""
-    if line or not result.steps or left() <= 0.0 or result.verification.get("best") != "end":
+    if line or not result.steps or not can_check or result.verification.get("best") != "end":
         return line
     return unexplained_pixels(problem, result.parameters, halves["initial"], ends, partial(_first_half, problem, spp))
+
+
+def _cost_of_check(problem: Problem) -> float:
+    """Return the time of `unexplained_pixels` relative to that of the pictures, two halves each of the start and of the end."""
+    return renderings_of_check(problem) / (2 * len(_SEEDS))
 
 
 def _first_half(problem: Problem, spp: int, values: Mapping[str, np.ndarray], view: int) -> np.ndarray:
@@ -309,7 +324,7 @@ def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
         started = time.perf_counter()
         render(problem, result.parameters, 0, trial, seed, per_pass=trial)
         seconds = time.perf_counter() - started
-    allowed = min(max(_SHARE * result.seconds, _LEAST_SECONDS), most_seconds)
+    allowed = min(max(_SHARE * result.seconds, _LEAST_SECONDS), most_seconds / (1.0 + _cost_of_check(problem)))
     paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
     return max(2, 2 * trial, power_of_two(int(min(most, max(paths, 0.0) / (2 * sum(sizes))))))
 
