@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -13,10 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
 import unrender as ur
 from unrender.app.cli import tasks
-from unrender.app.cli.signals import WAITING
+from unrender.app.cli.signals import DOUBTFUL, FAILED, INTERRUPTED, WAITING
 from unrender.app.sweeps.record import write_sweep
 from unrender.runs.budget import Budget
 
@@ -129,6 +131,20 @@ def test_a_sweep_from_python_is_the_commands(unrender, monkeypatch: pytest.Monke
         ur.app.sweep("quad", "plain")
     with pytest.raises(ur.InputError, match="contains earlier results"):
         ur.app.sweep("quad", "plain", over, out="python")
+
+
+@pytest.mark.parametrize("status", [FAILED, DOUBTFUL, INTERRUPTED])
+def test_a_sweep_from_python_returns_doubtful_and_failed_trials(
+    status: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run_trials(console: Any, session: Any, record: Any, search: Any) -> None:
+        write_sweep(session.folder, record)
+        raise typer.Exit(status)
+
+    monkeypatch.setattr("unrender.app.cli.sweep_driver.run_trials", run_trials)
+    interrupted = pytest.raises(KeyboardInterrupt) if status == INTERRUPTED else contextlib.nullcontext()
+    with interrupted:
+        assert ur.app.sweep("quad", "plain", {"spp": [1, 4]}, steps=3, out=tmp_path / "s").plan.steps == 3
 
 
 def test_pruned_runs_are_run_folders_without_pictures(unrender, mitsuba_variant: str) -> None:

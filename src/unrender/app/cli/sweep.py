@@ -181,7 +181,7 @@ def _run_silently(
 ) -> SweepRecord:
     import io
 
-    from unrender.app.cli.signals import FAILED
+    from unrender.app.cli.signals import DOUBTFUL, FAILED
     from unrender.app.cli.sweep_driver import Session
     from unrender.app.sweeps.record import read_sweep
     from unrender.display.terminal import Console
@@ -190,7 +190,7 @@ def _run_silently(
         session = Session(folder, workers, threads, fresh=True)
         _begin(Console(file=io.StringIO()), planned, "unrender.app.sweep", session)
     except typer.Exit as end:
-        if end.exit_code != FAILED:
+        if end.exit_code not in (DOUBTFUL, FAILED):
             raise KeyboardInterrupt from end
     return read_sweep(folder)
 
