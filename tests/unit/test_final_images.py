@@ -240,7 +240,7 @@ def textured(shift: float, noise: float, count: int = 2) -> Problem:
     renderer = AnalyticRenderer({"map": np.full(32, 0.5)}, matrix, noise=noise, shape=(40, 40), sensors=count)
     exact = renderer.exact(truth)
     given = [View(exact * (1.0 + shift * view), sensor=view) for view in range(count)]
-    return Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], given)
+    return Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], given, truth=truth)
 
 
 @pytest.mark.parametrize(("shift", "told"), [(0.25, True), (0.0, False)])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
-from unrender.runs.verification import MAY_IMPROVE, NOT_CONVERGED, PRIOR, Misfit, misfit
+from unrender.runs.verification import MAY_IMPROVE, NOT_CONVERGED, Misfit, misfit, prior_cause
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import difference
 
@@ -130,8 +130,7 @@ def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays:
     cause = (
         "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
     )
-    if any(unknown.prior is not None for unknown in problem.unknowns.values()):
-        cause = f"{PRIOR}, or {cause}"
+    cause = f"{prior_cause(problem)}{cause}"
     still = "no longer improves"
     if step < FIRST_CANDIDATE or not stays:
         still = f"has hardly improved since step {step} of {steps}" if stays else MAY_IMPROVE

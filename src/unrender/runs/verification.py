@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -21,8 +22,12 @@ from unrender.statistics import paired_losses
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
 MAY_IMPROVE, NOT_CONVERGED, MORE_STEPS = "may still improve", "the run has not converged", "more steps"
-PRIOR = "a prior may be too strong"
-"""Words of those warnings of them that more steps may answer: surely, or after few steps; and of those that a prior may answer."""
+PRIOR, NOISY = "a prior may be too strong", "the references are noisy"
+"""Words of those warnings of them that more steps may answer: surely, or after few steps; and of those whose cause may be a prior, or noise
+of the references."""
+_SHARE, _OF_MODEL = re.compile(rf"{DIFFERS} by [^(]*\((\d+)% of the picture"), 0.25
+"""Size of the difference in these warnings, and the smallest one that ends a run without a known truth as "does not fit". References such
+as photographs differ from any model: an asset from rendered photographs and a carved mesh by 13 %."""
 _FEW_PIXELS, _OF_FEW = 96, 0.2
 """Number of pixels below which the difference is also judged pixel by pixel, which includes the references' noise; its smallest size
 relative to the image in this case."""
@@ -153,14 +158,10 @@ def misfit_of_numbers(
     difference = misfit(one, other, references, weights, sizes, _OF_PICTURE, halves, by_pixel=True)
     if difference is None or difference.is_references_noise(at_truth):
         return ""
-    noise = (
-        "this picture's noise does not explain: the references are noisy, or"
-        if difference.by_pixel
-        else "noise does not explain:"
-    )
+    noise = f"this picture's noise does not explain: {NOISY}, or" if difference.by_pixel else "noise does not explain:"
     return (
-        f"{difference.describe()}, which {noise} the run needs more steps, another start or other bounds, or something that is not "
-        "among the unknowns is wrong; hence no standard errors"
+        f"{difference.describe()}, which {noise} {prior_cause(problem)}the run needs more steps, another start or other bounds, "
+        "or something that is not among the unknowns is wrong; hence no standard errors"
     )
 
 
@@ -183,14 +184,35 @@ def residuals_of_views(
     return residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), sizes
 
 
-def fit_status(status: str, warnings: Sequence[str], few: bool) -> str:
-    """Return the status of a run that used up its budget: "does not fit" for a finished one that differs, if more steps are no answer.
+def prior_cause(problem: Problem) -> str:
+    """Return the first words of the causes of a difference from the references if an unknown has a prior; "" otherwise."""
+    return f"{PRIOR}, or " if any(unknown.prior is not None for unknown in problem.unknowns.values()) else ""
 
-    `few` says whether the run had few steps. Lines that suggest more of them then change no status.
+
+def fit_status(problem: Problem, status: str, warnings: Sequence[str], few: bool) -> str:
+    """Return the status of a run that used up its budget: "does not fit" for a finished one that differs from its references for certain.
+
+    Differences that more steps, a weaker prior or less noise in the references may explain do not change the status. Without a known
+    truth, neither do those below a quarter of the picture.
+
+    Args:
+        problem: problem of the run.
+        status: status without the warnings.
+        warnings: warnings of the run.
+        few: whether the run had few steps. Lines that suggest more of them then do not change the status.
     """
-    answers = (MAY_IMPROVE, NOT_CONVERGED, PRIOR, *((MORE_STEPS,) if few else ()))
-    final = any(DIFFERS in line and not any(words in line for words in answers) for line in warnings)
+    answers = (MAY_IMPROVE, NOT_CONVERGED, PRIOR, NOISY, *((MORE_STEPS,) if few else ()))
+    least = 0.0 if problem.has_truth else _OF_MODEL
+    final = any(
+        DIFFERS in line and not any(words in line for words in answers) and _share(line) >= least for line in warnings
+    )
     return MISFIT if final and status == "finished" else status
+
+
+def _share(line: str) -> float:
+    """Return the size of a warning's difference relative to the picture; infinite if the references are black."""
+    found = _SHARE.search(line)
+    return int(found[1]) / 100 if found else math.inf
 
 
 def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) -> str:

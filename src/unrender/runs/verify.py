@@ -73,7 +73,7 @@ class Verify(Callback):
     `Result.parameters`; another one than the end must be significantly better. All images together use at most 2 % of the run's paths,
     if these are a million or more. Each uses 0.25 %, or about 4,000 paths in a short run. Larger images use the paths that are left, if
     there is time: where start and end are not told apart, and for the end of a run without a run folder, which has no final pictures.
-    Images of start and end use up to 33,000 paths each where the end may be worse. The steps are not affected.
+    Where the end may be worse, images of start and end may use 33,000 paths each in addition. The steps are not affected.
     """
 
     _small: FreshPictures | None = field(default=None, init=False)
@@ -154,8 +154,9 @@ class Verify(Callback):
         lines += _lines(*judged, best, best_loss[0], memory if disagrees else None, worse)
         spp = pictures.paths / (pictures.pixels * len(last.images[0]))
         lines += filter(None, [rare_light(last.images, pictures.weights, spp)])
+        status = WORSE if worse else MEMORY_DISAGREES if disagrees else "finished"
         verification: dict[str, Any] = {
-            "status": WORSE if worse else MEMORY_DISAGREES if disagrees else fit_status("finished", lines, few),
+            "status": fit_status(problem, status, lines, few),
             "start": _numbers(*judged[0].loss),
             "end": _numbers(*judged[1].loss),
             "best": best,

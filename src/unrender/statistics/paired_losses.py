@@ -145,14 +145,19 @@ def concentrated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> Sys
 
     A misplaced reflection or highlight changes its sign from pixel to pixel, which `systematic` and `nearby` miss. Noise of the reference
     is shared as well. Its variance is taken to be proportional to that of the pictures, with the median ratio of tiles of pixels; only four
-    times as much counts. The largest pixel does not count, since it may be an outlier of the reference.
+    times as much counts. A pixel where the picture is too dark does not count if no pixel is too bright by as much, since it may be an
+    outlier of the reference. Nor does the largest pixel of the rest.
 
     Args:
         one, other: differences of two independent pictures, (N, C).
         weights: (N,), how much each pixel counts, in [0, 1].
     """
     one, other = (np.asarray(of, np.float64) * weights[:, None] for of in (one, other))
-    products, variances = (one * other).sum(axis=1), np.square(one - other).sum(axis=1) / 2
+    brighter = (one + other).sum(axis=1) > 0
+    products = (one * other).sum(axis=1)
+    kept = brighter | (products <= products[brighter].max(initial=0.0))
+    one, other, products = one * kept[:, None], other * kept[:, None], products * kept
+    variances = np.square(one - other).sum(axis=1) / 2
     starts = np.linspace(0, len(one), min(len(one), _TILES), endpoint=False).astype(np.int64)
     shared, noise = (np.maximum(np.add.reduceat(of, starts), 1e-300) for of in (products, variances))
     total = float(products.sum() - products.max(initial=0.0))

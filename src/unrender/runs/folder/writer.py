@@ -190,7 +190,9 @@ class RunWriter(Callback):
                 images = render_final_images(run.problem, result, *given)
             warnings, verification = joined_warnings(result.warnings, images.warnings), dict(result.verification)
             if verification and verification["status"] in ("finished", MISFIT):
-                verification["status"] = fit_status("finished", warnings, has_few_steps(result.steps, run.optimizer))
+                verification["status"] = fit_status(
+                    run.problem, "finished", warnings, has_few_steps(result.steps, run.optimizer)
+                )
             result = replace(
                 result,
                 pictures=images.pictures,
