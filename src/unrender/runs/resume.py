@@ -108,7 +108,7 @@ def resume_run(
     run.initial, fingerprint = first_values(run), fingerprint_of(run)
     with open_writer(run, folder, method.name, method.checkpoint_every, method.final_spp) as writer:
         for source in _sources(stored):
-            changes = _changes(stored, source.checkpoint, fingerprint)
+            changes = _changes(run, stored, source.checkpoint)
             if changes and not force:
                 raise InputError(
                     f"run folder {folder}: changed since: {changes}; to continue nevertheless, give --force (force=True)"
@@ -183,10 +183,10 @@ def _sources(stored: StoredRun) -> Iterator[_Source]:
         yield _Source(candidate, records, passed_over)
 
 
-def _changes(stored: StoredRun, source: Checkpoint | None, fingerprint: dict[str, str]) -> str:
+def _changes(run: Run, stored: StoredRun, source: Checkpoint | None) -> str:
     """Return the changes since the checkpoint was written (or the run started), as phrases on one line."""
     before = stored.record.problem.fingerprint if source is None else source.manifest.problem
-    changed = [] if before is None else differences(before, fingerprint)
+    changed = [] if before is None else differences(before, fingerprint_of(run, before))
     if source is not None:
         changed += differences(source.manifest.versions, deciding_versions())
         changed += differences({"seed": str(source.manifest.seed)}, {"seed": str(stored.method.seed)})

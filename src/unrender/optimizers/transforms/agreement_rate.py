@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from unrender.core import arrays, checks
 from unrender.core.arrays import Array
@@ -61,7 +61,7 @@ class Agreement(TransformState):
         log_least: {key: the same, as if gradients had not agreed since the last change of smoothing}.
         factors: {key: factor of the rate}.
         sizes: {key: root mean square of the first parameters, 1 where that is 0, and at least the first rate}.
-        firsts: {key: factor of the first rate}.
+        firsts: {key: factor of the first rate}; 1 for keys that it lacks, as before the first step.
     """
 
     correlation: dict[str, float]
@@ -70,7 +70,7 @@ class Agreement(TransformState):
     log_least: dict[str, float]
     factors: dict[str, float]
     sizes: dict[str, float]
-    firsts: dict[str, float]
+    firsts: dict[str, float] = field(default_factory=dict)
 
 
 @register
@@ -124,13 +124,15 @@ class AgreementRate(StepTransform):
             for key, x in parameters.items()
         }
         zeros, ones = dict.fromkeys(parameters, 0.0), dict.fromkeys(parameters, 1.0)
-        return Agreement(ones, zeros, zeros, zeros, ones, sizes, ones)
+        return Agreement(ones, zeros, zeros, zeros, ones, sizes)
 
     def update(self, update: StepUpdate, state: Agreement) -> tuple[StepUpdate, Agreement]:
         """Adapt the learning rates. Waits for the device, because correlations and sizes of the parameters are read."""
         previous = update.require_previous("AgreementRate")
-        if update.made == 0 and (noise := update.estimate.get(NoiseSample)) is not None:
-            state = replace(state, firsts=state.firsts | _first_factors(update, noise.values))
+        if update.made == 0:
+            noise = update.estimate.get(NoiseSample)
+            factors = {} if noise is None else _first_factors(update, noise.values)
+            state = replace(state, firsts=dict.fromkeys(state.factors, 1.0) | factors)
         if update.made > 0:
             correlation, log_rate, log_most, log_least, factors = {}, {}, {}, {}, {}
             for key, (cosine, size) in _measured(update.gradient, previous, update.parameters).items():
@@ -152,18 +154,19 @@ class AgreementRate(StepTransform):
             falls = {key for key in falls if update.smoothing.get(key, SMOOTHING_UNCHANGED).gain == 1.0}
             update = replace(update, restarted=update.restarted | falls)
             weaker = {key for key, fit in update.smoothing.items() if fit.gain > 1.0}
-            firsts = state.firsts | dict.fromkeys(weaker, 1.0)
+            firsts = {key: 1.0 if key in weaker else first for key, first in state.firsts.items()}
             state = Agreement(correlation, log_rate, log_most, log_least, factors, state.sizes, firsts)
         power = min(1.0, _LONGER / max(update.made, 1))
         factors = {
-            key: update.factors.get(key, 1.0) * q * state.firsts[key] ** power for key, q in state.factors.items()
+            key: update.factors.get(key, 1.0) * q * state.firsts.get(key, 1.0) ** power
+            for key, q in state.factors.items()
         }
         return replace(update, factors=factors), state
 
     def choices(self, state: Agreement, made: int) -> tuple[str, ...]:
         """Return the current rates relative to the first."""
         power = min(1.0, _LONGER / max(made, 1))
-        rates = {key: factor * state.firsts[key] ** power for key, factor in state.factors.items()}
+        rates = {key: factor * state.firsts.get(key, 1.0) ** power for key, factor in state.factors.items()}
         changed = [f"{key} {rate:.2g}" for key, rate in rates.items()] if made > 0 else []
         return (f"learning rate, over the first: {listed(changed)}",) if changed else ()
 
