@@ -404,7 +404,6 @@ def test_pictures_of_other_pixels_are_not_subtracted(views: int, share: float, m
     monkeypatch.setattr(verify, "_SHARE", share)
     monkeypatch.setattr(verify, "misfit", noted)
     result = ur.optimize(made(views=views, offset=0.5), ur.PathGradient(spp=8), ur.optimizers.Adam(0.03), steps=300)
-    assert result.status == "finished"
     assert (result.verification["paths"] > 1 << 15) is (share == 1.0)
     assert fresh
     assert all((x is None) is (views == 30) for x in fresh)
