@@ -17,11 +17,11 @@ from unrender.estimators import fresh_pictures
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.images.base import leave_one_out
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.runs import run, verification, verify
+from unrender.runs import final_checks, run, verification, verify
 from unrender.runs.folder import reader
 from unrender.runs.folder.schema import NOT_VERIFIED, RunRecord
 from unrender.scene.prior import Prior
-from unrender.statistics import paired_losses
+from unrender.statistics import debiased, paired_losses
 
 SIDE, WIDE, SIZE = 12, 20, 6
 RCV = ur.PathGradient(image=RecursiveControlVariate(), spp=4)
@@ -732,7 +732,7 @@ def test_a_difference_in_few_pixels_counts(improved: bool) -> None:
 
 
 def test_saturated_pixels_are_no_difference_for_a_loss_that_takes_them_as_bounds() -> None:
-    """The true picture is brighter there. A dark pixel that differs counts."""
+    """The true picture is brighter there. Another pixel that differs counts."""
     light, generator = np.asarray(made().views[0].reference), np.random.default_rng(0)
     white = float(np.quantile(light.max(axis=2), 0.2))
     images = [light + generator.normal(0.0, 0.01, light.shape) for _ in range(2)]
@@ -742,6 +742,63 @@ def test_saturated_pixels_are_no_difference_for_a_loss_that_takes_them_as_bounds
         assert problem.test_weights(0).mean() == pytest.approx(1.0 if told else 0.2, abs=0.05)
         np.testing.assert_array_equal(FreshPictures(problem, 0, 0).weights, problem.test_weights(0).ravel())
         assert verification.misfit_of_views(problem, [0], [[image + 0.1 for image in images]])
+
+
+def brighter(light: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """A picture twice as bright."""
+    return 2.0 * light + generator.normal(0.0, 0.01, light.shape)
+
+
+def rarely_lit(light: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """A picture of light that three of four groups of paths find."""
+    return 3.0 * light * (generator.random((*light.shape[:2], 1)) < 0.75)
+
+
+def at_white(light: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """A picture as bright as white."""
+    return light + generator.normal(0.0, 0.1, light.shape)
+
+
+def dark(light: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """A picture without light in half of the saturated pixels, and brighter ones beside."""
+    half = np.arange(SIDE)[:, None, None] < SIDE // 2
+    return np.where(half, 0.0, 2.0) * light + generator.normal(0.0, 0.01, light.shape)
+
+
+@pytest.mark.parametrize(
+    ("picture", "count"),
+    [(brighter, 0.0), (rarely_lit, 0.0), (at_white, 0.0), (dark, 0.5)],
+    ids=["brighter", "rarely lit", "at white", "dark"],
+)
+@pytest.mark.parametrize("images", [2, 16])
+def test_a_picture_darker_than_a_saturated_reference_is_wrong(picture: Any, count: float, images: int) -> None:
+    """The loss takes its pixels as lower bounds, which only these pictures do not reach."""
+    problem, generator = (
+        made(loss=ur.losses.Censored(ur.losses.L2(), 1.0), offset=9.0, white=1.0),
+        np.random.default_rng(0),
+    )
+    light = np.ones((SIDE, SIDE, 3))
+    halves = [picture(light, generator) for _ in range(images)]
+    weights = problem.test_weights(0, halves)
+    assert weights.mean() == pytest.approx(count, abs=0.001)
+    fresh = FreshPictures(problem, 0, 0).weights_of([np.stack(halves).reshape(images, -1, 3)])
+    np.testing.assert_array_equal(fresh, weights.ravel() / max(weights.max(), 1e-300))
+    assert bool(verification.misfit_of_numbers(problem, *final_checks.compared(problem, [0], [halves]))) is (count > 0)
+    error, _ = debiased.rmse(halves[0], halves[1], np.asarray(problem.views[0].reference), weights)
+    assert error == pytest.approx(1.0 if count else 0.0, abs=0.02)
+
+
+def test_a_run_that_ends_darker_than_a_saturated_reference_is_told(tmp_path: Path) -> None:
+    """Its bounds are below the values that light the upper half of the picture."""
+    generator = np.random.default_rng(0)
+    matrix, truth = generator.random((SIDE * SIDE * 3, SIZE)), np.full(SIZE, 0.6)
+    renderer = AnalyticRenderer({"x": truth}, matrix, noise=0.1, shape=(SIDE, SIDE))
+    reference = np.minimum(renderer.exact({"x": truth}), 0.4)
+    unknown = ur.Parameter("x", initial=0.05, bounds=(0.0, 0.1))
+    dim = ur.Problem(renderer, [unknown], [ur.View(reference)], ur.losses.Censored(ur.losses.L2(), 0.4))
+    result = ur.optimize(dim, RCV, ur.optimizers.Adam(0.02), 40, run_directory=tmp_path)
+    assert any(verification.DIFFERS in line for line in result.warnings)
+    assert result.image_errors["view0/result"][0] > 0.05
 
 
 @pytest.mark.parametrize("outliers", [0, 1, 2, 3, 5, 40])

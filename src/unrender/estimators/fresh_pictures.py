@@ -163,8 +163,13 @@ class FreshPictures:
     @property
     def weights(self) -> np.ndarray:
         """Weight of each pixel, (N,), of all frames concatenated; at most 1, and 0 for lower bounds of `Censored`."""
+        return self.weights_of(())
+
+    def weights_of(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return `weights`, and those of the lower bounds that images (K, N, 3) of each frame do not reach."""
         factors = np.concatenate([frame.factors[:, 0] for frame in self.frames])
-        factors = factors * determined_pixels(self._problem.loss, self.references)
+        joined = np.concatenate(images, axis=1) if len(images) else None
+        factors = factors * determined_pixels(self._problem.loss, self.references, joined)
         return factors / max(float(factors.max(initial=0.0)), 1e-300)
 
     @property

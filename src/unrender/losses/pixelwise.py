@@ -12,6 +12,9 @@ from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.losses.base import Loss
 
+_CLEARLY = 4.0
+"""Standard errors by which images are darker than a lower bound that they do not reach."""
+
 
 class _Pixelwise:
     """Base of the losses in this module."""
@@ -158,7 +161,22 @@ class Censored:
         return arrays.where(reference >= self.white, arrays.minimum(image, reference), image)
 
 
-def determined_pixels(loss: Loss, reference: np.ndarray) -> np.ndarray:
-    """Return which pixels (...,) of a reference (..., 3) are values, not lower bounds of `Censored`."""
+def determined_pixels(loss: Loss, reference: np.ndarray, images: np.ndarray | None = None) -> np.ndarray:
+    """Return which pixels (...,) of a reference (..., 3) are values, or lower bounds of `Censored` that images do not reach.
+
+    Images do not reach a bound if their mean is darker by more than the noise of the elements with a darker image. This must hold for all
+    bounds of a pixel.
+
+    Args:
+        loss: loss of the problem.
+        reference: linear values.
+        images: K >= 2 independent images (K, ..., 3); None to exclude all bounds.
+    """
     white = loss.white if isinstance(loss, Censored) else np.inf
-    return np.asarray(reference.max(axis=-1) < white)
+    bounds = reference >= white
+    if images is None or len(images) < 2 or not bounds.any():
+        return np.asarray(~bounds.any(axis=-1))
+    below = np.where(np.isfinite(images), np.minimum(images - white, 0.0), 0.0)
+    dark, squares = bounds & (below < 0.0).any(axis=0), below.var(axis=0, ddof=1) / len(below)
+    noise = np.sqrt(np.maximum(squares, squares[dark].mean() if dark.any() else 0.0))
+    return np.asarray(~(bounds & ~(below.mean(axis=0) < -_CLEARLY * noise)).any(axis=-1))

@@ -147,7 +147,8 @@ def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -
             without progress, so neither is of averages.
     """
     residuals, pictures = last.residuals, last.pictures
-    of = residuals, residuals, pictures.references, pictures.weights, pictures.sizes
+    weights = pictures.weights_of(last.picture.images)
+    of = residuals, residuals, pictures.references, weights, pictures.sizes
     differs = misfit(*of, _OF_PICTURE_FALLING)
     if differs is None:
         return []

@@ -16,6 +16,7 @@ from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
 from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.final_checks import (
+    compared,
     differs_still,
     image_name,
     renderings_of_check,
@@ -27,7 +28,7 @@ from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
-from unrender.runs.verification import misfit_of_views
+from unrender.runs.verification import misfit_of_numbers
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.statistics import debiased
@@ -277,7 +278,7 @@ def _picture(
         render(problem, values, view, first, seed + offset, per_pass=per_pass) for offset in (0, _SECOND_HALF)
     )
     reference = np.asarray(problem.views[view].reference)
-    return (one, other), debiased.rmse(one, other, reference, problem.test_weights(view))
+    return (one, other), debiased.rmse(one, other, reference, problem.test_weights(view, (one, other)))
 
 
 def _per_pass(problem: Problem, spp: int) -> int | None:
@@ -299,7 +300,7 @@ def _differs(
     `can_check` says whether there is time to render images for `unexplained_pixels`.
     """
     ends = halves["result"]
-    line = misfit_of_views(problem, views, ends, result.warnings) if result.steps else ""
+    line = misfit_of_numbers(problem, *compared(problem, views, ends), result.warnings) if result.steps else ""
     if line or not result.steps or not can_check or result.verification.get("best") != "end":
         return line
     return unexplained_pixels(problem, result.parameters, halves["initial"], ends, partial(_first_half, problem, spp))

@@ -226,7 +226,7 @@ class Verify(Callback):
         if self._larger is None:
             return []
         larger, end = self._larger
-        of = larger.differences(end.images), larger.references, larger.weights, larger.sizes
+        of = larger.differences(end.images), larger.references, larger.weights_of(end.images), larger.sizes
         if line := misfit_of_numbers(run.problem, *of):
             return [line]
         return no_improvement(run.problem, change.get("change", {}), end.loss[0], result.steps, *of)
@@ -274,7 +274,7 @@ class Verify(Callback):
             return not_converged(problem, last, earlier), change
         if averages:
             last = replace(last, picture=end if small is pictures else small.picture(result.parameters))
-        own = small.references, small.weights, small.sizes
+        own = small.references, small.weights_of(last.picture.images), small.sizes
         differences = pictures.differences(end.images)
         # A sample of pixels has others than the images of earlier steps.
         halves = None if pictures.sampled or small.sampled else (differences[0::2], differences[1::2])
@@ -303,7 +303,7 @@ def _misfit_of_numbers(
         problem,
         pictures.differences(last.images),
         pictures.references,
-        pictures.weights,
+        pictures.weights_of(last.images),
         pictures.sizes,
         improved=_is_worse(pictures, last, first),
         at_truth=partial(_at_truth, problem, pictures, result) if problem.has_truth else None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -58,12 +59,17 @@ class ViewLosses:
             self._masks[view] = array
         return array
 
-    def test_weights(self, view: int) -> np.ndarray:
-        """Return the weight (H, W) of each pixel in tests of pictures: the mask's, and 0 for lower bounds of `Censored`."""
+    def test_weights(self, view: int, images: Sequence[np.ndarray] = ()) -> np.ndarray:
+        """Return the weight (H, W) of each pixel in tests of pictures: the mask's, and 0 for lower bounds of `Censored`.
+
+        Bounds that independent images (H, W, 3) do not reach have the mask's weight, since these images are wrong there.
+        """
         weights = self.views[view].pixel_weights(self.sizes[view])
         if not isinstance(self.loss, Censored):
             return weights
-        return weights * determined_pixels(self.loss, np.asarray(self.views[view].reference))
+        return weights * determined_pixels(
+            self.loss, np.asarray(self.views[view].reference), np.asarray(images) if len(images) else None
+        )
 
     def loss_value(self, view: int, image: Array) -> Array:
         """Return the view's loss at an image (H, W, 3): weight * mean(mask * loss), a lazy scalar."""
