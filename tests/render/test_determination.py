@@ -124,6 +124,14 @@ def test_cells_that_hardly_change_the_pictures_are_told():
     assert line.startswith("wall: 50% of it hardly changes the pictures")
 
 
+@pytest.mark.parametrize(("size", "count"), [(0.07, 0), (0.03, 1)])
+def test_elements_of_a_list_have_a_lower_limit_than_cells(size: float, count: int):
+    """Few probes leave single elements uncertain, and cells are medians over neighbours."""
+    seen = np.where(np.arange(48) % 4, 1.0, size)
+    assert len(undetermined_cells({"list": seen})) == count
+    assert undetermined_cells({"wall": np.repeat(seen, 8).reshape(8, 48, 1)})
+
+
 def test_a_run_tells_in_its_folder(tmp_path: Any):
     material = {"type": "principled", "sheen": 0.0, "sheen_tint": 0.5}
     keys = "wall.bsdf.sheen_tint.value", "wall.bsdf.base_color.value"

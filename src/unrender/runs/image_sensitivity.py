@@ -28,8 +28,9 @@ _PROJECTIONS = 1 << 25
 """Numbers of the probes' projections that are stored for the overlap."""
 COUNTED = 0.1
 """Curvature relative to the median above which a cell counts in means over cells."""
-_INSENSITIVE = 0.1
-"""Sensitivity relative to the median below which a cell hardly affects the images, such as by bounced light alone."""
+_INSENSITIVE, _INSENSITIVE_ALONE = 0.1, 0.05
+"""Sensitivity relative to the median below which a cell hardly affects the images, such as by bounced light alone; that of an element of a
+list, which has more noise than the medians over neighbouring cells."""
 
 
 @dataclass(frozen=True)
@@ -262,7 +263,7 @@ def seen_elements(values: np.ndarray) -> np.ndarray:
         (N,), truth values. Few probes leave it uncertain for single elements.
     """
     return (
-        values > _INSENSITIVE * np.median(values[values > 0.0])
+        values > _INSENSITIVE_ALONE * np.median(values[values > 0.0])
         if (values > 0.0).any()
         else np.zeros(values.shape, bool)
     )
