@@ -407,6 +407,18 @@ def test_the_check_of_unchanged_pixels_fits_into_the_time_that_is_left(
     assert spent[0] <= max(0.5 * budget + 0.04, 0.13)
 
 
+@pytest.mark.parametrize(("steps", "told"), [(8, False), (20, False), (21, True)])
+def test_a_grid_that_is_still_coarse_is_no_other_cause(steps: int, told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A smoke of 4³ cells after 8 steps of at least 21 lacks details of the references, although its cells hardly change those pixels."""
+    monkeypatch.setattr(final_images, "compared", lambda *_: ())
+    monkeypatch.setattr(final_images, "misfit_of_numbers", lambda *_: "")
+    monkeypatch.setattr(final_images, "unexplained_pixels", lambda *_: "told")
+    problem: Any = SimpleNamespace(coarse_to_fine={"grid": SimpleNamespace(steps=(0, 5, 20))})
+    result = Result({}, {}, [{}] * steps, 1.0, 0.0, "steps", verification={"best": "end"})
+    halves = {"initial": [], "result": []}
+    assert bool(final_images._differs(problem, result, [0], halves, 2, True)) is told
+
+
 @pytest.mark.parametrize("every", [512, 50, 4])
 def test_highlights_do_not_make_all_other_pixels_unchanged(every: int) -> None:
     """Such as a lamp's reflections in metal, which change a hundred times as much as the walls that the lamp lights."""

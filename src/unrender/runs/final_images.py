@@ -29,6 +29,7 @@ from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_key
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
 from unrender.runs.verification import misfit_of_numbers
+from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
 from unrender.statistics import debiased
@@ -297,11 +298,12 @@ def _differs(
 ) -> str:
     """Return a warning that the pictures of a run differ from the references by something that is not among the unknowns; else "".
 
-    `can_check` says whether there is time to render images for `unexplained_pixels`.
+    `can_check` says whether there is time to render images for `unexplained_pixels`. Details that a coarse grid lacks are no other cause.
     """
     ends = halves["result"]
     line = misfit_of_numbers(problem, *compared(problem, views, ends), result.warnings) if result.steps else ""
-    if line or not result.steps or not can_check or result.verification.get("best") != "end":
+    coarse = any(result.steps <= levels.steps[-1] < NEVER for levels in problem.coarse_to_fine.values())
+    if line or not result.steps or coarse or not can_check or result.verification.get("best") != "end":
         return line
     return unexplained_pixels(problem, result.parameters, halves["initial"], ends, partial(_first_half, problem, spp))
 
