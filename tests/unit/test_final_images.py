@@ -148,7 +148,7 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
     """A wrong number is told however late it is."""
     made, allowed = problem(), []
     monkeypatch.setattr(final_images, "slowdown", lambda: 1.0)
-    monkeypatch.setattr(final_images, "misfit_of_numbers", lambda *_: "")
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
     none = Curvature()
     monkeypatch.setattr(final_images, "curvature", lambda *_, seconds, **__: allowed.append(seconds) or none)
     monkeypatch.setattr(
@@ -166,7 +166,7 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
 def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that ends without its test of numbers says so; one that was tested does not."""
     made = problem()
-    monkeypatch.setattr(final_images, "misfit_of_numbers", lambda *_: "")
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
     values = {"wall": np.full(3, 0.4, np.float32)}
     result = replace(Result(values, values, [{}], 30.0, 0.0, "steps"), standard_error={"wall": np.full(3, 1e-3)})
     line = "whether wall converged: the run is too short for this test; use more steps or seconds, or fewer pixels"
@@ -189,7 +189,7 @@ def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: p
     assert not found.undetermined
     assert "it moves" in found.warnings
     assert "hence no standard errors" in " ".join(found.warnings)
-    monkeypatch.setattr(final_images, "misfit_of_numbers", lambda *_: "")
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
     assert "the references leave it open" in final_images.render_final_images(made, result).undetermined
 
 
@@ -410,8 +410,7 @@ def test_the_check_of_unchanged_pixels_fits_into_the_time_that_is_left(
 @pytest.mark.parametrize(("steps", "told"), [(8, False), (20, False), (21, True)])
 def test_a_grid_that_is_still_coarse_is_no_other_cause(steps: int, told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A smoke of 4³ cells after 8 steps of at least 21 lacks details of the references, although its cells hardly change those pixels."""
-    monkeypatch.setattr(final_images, "compared", lambda *_: ())
-    monkeypatch.setattr(final_images, "misfit_of_numbers", lambda *_: "")
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
     monkeypatch.setattr(final_images, "unexplained_pixels", lambda *_: "told")
     problem: Any = SimpleNamespace(coarse_to_fine={"grid": SimpleNamespace(steps=(0, 5, 20))})
     result = Result({}, {}, [{}] * steps, 1.0, 0.0, "steps", verification={"best": "end"})

@@ -117,15 +117,6 @@ def loss_of_halves(
     return loss, math.sqrt(square)
 
 
-def compared(
-    problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:
-    """Return `residuals_of_views`, with weights of the lower bounds of `Censored` that the images (H, W, 3) of each view do not reach."""
-    residuals, references, _, sizes = residuals_of_views(problem, views, images)
-    weights = [problem.test_weights(view, of).ravel() for view, of in zip(views, images, strict=True)]
-    return residuals, references, np.concatenate(weights), sizes
-
-
 def differs_still(
     problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
 ) -> str:
@@ -135,7 +126,7 @@ def differs_still(
         return ""
     loss, _ = loss_of_halves(problem, result.parameters, views, ends)
     change = result.verification.get("change", {})
-    lines = no_improvement(problem, change, loss, result.steps, *compared(problem, views, ends))
+    lines = no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends))
     return lines[0] if lines else ""
 
 
@@ -176,7 +167,7 @@ def unexplained_pixels(
     views = range(len(problem.views))
     if not renderings_of_check(problem) or len(ends) < len(views) or len(ends[0]) < 2:
         return ""
-    residuals, references, weights, sizes = compared(problem, views, ends)
+    residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
 
     def change(values: Mapping[str, np.ndarray]) -> np.ndarray:
         return _joined([picture(values, view) - of[0] for view, of in zip(views, ends, strict=True)])

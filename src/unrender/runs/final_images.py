@@ -16,7 +16,6 @@ from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
 from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.final_checks import (
-    compared,
     differs_still,
     image_name,
     renderings_of_check,
@@ -28,7 +27,7 @@ from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
-from unrender.runs.verification import misfit_of_numbers
+from unrender.runs.verification import misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
@@ -301,7 +300,7 @@ def _differs(
     `can_check` says whether there is time to render images for `unexplained_pixels`. Details that a coarse grid lacks are no other cause.
     """
     ends = halves["result"]
-    line = misfit_of_numbers(problem, *compared(problem, views, ends), result.warnings) if result.steps else ""
+    line = misfit_of_views(problem, views, ends, result.warnings) if result.steps else ""
     coarse = any(result.steps <= levels.steps[-1] < NEVER for levels in problem.coarse_to_fine.values())
     if line or not result.steps or coarse or not can_check or result.verification.get("best") != "end":
         return line

@@ -177,7 +177,7 @@ def residuals_of_views(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:
     """Return `residuals`, `references`, `weights` and `sizes` of `misfit_of_numbers`, from K images (H, W, 3) of each of some views."""
     references = [np.asarray(problem.views[view].reference, np.float32) for view in views]
-    weights = [problem.test_weights(view) for view in views]
+    weights = [problem.test_weights(view, of) for view, of in zip(views, images, strict=True)]
     pixels = np.concatenate([image.reshape(-1, 3) for image in references])
     residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
     sizes = [(height, width) for height, width, _ in map(np.shape, references)]
