@@ -407,15 +407,20 @@ def test_the_check_of_unchanged_pixels_fits_into_the_time_that_is_left(
     assert spent[0] <= max(0.5 * budget + 0.04, 0.13)
 
 
-@pytest.mark.parametrize(("steps", "told"), [(8, False), (20, False), (21, True)])
-def test_a_grid_that_is_still_coarse_is_no_other_cause(steps: int, told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A smoke of 4³ cells after 8 steps of at least 21 lacks details of the references, although its cells hardly change those pixels."""
+@pytest.mark.parametrize(("steps", "spp", "told"), [(8, 64, False), (20, 64, False), (21, 64, True), (21, 2, False)])
+def test_neither_coarse_grids_nor_few_samples_are_another_cause(
+    steps: int, spp: int, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A smoke of 4³ cells after 8 steps of at least 21 lacks details of the references, although its cells hardly change those pixels.
+
+    Of one sample per pixel in each half, most pixels are too dark in both.
+    """
     monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
     monkeypatch.setattr(final_images, "unexplained_pixels", lambda *_: "told")
     problem: Any = SimpleNamespace(coarse_to_fine={"grid": SimpleNamespace(steps=(0, 5, 20))})
     result = Result({}, {}, [{}] * steps, 1.0, 0.0, "steps", verification={"best": "end"})
     halves = {"initial": [], "result": []}
-    assert bool(final_images._differs(problem, result, [0], halves, 2, True)) is told
+    assert bool(final_images._differs(problem, result, [0], halves, spp, True)) is told
 
 
 @pytest.mark.parametrize("every", [512, 50, 4])

@@ -633,6 +633,14 @@ def test_new_derivative_images_are_worth_their_time() -> None:
     assert variance(0.01) > 1.1 * best
 
 
+def test_without_curvature_new_derivative_images_are_always_worth_it() -> None:
+    """At a caustic that few paths find, the first derivative images are 0. They are no derivatives without noise."""
+    singular = np.array([[1.0, 1.0], [1.0, 1.0 - 1e-9]])
+    for hessian in (np.zeros((2, 2)), np.diag([1.0, -0.1]), singular):
+        assert module._relative_noise(hessian, np.zeros((2, 2))) == np.inf
+    assert module._relative_noise(np.diag([2.0, 4.0]), np.diag([0.2, 0.4])) == pytest.approx(0.1)
+
+
 def test_settled_steps_use_earlier_derivative_images_and_long_ones_new_ones() -> None:
     made, estimator = problem(), ur.GaussNewton(2, 2, remember=True)
     state, paths = module.GaussNewtonState({"a": 0.02, "b": 0.03}), []

@@ -35,7 +35,7 @@ from unrender.estimators.derivative_images import (
 from unrender.estimators.gauss_newton_system import Point, System
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
-from unrender.statistics.scores import positive_inverse
+from unrender.statistics.scores import positive_inverse, scaled_eigh
 
 _PASSES, _FIRST_CHANGE, _CHANGE = 3, 64.0, 2.0
 """Number of passes that adapt the widths before the first estimate, and maximum factors of change of a width, then and later."""
@@ -249,5 +249,12 @@ class GaussNewton:
             residuals=tuple(system.residuals),
             hessian=system.products.hessian if system.residuals else None,
             origin=point.theta if system.fresh else state.origin,
-            noise=float(np.vdot(positive_inverse(system.products.hessian), system.products.noise)) / point.theta.size,
+            noise=_relative_noise(system.products.hessian, system.products.noise),
         )
+
+
+def _relative_noise(hessian: np.ndarray, noise: np.ndarray) -> float:
+    """Return the noise of derivative images relative to the derivatives; infinite if a direction has no positive curvature, (n, n)."""
+    if scaled_eigh(hessian)[1][0] <= 0.0:
+        return math.inf
+    return float(np.vdot(positive_inverse(hessian), noise)) / len(hessian)

@@ -55,6 +55,8 @@ _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
 _SEEDS = {"initial": 1, "result": 2}
+_FEWEST_SAMPLES = 8
+"""Fewest samples per pixel of a half with which `unexplained_pixels` judges: of fewer, most pixels miss the rare bright paths."""
 _SECOND_HALF = 1 << 16
 """Offset of the seed for the second half of an image's samples."""
 
@@ -302,7 +304,8 @@ def _differs(
     ends = halves["result"]
     line = misfit_of_views(problem, views, ends, result.warnings) if result.steps else ""
     coarse = any(result.steps <= levels.steps[-1] < NEVER for levels in problem.coarse_to_fine.values())
-    if line or not result.steps or coarse or not can_check or result.verification.get("best") != "end":
+    possible = can_check and not coarse and spp >= 2 * _FEWEST_SAMPLES
+    if line or not result.steps or not possible or result.verification.get("best") != "end":
         return line
     return unexplained_pixels(problem, result.parameters, halves["initial"], ends, partial(_first_half, problem, spp))
 
