@@ -325,7 +325,8 @@ def test_the_command_of_the_best_trial_repeats_its_first_run() -> None:
     ("runs", "status"),
     [
         ({"finished": ""}, 0),
-        ({"finished": "", "does not fit": ""}, 5),
+        ({"finished": "", "does not fit": ""}, 0),
+        ({"does not fit": ""}, 5),
         ({"worse than start": ""}, 5),
         ({"failed": "non-finite", "memory disagrees": ""}, 4),
         ({"interrupted": "interrupted", "does not fit": ""}, 130),

@@ -215,14 +215,18 @@ def _run_all(
 
 
 def status_of(outcomes: Sequence[RunOutcome]) -> int:
-    """Return the exit status of runs: of the one that was interrupted, of one that failed, or of one that is doubtful, else 0."""
+    """Return the exit status of runs: of the one that was interrupted, of one that failed, or of one that is doubtful, else 0.
+
+    A run that does not fit is doubtful only if no other run fits: a method that stalls is a result of the comparison.
+    """
     from unrender.runs.folder import schema
 
     interrupted = [outcome for outcome in outcomes if outcome.status == "interrupted"]
     if interrupted:
         return exit_status(interrupted[0].stopped)
     failed = any(exit_status(outcome.stopped) or outcome.message for outcome in outcomes)
-    doubtful = any(outcome.status in schema.DOUBTFUL for outcome in outcomes)
+    statuses = {outcome.status for outcome in outcomes}
+    doubtful = statuses & (schema.DOUBTFUL - {schema.MISFIT}) or statuses == {schema.MISFIT}
     return FAILED if failed else DOUBTFUL if doubtful else 0
 
 
