@@ -13,6 +13,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements
+from unrender.runs.numbers import MOST_ELEMENTS
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
@@ -27,8 +28,6 @@ _ERRORS = 2.0
 """Number of standard errors by which a change must be below its limit."""
 _MOVED = 0.1
 """Root mean square change from the initial values, relative to the values, from which recovered values may be noise."""
-_FEW = 24
-"""Number of elements of a list up to which least squares test them one by one."""
 _UNSEEN = 0.05
 """Fraction of unseen cells of a texture or grid from which a line is returned."""
 _SCALE = "scale"
@@ -131,17 +130,15 @@ def _moved(initial: np.ndarray, values: np.ndarray) -> bool:
 
 def _words(hidden: bool, change: Change, ranged: bool, bounded: bool) -> str:
     """Return what a change from one end of a range to the other, or to the initial values, tells of a parameter; "" for nothing."""
-    less = f"the pictures by less than {_LEAST:.1%}"
+    less = f"by less than {_LEAST:.1%}"
     if not hidden:
         return ""
     if not ranged:
-        return (
-            f"with its initial values, the pictures change by less than {_LEAST:.1%}; its recovered values may be noise"
-        )
+        return f"with its initial values, the pictures change {less}; its recovered values may be noise"
     if change.is_above(_LEAST):
-        return f"a constant added to all of it changes {less}; only differences of its elements are determined"
+        return f"a constant added to all of it changes the pictures {less}; only differences of its elements are determined"
     if bounded and change.is_below(_LEAST):
-        return f"over its entire range the pictures change by less than {_LEAST:.1%}; its value is the initial one, or noise"
+        return f"over its entire range the pictures change {less}; its value is the initial one, or noise"
     return ""
 
 
@@ -153,9 +150,8 @@ def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:
     """
     lines = []
     for key, sensitivity in sensitivities.items():
-        where = (
-            seen_cells(sensitivity) if sensitivity.ndim != 1 or sensitivity.size <= _FEW else seen_elements(sensitivity)
-        )
+        is_long = sensitivity.ndim == 1 and sensitivity.size > MOST_ELEMENTS  # least squares test others one by one
+        where = seen_elements(sensitivity) if is_long else seen_cells(sensitivity)
         if where is not None and (share := 1.0 - float(where.mean())) >= _UNSEEN:
             lines.append(
                 f"{key}: {share:.0%} of it hardly changes the pictures; values there are the initial ones, smoothed, or noise"

@@ -59,8 +59,7 @@ def rise(
     It is "" where the verification found that the loss has fallen, or that earlier parameters are better, and for losses and priors whose
     minimum is elsewhere. Losses of full images, of which the verification renders few, are compared themselves.
     """
-    prior = any(unknown.prior is not None for unknown in problem.unknowns.values())
-    if prior or (problem.loss.pixelwise and not problem.loss.linear):
+    if problem.has_prior or (problem.loss.pixelwise and not problem.loss.linear):
         return ""
     start, end = (result.verification.get(name, [None, None]) for name in ("start", "end"))
     ended = (
@@ -119,15 +118,14 @@ def loss_of_halves(
 
 def differs_still(
     problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
-) -> str:
-    """Return a warning of `no_improvement` by the halves of the final images; "" if one is known or the images are not all."""
+) -> list[str]:
+    """Return `no_improvement` of the halves of the final images; [] if a warning is known or the images are not all."""
     known = any(DIFFERS in line for line in result.warnings) or result.verification.get("best") != "end"
     if known or len(views) < len(problem.views) or len(ends[0]) < 2:
-        return ""
+        return []
     loss, _ = loss_of_halves(problem, result.parameters, views, ends)
     change = result.verification.get("change", {})
-    lines = no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends))
-    return lines[0] if lines else ""
+    return no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends))
 
 
 def joined_warnings(earlier: Sequence[str], later: Sequence[str]) -> list[str]:

@@ -15,13 +15,7 @@ from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
 from unrender.runs.field_directions import TOO_SHORT
-from unrender.runs.final_checks import (
-    differs_still,
-    image_name,
-    renderings_of_check,
-    rise,
-    unexplained_pixels,
-)
+from unrender.runs.final_checks import differs_still, image_name, renderings_of_check, rise, unexplained_pixels
 from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
@@ -157,7 +151,7 @@ def render_final_images(
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
         warnings += () if differs in result.warnings else (differs,)
     else:
-        warnings += tuple(filter(None, [differs_still(problem, result, chosen, ends)]))
+        warnings += tuple(differs_still(problem, result, chosen, ends))
     lines += maps.limited
     return FinalImages(
         pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share, maps.missing

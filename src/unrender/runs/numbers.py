@@ -15,7 +15,7 @@ from unrender.runs.image_sensitivity import mask_roots
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, selected_views
 
-_MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
+MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
 """Elements of all numbers up to which they are tested; elements of a number or colour; longer lists are left out first."""
 _MOST_VALUES = 1 << 25
 """Values of the pictures of one pass, up to which there is a check."""
@@ -121,11 +121,11 @@ class Numbers:
             and (known[key].sensor is None or known[key].sensor in sensors)
         ]
         lists = [key for key in keys if values[key].size > _MOST_OF_ONE]
-        while lists and sum(values[key].size for key in keys) > _MOST_ELEMENTS:
+        while lists and sum(values[key].size for key in keys) > MOST_ELEMENTS:
             keys.remove(lists.pop())
         elements = sum(values[key].size for key in keys)
         pixels = sum(math.prod(problem.sizes[view]) for view in views)
-        if not keys or elements > _MOST_ELEMENTS or 6 * elements * pixels > _MOST_VALUES:
+        if not keys or elements > MOST_ELEMENTS or 6 * elements * pixels > _MOST_VALUES:
             return None
         sizes, limits = [], []
         for key in keys:

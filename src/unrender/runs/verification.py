@@ -186,7 +186,7 @@ def residuals_of_views(
 
 def prior_cause(problem: Problem) -> str:
     """Return the first words of the causes of a difference from the references if an unknown has a prior; "" otherwise."""
-    return f"{PRIOR}, or " if any(unknown.prior is not None for unknown in problem.unknowns.values()) else ""
+    return f"{PRIOR}, or " if problem.has_prior else ""
 
 
 def fit_status(problem: Problem, status: str, warnings: Sequence[str], few: bool) -> str:
@@ -211,8 +211,8 @@ def fit_status(problem: Problem, status: str, warnings: Sequence[str], few: bool
 
 def _share(line: str) -> float:
     """Return the size of a warning's difference relative to the picture; infinite if the references are black."""
-    found = _SHARE.search(line)
-    return int(found[1]) / 100 if found else math.inf
+    percent = _SHARE.search(line)
+    return int(percent[1]) / 100 if percent else math.inf
 
 
 def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) -> str:

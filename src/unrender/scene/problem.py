@@ -287,6 +287,11 @@ class Problem(ViewLosses):
         return any(u.truth is not None or u.surface is not None for u in self.unknowns.values())
 
     @property
+    def has_prior(self) -> bool:
+        """Return whether any unknown has a prior."""
+        return any(u.prior is not None for u in self.unknowns.values())
+
+    @property
     def pixels(self) -> int:
         """Number of pixels of all views."""
         return sum(height * width for height, width in self.sizes)

@@ -153,10 +153,10 @@ def concentrated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> Sys
         weights: (N,), how much each pixel counts, in [0, 1].
     """
     one, other = (np.asarray(of, np.float64) * weights[:, None] for of in (one, other))
-    brighter = (one + other).sum(axis=1) > 0
-    products = (one * other).sum(axis=1)
-    kept = brighter | (products <= products[brighter].max(initial=0.0))
-    one, other, products = one * kept[:, None], other * kept[:, None], products * kept
+    too_bright, products = (one + other).sum(axis=1) > 0, (one * other).sum(axis=1)
+    most = products[too_bright].max(initial=0.0)
+    counted = too_bright | (products <= most)
+    one, other, products = one * counted[:, None], other * counted[:, None], products * counted
     variances = np.square(one - other).sum(axis=1) / 2
     starts = np.linspace(0, len(one), min(len(one), _TILES), endpoint=False).astype(np.int64)
     shared, noise = (np.maximum(np.add.reduceat(of, starts), 1e-300) for of in (products, variances))

@@ -72,6 +72,11 @@ class Agreement(TransformState):
     sizes: dict[str, float]
     firsts: dict[str, float] = field(default_factory=dict)
 
+    def first_factors(self, made: int) -> dict[str, float]:
+        """Return {key: what is left of the factor of the first rate after some steps}."""
+        power = min(1.0, _LONGER / max(made, 1))
+        return {key: self.firsts.get(key, 1.0) ** power for key in self.factors}
+
 
 @register
 @dataclass(frozen=True)
@@ -156,18 +161,14 @@ class AgreementRate(StepTransform):
             weaker = {key for key, fit in update.smoothing.items() if fit.gain > 1.0}
             firsts = {key: 1.0 if key in weaker else first for key, first in state.firsts.items()}
             state = Agreement(correlation, log_rate, log_most, log_least, factors, state.sizes, firsts)
-        power = min(1.0, _LONGER / max(update.made, 1))
-        factors = {
-            key: update.factors.get(key, 1.0) * q * state.firsts.get(key, 1.0) ** power
-            for key, q in state.factors.items()
-        }
+        firsts = state.first_factors(update.made)
+        factors = {key: update.factors.get(key, 1.0) * q * firsts[key] for key, q in state.factors.items()}
         return replace(update, factors=factors), state
 
     def choices(self, state: Agreement, made: int) -> tuple[str, ...]:
         """Return the current rates relative to the first."""
-        power = min(1.0, _LONGER / max(made, 1))
-        rates = {key: factor * state.firsts.get(key, 1.0) ** power for key, factor in state.factors.items()}
-        changed = [f"{key} {rate:.2g}" for key, rate in rates.items()] if made > 0 else []
+        firsts = state.first_factors(made)
+        changed = [f"{key} {q * firsts[key]:.2g}" for key, q in state.factors.items()] if made > 0 else []
         return (f"learning rate, over the first: {listed(changed)}",) if changed else ()
 
     def _change(self, correlation: float, shape: tuple[int, ...], made: int) -> float:
