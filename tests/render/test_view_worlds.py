@@ -20,6 +20,7 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.estimators.base import as_numpy
 from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.scene import serialization
 from unrender.scene.batches import PixelBatch, PixelSample
 from unrender.scene.fingerprint import fingerprint
 
@@ -292,6 +293,49 @@ def test_a_stage_has_a_scene_though_the_first_view_knows_what_is_fixed(tmp_path:
     whole = StagedProblem.read(stages_file.Stages(file, (first, stage), steps=1))
     made = whole.of_stage(stage, {lamp: np.full(3, 3.0, np.float32)}, tmp_path / "made")
     assert made.renderer.values([lamp])[lamp].numpy() == pytest.approx(3.0)
+
+
+def test_a_stage_has_the_initial_values_of_what_it_does_not_move(tmp_path: Path) -> None:
+    """It had the values of the scenes instead, 2 and 5."""
+    lamp = "lamp.intensity.value"
+    more = f'[[views]]\nreference = "two.npy"\nscene = "other.xml"\n[[parameters]]\nkey = "{lamp}"\ninitial = 3.0\n'
+    file = files(tmp_path, more)
+    colour = stages_file.Stage("colour", ("wall.bsdf.reflectance.value",))
+    staged = StagedProblem.read(stages_file.Stages(file, (colour, stages_file.Stage("light", (lamp,))), steps=1))
+    whole = ur.Problem.from_file(file)
+    for intensity, earlier in ((3.0, {}), (4.0, {lamp: np.full(3, 4.0, np.float32)})):
+        made = staged.of_stage(colour, earlier, tmp_path / f"made{intensity:.0f}")
+        values = {**whole.initial_values(), lamp: np.full(3, intensity, np.float32)}
+        for view in (0, 1):
+            expected = ur.render(whole, values, view=view, spp=16).mean()
+            assert ur.render(made, view=view, spp=16).mean() == pytest.approx(expected, rel=1e-4)
+
+
+def test_unknowns_of_expressions_in_stages_are_refused(tmp_path: Path) -> None:
+    more = '[[parameters]]\nkey = "strength"\ninitial = 3.0\n[expressions]\n"lamp.intensity.value" = "strength * [1, 1, 1]"\n'
+    stages = stages_file.Stages(files(tmp_path, more), (stages_file.Stage("light", ("strength",)),), steps=1)
+    with pytest.raises(InputError, match="strength is an unknown of expressions, which stages do not support"):
+        StagedProblem.read(stages)
+
+
+def test_reopened_scenes_of_views_keep_the_depth_of_their_integrators(tmp_path: Path) -> None:
+    """They took that of the problem's scene in stages, reopened run folders, workers and `replaced`. A depth of 1 shows no lit wall."""
+    cloudpickle = pytest.importorskip("ray").cloudpickle
+    lamp = "lamp.intensity.value"
+    more = f'[[views]]\nreference = "two.npy"\nscene = "other.xml"\n[[parameters]]\nkey = "{lamp}"\n'
+    file, other = files(tmp_path, more), tmp_path / "other.xml"
+    other.write_text(other.read_text().replace('name="max_depth" value="2"', 'name="max_depth" value="1"'))
+    made = ur.Problem.from_file(file)
+    (tmp_path / "run").mkdir()
+    serialization.save(made, tmp_path / "run")
+    stages = stages_file.Stages(file, (stages_file.Stage("light", (lamp,)),), steps=1)
+    staged = StagedProblem.read(stages).of_stage(stages.stages[0], {}, tmp_path / "made")
+    reopened = ur.Problem.from_file(tmp_path / "run" / serialization.FILE)
+    ray = SimpleNamespace(cloudpickle=cloudpickle)
+    sent = unpacked(packed(made, [0, 1], ray), ray)
+    for each in (made, made.replaced(name="again"), reopened, staged, sent):
+        assert ur.render(each, view=0, spp=4).mean() > 0.01
+        assert not ur.render(each, view=1, spp=4).any()
 
 
 def test_a_scene_without_the_unknowns_is_refused() -> None:

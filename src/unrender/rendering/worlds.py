@@ -118,6 +118,10 @@ class WorldsRenderer(RendererWrapper):
         """See `RendererWrapper.notices`: those of all scenes, each once."""
         return tuple(dict.fromkeys(line for one in self.renderers for line in getattr(one, "notices", ())))
 
+    def renderer_of(self, sensor: int) -> Renderer:
+        """Return the renderer of a sensor's scene."""
+        return self.states[self._state[sensor]].renderer
+
     def sensors_of(self, worlds: Sequence[World]) -> list[int] | None:
         """Return the index of each world's sensor; None where one is missing."""
         indices = [next((n for n, known in enumerate(self.worlds) if world.same(known)), None) for world in worlds]

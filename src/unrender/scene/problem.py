@@ -48,7 +48,7 @@ from unrender.scene.validation import (
 from unrender.scene.view import View
 from unrender.scene.view_checks import check_views, known_angles
 from unrender.scene.view_losses import ViewLosses
-from unrender.scene.view_worlds import check_determined, known_keys, of_views
+from unrender.scene.view_worlds import check_determined, known_keys, of_views, requested_depth
 
 __all__ = ["Bounds", "Problem", "open_scene"]
 
@@ -193,7 +193,7 @@ class Problem(ViewLosses):
             checked_parameters,
             self.original_views if views is None else views,
             self.loss if loss is None else loss,
-            self.max_depth,
+            requested_depth(self.renderer, self.original_views, self.max_depth),
             truth={key: value for key, value in self.truth.items() if key in keys} if truth is None else truth,
             name=name or self.name,
             surfaces={key: u.surface for key, u in self.unknowns.items() if u.surface is not None and key in keys},

@@ -20,6 +20,7 @@ from unrender.io import files, toml_lines
 from unrender.rendering.expressions import expression_layer
 from unrender.scene.problem import Problem
 from unrender.scene.unknown import Unknown
+from unrender.scene.view_worlds import requested_depth
 
 FILE, ARRAYS = "problem.toml", "problem"
 _INLINE = 64
@@ -65,8 +66,10 @@ def _described(problem: Problem, folder: Path) -> dict[str, Any]:
             known = [store.field(key, x, f"view{index}-{n}") for n, (key, x) in enumerate(view.known.items())]
             table["with"] = {key: value for part in known for key, value in part.items()}
         views.append(table)
-    scene = {"scene": problem.origin["scene"]} if rebuilt else {}
-    head = {"name": problem.name, **scene, "max_depth": problem.max_depth, "loss": _component(problem.loss)}
+    scene: dict[str, Any] = {"scene": problem.origin["scene"]} if rebuilt else {}
+    depth = requested_depth(problem.renderer, problem.original_views, problem.max_depth)
+    scene |= {} if depth is None else {"max_depth": depth}
+    head = {"name": problem.name, **scene, "loss": _component(problem.loss)}
     layer = expression_layer(problem.renderer)
     texts = {} if layer is None else {one.key: one.text for one in layer.expressions if one.text is not None}
     return {**head, **({"expressions": texts} if texts else {}), "parameters": parameters, "views": views}

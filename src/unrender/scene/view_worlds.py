@@ -64,6 +64,18 @@ def of_views(
     )
 
 
+def requested_depth(renderer: Renderer, views: Sequence[View], max_depth: int) -> int | None:
+    """Return the `max_depth` with which the scenes of views are opened again: None if each view's own scene has its integrator's.
+
+    Args:
+        renderer: renderer of a problem.
+        views: its views, as passed.
+        max_depth: its `max_depth`.
+    """
+    own = any(view.scene is not None for view in views)
+    return getattr(scene_renderer(renderer), "requested_depth", max_depth) if own else max_depth
+
+
 def check_determined(views: Sequence[View], unknowns: Mapping[str, Collection[str]]) -> None:
     """Raise `FieldError` if all views know all parameters of the scene that an unknown sets.
 

@@ -16,6 +16,7 @@ from unrender.rendering.photographs import scene_renderer, sensors_with_rows, wi
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem, open_scene
 from unrender.scene.view import View
+from unrender.scene.view_worlds import requested_depth
 
 _Owner = TypeVar("_Owner", View, Parameter)
 
@@ -27,7 +28,7 @@ class _Parts(NamedTuple):
     parameters: Any
     views: Any
     loss: Any
-    max_depth: int
+    max_depth: int | None
     name: str
     sensors: tuple[int, ...] | None
     expressions: Any
@@ -56,7 +57,7 @@ def packed(problem: Problem, views: Sequence[int], ray: Any) -> bytes:
         parameters,
         located_views,
         problem.loss,
-        problem.max_depth,
+        requested_depth(problem.renderer, problem.original_views, problem.max_depth),
         problem.name,
         sensors,
         _expressions(problem),

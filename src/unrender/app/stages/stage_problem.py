@@ -11,15 +11,19 @@ import numpy as np
 
 from unrender.app.exporting import scene_folder
 from unrender.app.stages.stages_file import Stage, Stages
+from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.losses import Loss
-from unrender.rendering.photographs import OF_PHOTOGRAPHS
-from unrender.rendering.renderer import ParameterInfo
+from unrender.rendering.photographs import OF_PHOTOGRAPHS, member_values, scene_renderer
+from unrender.rendering.renderer import ParameterInfo, Renderer
+from unrender.rendering.worlds import WorldsRenderer
+from unrender.rendering.wrapper import RendererWrapper
 from unrender.scene.coarse_to_fine import NEVER, CoarseToFine
-from unrender.scene.parameter import Parameter
+from unrender.scene.parameter import Parameter, ties_of
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
+from unrender.scene.view_worlds import requested_depth
 
 
 @dataclass(frozen=True)
@@ -30,16 +34,22 @@ class StagedProblem:
         scene: an XML file.
         parameters, views, loss, max_depth, truth, name: attributes of `Problem`.
         known: the renderer's description of each unknown.
+        initial: {key: array}, initial values that a scene can hold.
+        given: the keys of those that the problem's scene does not have.
+        scenes: keys of the parameters of each view's own scene; empty for views of the problem's scene.
     """
 
     scene: Path
     parameters: dict[str, Parameter]
     views: tuple[View, ...]
     loss: Loss
-    max_depth: int
+    max_depth: int | None
     truth: dict[str, np.ndarray]
     name: str
     known: dict[str, ParameterInfo]
+    initial: dict[str, np.ndarray]
+    given: frozenset[str]
+    scenes: tuple[frozenset[str], ...]
 
     @classmethod
     def read(cls, stages: Stages) -> StagedProblem:
@@ -50,18 +60,25 @@ class StagedProblem:
                 can hold, or remeshes a mesh whose first triangles later stages need.
         """
         problem = Problem.from_file(stages.problem)
-        known = problem.renderer.parameters()
+        known, scene = problem.renderer.parameters(), scene_renderer(problem.renderer)
         parameters = {parameter.key: parameter for parameter in problem.parameters}
         _check(stages, parameters)
+        for key in (key for key in parameters if parameters[key].keys is None and key not in OF_PHOTOGRAPHS):
+            if key not in scene.parameters():
+                raise InputError(f"{stages.problem}: {key} is an unknown of expressions, which stages do not support")
+        initial = {key: u.initial for key, u in problem.unknowns.items() if key not in OF_PHOTOGRAPHS}
         return cls(
             Path(problem.origin["scene"]),
             parameters,
             problem.original_views,
             problem.loss,
-            problem.max_depth,
+            requested_depth(problem.renderer, problem.original_views, problem.max_depth),
             problem.truth,
             problem.name,
             {key: replace(known[key], mesh=None) for key in parameters},
+            initial,
+            frozenset(key for key, value in initial.items() if _differs(problem.renderer, key, value)),
+            tuple(_keys_of_scene(problem, view) for view in range(len(problem.views))),
         )
 
     def of_stage(self, stage: Stage, values: Mapping[str, np.ndarray], folder: Path) -> Problem:
@@ -69,29 +86,40 @@ class StagedProblem:
 
         Args:
             stage: the stage; its keys are among the unknowns.
-            values: {key: array} of the results of earlier stages; those that the stage does not optimise become part of its scene.
+            values: {key: array} of the results of earlier stages. These, and initial values, become part of the stage's scene, and of
+                the other scenes of views, where the stage does not optimise them.
             folder: folder of that scene, if one is needed; an existing scene is reused.
 
         Raises:
             InputError: the folder cannot be written, or a key of the stage has another name in the exported scene.
         """
         scene = self.scene
-        fixed = {key: value for key, value in values.items() if key not in stage.unknowns}
-        if fixed:
+        fixed = {key: value for key, value in {**self.initial, **values}.items() if key not in stage.unknowns}
+        stored = {key: value for key, value in fixed.items() if key in values or key in self.given}
+        if stored:
             if not (folder / scene_folder.SCENE).is_file():
-                unknowns = [Parameter(key, keys=self.parameters[key].keys) for key in fixed]
+                unknowns = [Parameter(key, keys=self.parameters[key].keys) for key in stored]
                 problem = Problem(scene, unknowns, self.views[:1], self.loss, self.max_depth, partial=True)
-                self._check_names(stage, scene_folder.export((problem, fixed), folder))
+                self._check_names(stage, scene_folder.export((problem, stored), folder))
             scene = folder / scene_folder.SCENE
         return Problem(
             scene,
             [self._parameter(key, stage, values.get(key)) for key in stage.unknowns],
-            self.views,
+            self._views(fixed),
             self.loss,
             self.max_depth,
             truth={key: self.truth[key] for key in stage.unknowns if key in self.truth},
             name=f"{self.name}: {stage.name}"[:200],
         )
+
+    def _views(self, fixed: Mapping[str, np.ndarray]) -> list[View]:
+        """Return the views; those of other scenes know the fixed values there."""
+        ties = {tie.key: tie.factors for tie in ties_of(list(self.parameters.values()))}
+        members = {m: f * x for key, x in fixed.items() for m, f in ties.get(key, {key: 1.0}).items()}
+        known = [{key: x for key, x in members.items() if key in keys} for keys in self.scenes]
+        return [
+            replace(v, known={**own, **(v.known or {})}) if own else v for v, own in zip(self.views, known, strict=True)
+        ]
 
     def _check_names(self, stage: Stage, written: scene_folder.Exported) -> None:
         for key in stage.unknowns:
@@ -109,6 +137,22 @@ class StagedProblem:
             return parameter
         coarse = CoarseToFine((NEVER,), stage.coarser)
         return replace(parameter, coarse_to_fine=coarse if max(coarse.shape(info.shape, 0)[:-1]) > 1 else None)
+
+
+def _keys_of_scene(problem: Problem, view: int) -> frozenset[str]:
+    """Return the keys of the parameters of a view's own scene; empty for the problem's scene."""
+    renderer = problem.renderer
+    while isinstance(renderer, RendererWrapper) and not isinstance(renderer, WorldsRenderer):
+        renderer = renderer.inner
+    if problem.original_views[view].scene is None or not isinstance(renderer, WorldsRenderer):
+        return frozenset()
+    return frozenset(renderer.renderer_of(problem.views[view].sensor).parameters())
+
+
+def _differs(renderer: Renderer, key: str, initial: np.ndarray) -> bool:
+    """Return whether the initial value of an unknown is not that of the scene."""
+    members, scene = member_values(renderer, {key: initial}), scene_renderer(renderer)
+    return any(not np.array_equal(x, arrays.numpy(scene.values([name])[name])) for name, x in members.items())
 
 
 def _check(stages: Stages, parameters: Mapping[str, Parameter]) -> None:

@@ -59,6 +59,7 @@ class MitsubaRenderer:
     Attributes:
         light_paths: settings of the light paths.
         max_depth: maximum path length in segments.
+        requested_depth: the argument `max_depth`.
         notices: one line for each setting of the scene that is not used.
 
     Raises `InputError` if Mitsuba refuses the description.
@@ -71,7 +72,7 @@ class MitsubaRenderer:
         keys: Iterable[str] = (),
         replaced: Mapping[str, ReplacedMesh] | None = None,
     ):
-        self._requested_depth, keys = max_depth, tuple(keys)
+        self.requested_depth, keys = max_depth, tuple(keys)
         self.pair = ScenePair(description, moving_targets(keys), replaced)
         self.light_paths = LightPaths.of(self.pair.current, self.pair.volumetric, max_depth)
         self.max_depth = self.light_paths.max_depth
@@ -176,7 +177,7 @@ class MitsubaRenderer:
             return session
 
     def with_meshes(self, meshes: Mapping[str, ReplacedMesh], keys: Iterable[str]) -> MitsubaRenderer:
-        return MitsubaRenderer(self.pair.description, self._requested_depth, keys, self.pair.replaced | dict(meshes))
+        return MitsubaRenderer(self.pair.description, self.requested_depth, keys, self.pair.replaced | dict(meshes))
 
     def with_differential_bsdf(self) -> MitsubaRenderer:
         """Return a renderer of the same loaded scenes with differential BSDF sampling; this renderer if it renders an AOV."""
