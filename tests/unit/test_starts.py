@@ -129,7 +129,9 @@ def test_a_start_is_kept_where_it_is_near_or_places_have_no_bounds(
 def test_a_start_whose_difference_is_noise_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     made = problem(monkeypatch, [2.0, 7.0])
     changes = iter([-1e-9, *[-1e-6] * 1000])
-    monkeypatch.setattr(starts, "_losses", lambda *_: (np.full((4, 64), next(changes)), 1.0))
+    monkeypatch.setattr(
+        starts._Comparison, "losses", lambda _, states: [(np.full((4, 64), next(changes)), 1.0) for _ in states]
+    )
     assert not any("starts at other values" in reason for reason in method("auto").plan(made).reasons)
 
 
@@ -223,3 +225,34 @@ def test_places_are_spread_over_the_range(
     other = other / np.linalg.norm(other, axis=1)[:, None] if role == "direction" else np.clip(0.4 * other, -1, 1)
     nearest = np.linalg.norm(other[:, None] - places[None], axis=2).min(axis=1)
     assert nearest.max() < farthest
+
+
+@pytest.mark.parametrize(("shape", "views"), [((8, 8), 2), ((40, 30), 2)])
+def test_places_of_a_shape_share_launches(shape: tuple[int, int], views: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten times as many launches, one picture each, took 2.5 s for five squares."""
+    values = {"box.translation": np.zeros(2), "lamp": np.ones(1)}
+    matrix = np.random.default_rng(3).uniform(0.5, 1.5, (shape[0] * shape[1] * 3, 3))
+    renderer = AnalyticRenderer(values, matrix, 0.0, 0.0, shape=shape, sensors=views)
+    known = renderer.parameters()
+    moved = {**known, "box.translation": dataclasses.replace(known["box.translation"], rigid=True)}
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: moved)
+    references = [View(np.zeros((*shape, 3)), sensor=index) for index in range(views)]
+    made = Problem(renderer, [Parameter(key) for key in values], references)
+    launches: list[str] = []
+    for name in ("image", "image_batch"):
+        render = getattr(AnalyticRenderer, name)
+        monkeypatch.setattr(
+            AnalyticRenderer, name, lambda *own, name=name, render=render: (launches.append(name), render(*own))[1]
+        )
+    pictures = starts.FreshPictures(made, 0, 1 << 15)
+    places = np.random.default_rng(4).uniform(-1.0, 1.0, (20, 2))
+    states = [{"box.translation": place, "lamp": np.ones(1)} for place in places]
+    found = pictures.images_of(states, ["box.translation"])
+    assert launches == ["image_batch"] * (2 * 4 * views)  # sixteen states each, four independent groups of each view
+    assert pictures.rendered == 32 * max(pictures.paths // 4, 4 * pictures.pixels)  # a quarter of the samples of each
+    for state, images in zip(states, found, strict=True):
+        for one, other in zip(images, pictures.images(state), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-6)
+    launches.clear()
+    pictures.images_of([{**states[0], "lamp": np.full(1, 2.0)}], ["lamp"])  # no pose: each state has its own launches
+    assert "image_batch" not in launches

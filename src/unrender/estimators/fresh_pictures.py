@@ -31,6 +31,9 @@ _LONGER = 2
 recording."""
 _FEW_PIXELS, _FEW_OF_VIEWS = 1 << 10, 1 << 12
 """Number of pixels of all views up to which full views are rendered, for any number of paths; the same number for losses of full views."""
+_TOGETHER, _FEWER = 16, 4
+"""Number of states that share a launch in `FreshPictures.images_of`, since one number needs one recording; ratio of the samples of one
+image to those of each state, since places differ much."""
 _STREAM = 2
 """Stream of the run's key for new images; the steps use 0, the warm-up 1."""
 _MOST_NON_FINITE = 0.01
@@ -135,6 +138,46 @@ class FreshPictures:
             images_by_frame.append(total.reshape(-1, *total.shape[2:]) * (self._parts / self._launches))
         return images_by_frame
 
+    def images_of(self, states: Sequence[Mapping[str, np.ndarray]], varied: Sequence[str]) -> list[list[np.ndarray]]:
+        """Return `images` of each state. Where all pixels are rendered, states that differ in poses of shapes share launches, with a
+        quarter of the samples.
+
+        Args:
+            states: {key: array} of the same keys, equal except for those of `varied`.
+            varied: keys of unknowns.
+        """
+        known = self._problem.renderer.parameters()
+        posed = all(known[key].rigid and not (known[key].light or known[key].viewpoint) for key in varied)
+        if self.sampled or self._parts > 1 or not posed:
+            return [self.images(state) for state in states]
+        images_by_state: list[list[np.ndarray]] = []
+        for start in range(0, len(states), _TOGETHER):
+            part = list(states[start : start + _TOGETHER])
+            images_by_state += self._rendered_together(part, varied)[: len(part)]
+        return images_by_state
+
+    def _rendered_together(
+        self, states: list[Mapping[str, np.ndarray]], varied: Sequence[str]
+    ) -> list[list[np.ndarray]]:
+        """Return the images (4, N, 3) of each frame, of each of `_TOGETHER` states; the last of fewer states is repeated."""
+        states = [*states, *[states[-1]] * (_TOGETHER - len(states))]
+        stacked = {
+            key: np.stack([state[key] for state in states])
+            if key in varied
+            else np.broadcast_to(x, (_TOGETHER, *np.shape(x)))
+            for key, x in states[0].items()
+        }
+        session = self._problem.renderer.prepare(list(stacked), None, derivatives=False)
+        spp, views = max(self._spp * self._launches // (_FEWER * _GROUPS), 1), []
+        for view in range(len(self._problem.views)):
+            key, sensor = self._key.fold(view + 1), self._problem.views[view].sensor
+            requests = [SampleRequest(sensor, spp, key.fold(group).uint32()) for group in range(_GROUPS)]
+            groups = [arrays.numpy(session.image_batch(stacked, request)) for request in requests]
+            self.rendered += _TOGETHER * _GROUPS * spp * (groups[0][0].size // 3)
+            views.append(np.stack(groups, axis=1).astype(np.float64).reshape(_TOGETHER, _GROUPS, -1, 3))
+        frames = views if self.frames[0].view is not None else [np.concatenate(views, axis=2)]
+        return [list(of_state) for of_state in zip(*frames, strict=True)]
+
     def losses(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return the pseudo-values (K, N) of the loss without priors and regularizers, from images (K, N, 3) of each frame."""
         with np.errstate(invalid="ignore", over="ignore"):
@@ -198,8 +241,7 @@ class FreshPictures:
 
     def _losses(self, frame: _Frame, images: np.ndarray) -> np.ndarray:
         """Return the pseudo-values (K, N) of pixels, or (K, 1) of the view if the loss needs full images."""
-        candidates = [images.mean(axis=0), *leave_one_out(images)]
-        total, *others = (self._values(frame, image) for image in candidates)
+        total, *others = self._values(frame, np.stack([images.mean(axis=0), *leave_one_out(images)]))
         pseudo = paired_losses.pseudo_values(total, np.stack(others))
         if not self.sampled:
             return pseudo
@@ -207,14 +249,15 @@ class FreshPictures:
         divisor = 1 if frame.view is not None else pseudo.shape[1] // 2
         return pseudo.reshape(len(pseudo), divisor, -1).sum(axis=2)
 
-    def _values(self, frame: _Frame, image: np.ndarray) -> np.ndarray:
+    def _values(self, frame: _Frame, images: np.ndarray) -> np.ndarray:
+        """Return the loss of each pixel, (M, N), or of the view, (M, 1), for images (M, N, 3)."""
         problem, array = self._problem, self._problem.renderer.array
         if frame.view is not None and not problem.loss.pixelwise:
-            height, width = problem.sizes[frame.view]
-            return np.array([arrays.number(problem.loss_value(frame.view, array(image.reshape(height, width, 3))))])
-        values = arrays.numpy(problem.loss.value(array(image), array(frame.reference))).reshape(len(image), -1)
-        counted = frame.factors > 0
-        return np.where(counted, values * frame.factors, 0.0).sum(axis=1, dtype=np.float64)
+            of_view = [array(image.reshape(*problem.sizes[frame.view], 3)) for image in images]
+            return np.array([[arrays.number(problem.loss_value(frame.view, image))] for image in of_view])
+        references = np.tile(frame.reference, (len(images), 1))
+        values = arrays.numpy(problem.loss.value(array(images.reshape(-1, 3)), array(references))).reshape(images.shape)
+        return np.where(frame.factors > 0, values * frame.factors, 0.0).sum(axis=2, dtype=np.float64)
 
 
 def is_finite(first: Picture, other: Picture) -> bool:

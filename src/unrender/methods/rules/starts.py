@@ -108,9 +108,10 @@ def better_place(
     unknowns = problem.unknowns
     lights = [key for key in lights if unknowns[key].prior is None]
     limits = _limits([(values[key], unknowns[key].bounds) for key in lights])
-    first = best = _Compared({}, 1.0, _losses(pictures, values, lights, limits)[0])
+    comparison = _Comparison(problem, pictures, values, keys, lights, limits)
+    first = best = _Compared({}, 1.0, comparison.losses([values])[0][0])
     for group in _groups(problem, keys):
-        best = _best_of_group(problem, pictures, values, group, lights, limits, best)
+        best = comparison.best_of_group(group, best)
     start = first.total
     share = max(best.total, 0.0) / start if start > 0.0 else math.inf  # without its noise, a loss may be negative
     change = difference(best.losses, first.losses, sampled=pictures.sampled or not plateau)
@@ -135,37 +136,69 @@ class _Compared:
         return mean_and_error(self.losses)[0]
 
 
-def _best_of_group(
-    problem: Problem,
-    pictures: FreshPictures,
-    values: Mapping[str, np.ndarray],
-    keys: Sequence[str],
-    lights: Sequence[str],
-    limits: Bounds,
-    best: _Compared,
-) -> _Compared:
-    """Return the best of the places of some unknowns, whose others have their best values so far.
+@dataclass(frozen=True)
+class _Comparison:
+    """Pictures of places of some unknowns.
 
-    Places around the best pose of a shape are compared, too, because few of the spread ones overlap its picture in the references.
+    Attributes:
+        problem, pictures: problem, and renderer of the pictures.
+        values: {key: array}, the given values of all unknowns.
+        keys: keys of the varied unknowns.
+        lights: keys of the unknowns with a common factor.
+        limits: limits of that factor.
     """
-    before, at = best, np.empty(0)
-    shape = _is_shape(problem, keys[0])
-    points = _points(problem, keys)
-    reach = len(points) ** (-1.0 / points.shape[1])
-    for _ in range(2 if shape else 1):
-        for point in points:
-            place = {**before.place, **_values(problem, keys, point, values)}
-            try:
-                losses, factor = _losses(pictures, {**values, **place}, lights, limits)
-            except InputError:  # a value that the renderer rejects
-                continue
-            if (made := _Compared(place, factor, losses)).total < best.total:
-                best, at = made, point
-        if best is before:
-            break
-        points = np.clip(at + reach * (2.0 * points[:_NEAR] - 1.0), 0.0, 1.0)
-    change = difference(best.losses, before.losses, sampled=pictures.sampled)
-    return best if not shape or change.value > _ERRORS * change.standard_error else before
+
+    problem: Problem
+    pictures: FreshPictures
+    values: Mapping[str, np.ndarray]
+    keys: Sequence[str]
+    lights: Sequence[str]
+    limits: Bounds
+
+    def best_of_group(self, keys: Sequence[str], best: _Compared) -> _Compared:
+        """Return the best of the places of some unknowns, whose others have their best values so far.
+
+        Places around the best pose of a shape are compared, too, because few of the spread ones overlap its picture in the references.
+        """
+        problem, before, at = self.problem, best, np.empty(0)
+        shape = _is_shape(problem, keys[0])
+        points = _points(problem, keys)
+        reach = len(points) ** (-1.0 / points.shape[1])
+        for _ in range(2 if shape else 1):
+            places = [{**before.place, **_values(problem, keys, point, self.values)} for point in points]
+            together = len(places) if shape else 1
+            for start in range(0, len(places), together):
+                part = slice(start, start + together)
+                try:
+                    losses = self.losses([{**self.values, **place} for place in places[part]])
+                except InputError:  # a value that the renderer rejects
+                    continue
+                for place, point, (own, factor) in zip(places[part], points[part], losses, strict=True):
+                    if (made := _Compared(place, factor, own)).total < best.total:
+                        best, at = made, point
+            if best is before:
+                break
+            points = np.clip(at + reach * (2.0 * points[:_NEAR] - 1.0), 0.0, 1.0)
+        change = difference(best.losses, before.losses, sampled=self.pictures.sampled)
+        return best if not shape or change.value > _ERRORS * change.standard_error else before
+
+    def losses(self, states: Sequence[Mapping[str, np.ndarray]]) -> list[tuple[np.ndarray, float]]:
+        """Return the pseudo-values of the loss of each state, (K, N), and the factor of its lights: 1 or that of least squares, whichever
+        has less loss."""
+        pictures = self.pictures
+        images_of = pictures.images_of(states, self.keys)
+        losses = [(pictures.losses(images), 1.0) for images in images_of]
+        if not self.lights:
+            return losses
+        doubled = [{**state, **{key: 2.0 * state[key] for key in self.lights}} for state in states]
+        for index, double in enumerate(pictures.images_of(doubled, self.keys)):
+            images = images_of[index]
+            own = [two - one for two, one in zip(double, images, strict=True)]
+            factor = float(np.clip(_factor(pictures, images, own), *self.limits))
+            other = pictures.losses([image + (factor - 1.0) * light for image, light in zip(images, own, strict=True)])
+            if mean_and_error(other)[0] < mean_and_error(losses[index][0])[0]:
+                losses[index] = other, factor
+        return losses
 
 
 def varied_keys(problem: Problem, keys: Sequence[str]) -> list[str]:
@@ -265,21 +298,6 @@ def _limits(lights: Sequence[tuple[np.ndarray, Bounds]]) -> Bounds:
         ends = np.sort([below / x[x != 0.0], above / x[x != 0.0]], axis=0)
         low, high = float(ends[0].max(initial=low)), float(ends[1].min(initial=high))
     return min(low, 1.0), max(high, 1.0)
-
-
-def _losses(
-    pictures: FreshPictures, values: Mapping[str, np.ndarray], lights: Sequence[str], limits: Bounds
-) -> tuple[np.ndarray, float]:
-    """Return the pseudo-values of the loss, (K, N), and the factor of the lights: 1 or that of least squares, whichever has less loss."""
-    images = pictures.images(values)
-    losses = pictures.losses(images)
-    if not lights:
-        return losses, 1.0
-    double = pictures.images({**values, **{key: 2.0 * values[key] for key in lights}})
-    own = [two - one for two, one in zip(double, images, strict=True)]
-    factor = float(np.clip(_factor(pictures, images, own), *limits))
-    others = pictures.losses([image + (factor - 1.0) * light for image, light in zip(images, own, strict=True)])
-    return (others, factor) if mean_and_error(others)[0] < mean_and_error(losses)[0] else (losses, 1.0)
 
 
 def _factor(pictures: FreshPictures, images: Sequence[np.ndarray], own: Sequence[np.ndarray]) -> float:
