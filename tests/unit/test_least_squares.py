@@ -335,6 +335,25 @@ def test_the_error_of_a_step_is_at_least_that_of_the_check():
     )
 
 
+def test_a_rare_bright_sample_that_hides_a_slope_leaves_its_number_without_a_standard_error():
+    """It made the slope's upper limit large, and the stated error, a lower limit, small: 0.00016 for a roughness 0.01 away."""
+    made = problem(MATRIX)
+    numbers = Numbers.of(made, TRUTH, made.initial_values())
+    assert numbers is not None
+    of = 0.1 * MATRIX.T.reshape(4, -1, 3)
+    noise = np.random.default_rng(1).normal(0.0, 0.5, (2, *of.shape[1:]))  # far above that of the references
+    for bright, expected in ((0.0, ()), (1e3, ("b",))):
+        one = of.copy()
+        one[3, 5] += bright
+        found = _checked(numbers, _Fit.of(numbers, Differences(0.1 * np.eye(4), one, of), noise), np.full(4, 0.01))
+        errors = found.standard_errors(TRUTH)
+        assert found.blind == expected
+        assert bool(np.isinf(errors["b"])) is bool(expected)
+        assert np.isfinite(errors["a"]).all()
+        assert bool(found.noisy(())) is bool(expected)
+        assert not found.noisy(("b",))
+
+
 def test_no_time_no_check():
     made = problem(MATRIX)
     found = check_numbers(made, at(best(made, MATRIX)), made.initial_values(), 0.0)

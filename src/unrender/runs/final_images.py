@@ -242,6 +242,7 @@ def _undetermined(
     if fits:
         lines += [line for key, line in numbers.undetermined.items() if key not in text]
         lines += numbers.missing([key for key in numbers.unchecked if key in text] + [*numbers.undetermined])
+        lines += numbers.noisy(result.standard_error)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
     return lines, unfinished, deviations

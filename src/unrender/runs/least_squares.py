@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -21,8 +21,9 @@ from unrender.estimators.base import Estimator
 from unrender.estimators.derivative_images import noise_weights
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.hybrid import HybridGradient, HybridState
-from unrender.runs.field_directions import TOO_SHORT, add_field_directions, fields_of
+from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.numbers import Differences, Numbers
+from unrender.runs.numbers_check import NumbersCheck
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
 
@@ -47,76 +48,9 @@ _OF_WIDTHS, _TOGETHER = 10.0, 0.9
 """Size of a pose, in widths of its differences; correlation from which on two numbers count as determined together."""
 _ROUNDS, _WEAK = 3, 0.3
 """Most rounds that measure weak directions again; length relative to the wanted one below which a direction is weak."""
-_CLEAR = 3.0
-"""Length of a step over its noise from which it counts as a distance, if the run states its own error."""
 _FAR, _BETTER, _NOISY = 6.0, 1.0, 0.05
 """Standard errors that a number moved from which on the picture must be better than with its start; by how many standard errors; share of
 the noisiest pixels that may hide it."""
-
-
-@dataclass(frozen=True)
-class NumbersCheck:
-    """Result of the least-squares test of the numbers of a run.
-
-    Attributes:
-        undetermined: {key: line} of the numbers that the references leave open.
-        unfinished: {key: line} of those that a least-squares step would still move.
-        errors: {key: standard errors} of all numbers but the unchecked ones, the references' noise included.
-        steps: {key: least-squares steps} of all numbers.
-        noise: {key: standard errors of the steps by the noise of this check}.
-        unchecked: keys of the numbers whose standard errors are unknown.
-        fixed: {key: reason} of unknowns that trade off against the numbers in directions that the test leaves out; {} if there was no
-            time for the test.
-    """
-
-    undetermined: Mapping[str, str] = field(default_factory=dict)
-    unfinished: Mapping[str, str] = field(default_factory=dict)
-    errors: Mapping[str, np.ndarray] = field(default_factory=dict)
-    steps: Mapping[str, np.ndarray] = field(default_factory=dict)
-    noise: Mapping[str, np.ndarray] = field(default_factory=dict)
-    unchecked: tuple[str, ...] = ()
-    fixed: Mapping[str, str] = field(default_factory=dict)
-
-    def missing(self, reported: Collection[str] = ()) -> list[str]:
-        """Return at most one line: why the standard errors of the unchecked numbers are unknown.
-
-        Args:
-            reported: keys to leave out, since other lines are about them.
-        """
-        keys = [key for key in self.unchecked if key not in reported]
-        if not keys:
-            return []
-        if not self.fixed:
-            return [f"whether {listed(keys)} converged: {TOO_SHORT}"]
-        others = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
-        have = "has no standard error: it is" if len(keys) == 1 else "have no standard errors: they are"
-        return [f"{listed(keys)} {have} recovered together with {others}"]
-
-    def standard_errors(
-        self, values: Mapping[str, np.ndarray], known: Mapping[str, np.ndarray] | None = None, complete: bool = False
-    ) -> dict[str, np.ndarray]:
-        """Return the standard errors of the numbers at the end of a run, of the shapes of `values`, float32.
-
-        The squares of the error by the references' noise and of the distance from the least-squares solution are added. An estimate of the
-        distance, without its noise σ, is step² − σ². A number is not known better than σ, unless the run states its own error. If that is
-        complete, it replaces the check's, which is of another solution, and only steps beyond 3 σ are distances.
-
-        Args:
-            values: {key: array} at the end of the run.
-            known: {key: standard errors} that the run states.
-            complete: whether these contain the references' noise; otherwise errors are no smaller than them.
-        """
-        errors, known = {}, known or {}
-        for key, error in self.errors.items():
-            square, noise, step = (np.square(x) for x in (error, self.noise[key], self.steps[key]))
-            own = np.square(known.get(key, 0.0)).reshape(-1)
-            if complete and key in known:
-                square = np.where(np.isfinite(square), own, np.inf) + np.maximum(step - _CLEAR**2 * noise, 0.0)
-            else:
-                square = square if key in known else np.maximum(square, noise)
-                square = np.maximum(square + np.maximum(step - noise, 0.0), own)
-            errors[key] = np.sqrt(square).reshape(values[key].shape).astype(np.float32)
-        return errors
 
 
 @exclusive("check_numbers")
@@ -272,7 +206,8 @@ class _Fit:
         error: standard errors of the numbers, (n,); infinite along directions whose changes the noise of this check hides.
         own: the same from the noise of this check, its slopes included, (n,).
         step: step of the numbers, (n,).
-        unseen: largest changes of the numbers along each hidden direction, signed, (n, number of hidden directions).
+        unseen: largest changes of the numbers along each hidden direction that leaves them open, signed, (n, number of hidden directions).
+        blind: largest changes of the numbers along the other hidden directions, whose slopes this check does not know, (n,).
         better: standard errors by which the picture is better than with the start's numbers.
     """
 
@@ -281,6 +216,7 @@ class _Fit:
     own: np.ndarray
     step: np.ndarray
     unseen: np.ndarray
+    blind: np.ndarray | float = 0.0
     better: float = math.inf
 
     @classmethod
@@ -327,8 +263,9 @@ class _Fit:
         # Differences along poses are noisy at a few pixels, such as a lamp's edge, which hide what all others show.
         open_ = flat[None] | (~numbers.rigid[:, None] & comparable)
         unseen = changes[:n] * (hidden[None] & open_)
+        blind = np.abs(changes[:n] * (hidden[None] & ~open_)).max(axis=1, initial=0.0)
         better = math.inf if before is None else _better(residuals, before)
-        return cls(total, error, own, step[:n], unseen[:, hidden], better)
+        return cls(total, error, own, step[:n], unseen[:, hidden], blind, better)
 
 
 def _better(residuals: np.ndarray, before: np.ndarray) -> float:
@@ -355,7 +292,10 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
     together = (np.abs(fit.covariance[:n, :n]) > _TOGETHER * spread) | (along > _DOUBTFUL * sizes[:, None])
     together |= (unseen[:, None] & unseen[None]).any(axis=2)
     shared = open_ & (_shared_with_fields(fit.covariance, n) | unseen.any(axis=1))
-    of_step = np.maximum(error, fit.own)  # references without noise leave the noise of this check
+    # A hidden slope has an upper limit alone, so an error from it is a lower limit.
+    blind = fit.blind > np.maximum(error, fit.own)
+    own = np.where(blind, np.inf, fit.own)
+    of_step = np.maximum(error, own)  # references without noise leave the noise of this check
     further = np.abs(fit.step) > np.maximum(_STEP_ERRORS * of_step, _FURTHER * sizes)
     shown, more = np.minimum(error, sizes), np.where(error > sizes, " or more", "")
     # Least squares is linear: a picture that is no better than with the start, many standard errors away, refutes these errors.
@@ -384,8 +324,9 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
                 f"standard error {_numbers(of_step[of])}; give more steps or seconds, or resume the run"
             )
     known = np.where((error > sizes) | refuted, np.inf, error)  # beyond its own size an error is not linear
-    errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, fit.own))
-    return NumbersCheck(undetermined, unfinished, errors, steps, noise)
+    errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, own))
+    hidden = tuple(k for k, of in numbers.places().items() if blind[of].any() and k not in undetermined)
+    return NumbersCheck(undetermined, unfinished, errors, steps, noise, blind=hidden)
 
 
 def _shared_with_fields(covariance: np.ndarray, n: int) -> np.ndarray:
