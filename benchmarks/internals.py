@@ -26,7 +26,7 @@ from unrender.estimators.sample_groups import GradientRequest, leave_one_out_gro
 from unrender.gallery import parts, textures, volumes
 from unrender.gallery.analytic import RATE
 from unrender.gallery.heights import Lenses, Relief
-from unrender.gallery.indirect_room import IndirectRoom
+from unrender.gallery.rooms import IndirectRoom
 from unrender.gallery.specification import build_problem
 from unrender.gallery.volumes import Smoke
 from unrender.images import denoising

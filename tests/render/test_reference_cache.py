@@ -11,7 +11,7 @@ import pytest
 import unrender as ur
 from unrender.backend import cache
 from unrender.gallery import specification
-from unrender.gallery.indirect_room import IndirectRoom
+from unrender.gallery.rooms import IndirectRoom
 from unrender.rendering.mitsuba.scene_loading import load
 
 SMALL = {"resolution": 8, "texture_resolution": 4, "reference_spp": 4}

@@ -17,7 +17,6 @@ from unrender.scene.problem import Problem
 
 __all__ = ["Option", "names", "options", "photographs", "problem", "summary"]
 
-
 _KIND = "gallery problem"
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -10,7 +10,6 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
-from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
 _PLACES = {"left": (-1.95, 1.36, 1.95), "middle": (0.15, 1.89, 2.55), "right": (2.18, 1.06, 1.5)}
@@ -27,18 +26,13 @@ _START = {
 
 @register(name="camera", position=27)
 @dataclass(frozen=True)
-class Camera:
+class Camera(fields.Rendered):
     """The poses of three cameras, from their images of a known scene.
 
     Three views. The unknowns are the translation and the rotation vector of each camera, (3,) each, 18 numbers. Initial errors are 2
     degrees and 2 % of the distance. The difficulty is that a rotation and a sideways shift have nearly the same effect: only the depth of
     the scene distinguishes them.
     """
-
-    resolution: int = fields.resolution(48)
-    reference_spp: int = fields.reference_spp(1024)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return objects of several heights on a patterned floor, before a patterned wall, under two suns."""
@@ -99,17 +93,14 @@ _LIGHTS: dict[str, tuple[str, dict[str, float]]] = {
 
 @register(name="stage-lights", position=33)
 @dataclass(frozen=True)
-class StageLights:
+class StageLights(fields.Rendered):
     """The direction of a spotlight, the position of a softbox and the rotation of a projector, from one image of a stage.
 
     One view. Seven unknowns: two angles of the spotlight, whose rotation about its own axis has no effect, the softbox's translation, and
     two angles of the projector. None of the lights is visible itself.
     """
 
-    resolution: int = fields.resolution(48)
-    reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(3, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the stage: x in [-2, 2], z in [-1.5, 2], a backdrop at z = -1.5, two blocks, and the camera at its front, looking along

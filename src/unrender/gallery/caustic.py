@@ -6,7 +6,7 @@ it does, so a few samples per pixel contain almost no information about large or
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -14,7 +14,6 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
-from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
@@ -27,7 +26,7 @@ _LAMPS = {"left": (-0.58, -0.15, (1.0, 0.85, 0.65)), "right": (0.58, 0.05, (0.75
 
 @register(name="caustic", position=12)
 @dataclass(frozen=True)
-class Caustic:
+class Caustic(fields.Rendered):
     """The texture of a floor that two lamps light through glass balls, in caustics.
 
     One view. One unknown reflectance (texture_resolution², 3), initially grey, with LargeSteps. Only paths of at least 4 segments reach
@@ -37,9 +36,7 @@ class Caustic:
 
     resolution: int = fields.resolution(64)
     texture_resolution: int = fields.texture_resolution(32)
-    reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(5, at_least=4)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the floor: x in [-1.3, 1.3], z in [-0.9, 0.9] at y = 0.

@@ -10,7 +10,7 @@ from typing import Any
 from unrender.core import checks, registry, tables
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
-from unrender.losses import Loss
+from unrender.losses import L2, Loss
 
 _LONGEST_SIDE = 1 << 13
 """Pixels along a side of an image with the largest number of values that is read from a file."""
@@ -88,11 +88,19 @@ LOSS = {"kind": Loss, "about": "L1, L2, RelativeL2, Huber, Perceptual or another
 """Metadata of the field `loss`."""
 
 
+@dataclass(frozen=True)
+class Rendered:
+    """Options that all rendered problems have, with the most frequent defaults; other defaults override these."""
+
+    resolution: int = resolution(48)
+    reference_spp: int = reference_spp(1024)
+    max_depth: int = max_depth(2, at_least=2)
+    loss: Loss = field(default=L2(), metadata=LOSS)
+
+
 def of(specification: type) -> list[Option]:
     """Return the options of a specification, in order."""
-    return [
-        Option(f.name, f.metadata["kind"], f.default, f.metadata["about"]) for f in dataclasses.fields(specification)
-    ]
+    return [Option(f.name, f.metadata["kind"], f.default, f.metadata["about"]) for f in _fields(specification).values()]
 
 
 def fill(name: str, specification: type, options: Mapping[str, Any]) -> Any:
@@ -100,7 +108,7 @@ def fill(name: str, specification: type, options: Mapping[str, Any]) -> Any:
 
     Raises `InputError` for an unknown option (with the nearest known one), or one out of range.
     """
-    fields = {f.name: f for f in dataclasses.fields(specification)}
+    fields = _fields(specification)
     owner = f"gallery problem {name}"
     taken = {}
     for key, value in options.items():
@@ -109,3 +117,9 @@ def fill(name: str, specification: type, options: Mapping[str, Any]) -> Any:
             raise InputError(f"{owner}: no option {key}{hint}")
         taken[key] = fields[key].metadata["check"](owner, key, value)
     return specification(**taken)
+
+
+def _fields(specification: type) -> dict[str, dataclasses.Field[Any]]:
+    last = ("reference_spp", "max_depth", "loss")  # after those of the problem itself
+    ordered = sorted(dataclasses.fields(specification), key=lambda f: f.name in last)
+    return {f.name: f for f in ordered}

@@ -24,7 +24,7 @@ import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
-from unrender.losses import L2, Loss, RelativeL2
+from unrender.losses import Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
@@ -40,7 +40,7 @@ _TINTS = [(35.0, 31.0, 28.0), (28.0, 31.0, 35.0), (35.0, 35.0, 35.0)]
 
 @register(name="glossy-room", position=2)
 @dataclass(frozen=True)
-class GlossyRoom:
+class GlossyRoom(fields.Rendered):
     """Base colour, roughness and metallic maps of a metal tile and a gilded ball, from their highlights.
 
     Several views. Four unknowns of texture_resolution² texels: base colour and roughness of the tile, metallic and roughness of the ball.
@@ -51,7 +51,6 @@ class GlossyRoom:
     views: int = fields.integer(3, "cameras, side by side", at_least=1, at_most=16)
     reference_spp: int = fields.reference_spp(192)
     max_depth: int = fields.max_depth(5, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the room: x in [-2.2, 2.2], y in [0, 3], z in [-1.5, 4.5], with cameras at z = 4 that look along -z."""
@@ -137,7 +136,7 @@ _LAMPS = ((-1.4, 2.6, 1.6), (1.5, 2.2, 1.2), (0.2, 2.9, 2.2), (-1.9, 1.2, 0.4), 
 
 @register(name="chalice", position=7)
 @dataclass(frozen=True)
-class Chalice:
+class Chalice(fields.Rendered):
     """The roughness map of a metal chalice under small, bright lights.
 
     Two views. One unknown, the roughness (texture_resolution², 1), initially constant, with LargeSteps.
@@ -145,7 +144,6 @@ class Chalice:
 
     resolution: int = fields.resolution(96)
     texture_resolution: int = fields.texture_resolution(64)
-    reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(4, at_least=2)
     loss: Loss = field(default=RelativeL2(), metadata=fields.LOSS)
 
@@ -221,7 +219,7 @@ _TRIO_LAMPS = {
 
 @register(name="mirror-trio", position=8)
 @dataclass(frozen=True)
-class MirrorTrio:
+class MirrorTrio(fields.Rendered):
     """The roughness of a mirror behind three diffuse objects, from an image of which it covers a part.
 
     One view. One unknown, the alpha of a rough conductor, a number. Path gradients reach it well. The difficulty is to sample the few
@@ -229,14 +227,13 @@ class MirrorTrio:
     """
 
     resolution: int = fields.resolution(64)
-    reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(5, at_least=3)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the objects on a floor y = 0 around z = 0, the mirror at z = -1 before a wall, and the camera at z = 4."""
         silver = {"type": "roughconductor", "material": "Ag", "alpha": _ALPHA, "distribution": "ggx"}
-        cone = meshes.lathe(*_cone(48), 64) + np.array([-0.02, 0.0, 0.15])
+        t = np.linspace(0, 1, 48)
+        cone = meshes.lathe(0.32 * (1 - t) + 1e-3, 0.85 * t, 64) + np.array([-0.02, 0.0, 0.15])
         return {
             "type": "scene",
             "camera": parts.camera((0.0, 1.25, 4.0), (0.0, 0.68, 0.0), 34.0, self.resolution),
@@ -267,11 +264,6 @@ class MirrorTrio:
         return (Parameter("mirror.bsdf.alpha.value", initial=0.15, bounds=(0.01, 1.0)),)
 
 
-def _cone(rows: int) -> tuple[np.ndarray, np.ndarray]:
-    t = np.linspace(0, 1, rows)
-    return 0.32 * (1 - t) + 1e-3, 0.85 * t
-
-
 def _block(centre: parts.Vector, half: float) -> Any:
     turn = mi.ScalarTransform4f().rotate([0, 1, 0], 28)
     return mi.ScalarTransform4f().translate(list(centre)) @ turn @ mi.ScalarTransform4f().scale(half)
@@ -282,7 +274,7 @@ _TURNS = 2.5
 
 @register(name="spiral", position=5)
 @dataclass(frozen=True)
-class Spiral:
+class Spiral(fields.Rendered):
     """Base colour, metalness and roughness of a glossy spiral ribbon, together, by indirect light.
 
     One view. Five unknown numbers, or three maps of texture_resolution² texels, initially constant.

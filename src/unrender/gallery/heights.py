@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,6 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.gallery.specification import reference
-from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.rendering.mitsuba.scene_loading import load
 from unrender.scene.parameter import Parameter
@@ -32,7 +31,7 @@ _HEIGHTS, _START, _LARGEST = (0.2, 0.08, 0.14), 0.12, 0.3
 
 @register(name="lenses", position=35)
 @dataclass(frozen=True)
-class Lenses:
+class Lenses(fields.Rendered):
     """The heights of three lenses in a pane of glass, from the caustics that they cast on a screen.
 
     One view of the screen; the glass itself is not seen. The unknown is the height in the middle of each lens, (3,), initially the same.
@@ -44,7 +43,6 @@ class Lenses:
     mesh_resolution: int = fields.integer(40, "n: the pane has n by n vertices", at_least=8, at_most=1024)
     reference_spp: int = fields.reference_spp(8192)
     max_depth: int = fields.max_depth(5, at_least=4)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the pane with lenses of equal heights, the screen at z = 0, and a lamp above."""
@@ -108,7 +106,7 @@ _DEEPEST = 0.3
 
 @register(name="relief", position=34)
 @dataclass(frozen=True)
-class Relief:
+class Relief(fields.Rendered):
     """The height map of a plaque, from three images under one lamp each, starting with a flat plaque.
 
     Three views by one camera, each of a world in which one lamp is on. The unknown is the height of each vertex above the plane, (n, n, 1),
@@ -116,11 +114,9 @@ class Relief:
     change the image only by shading and shadows.
     """
 
-    resolution: int = fields.resolution(48)
     height_resolution: int = fields.integer(24, "n: the height map has n by n vertices", at_least=2, at_most=1024)
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(3, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the flat plaque, x and y in [-1, 1] at z = 0, under all lamps."""

@@ -324,7 +324,6 @@ def around(
     Args:
         depth: function of points (N, 3) that returns (N,), positive inside; negative on the sides of the box.
         low, high: corners of the box.
-        spacing: spacing of the grid.
     """
     from skimage import measure
 

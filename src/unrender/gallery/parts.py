@@ -49,7 +49,6 @@ def cameras_around(
 
     Args:
         angles: angle of each camera in radians, from +z towards +x.
-        distance: distance of all from the axis.
         heights: their y in turn: two are alternately lower and higher.
         target, fov, resolution: see `camera`.
     """
@@ -204,6 +203,5 @@ def unknown_pose(
         shape: id of the shape or light.
         part: "translation" or "rotation".
         start: {"x" | "y" | "z": initial value}; other coordinates are known.
-        bounds: bounds of each coordinate.
     """
     return [Parameter(f"{shape}.{part}.{axis}", initial=value, bounds=bounds) for axis, value in start.items()]

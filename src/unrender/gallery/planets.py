@@ -8,14 +8,13 @@ the ground, which contains almost no information about the paint. The sides in t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
-from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
@@ -33,19 +32,17 @@ _SUN = parts.unit([0.3, 0.75, 0.6])
 
 @register(name="two-planets", position=11)
 @dataclass(frozen=True)
-class TwoPlanets:
+class TwoPlanets(fields.Rendered):
     """The textures of two planets, one inside of glass, each initially with the other's texture.
 
     Many views. Two unknown reflectances of texture_resolution² texels, with LargeSteps. Paths to the enclosed planet and on to the light
     have at least 6 segments.
     """
 
-    resolution: int = fields.resolution(48)
     texture_resolution: int = fields.texture_resolution(32)
     views: int = fields.integer(16, "cameras around the planets, alternately lower and higher", at_least=1, at_most=32)
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(8, at_least=6)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the planets: at x = -1.05 the free blue one, at x = 1.05 the enclosed red one, and the sky."""
@@ -141,7 +138,7 @@ _EYE, _MIRROR = np.array([1.4, 0.8, 6.0]), np.array([-2.1, 0.1, -1.5])
 
 @register(name="globe-and-mirror", position=32)
 @dataclass(frozen=True)
-class GlobeAndMirror:
+class GlobeAndMirror(fields.Rendered):
     """The texture of a globe inside of glass, whose back is visible in a mirror, from one image.
 
     One view. An unknown reflectance of texture_resolution² texels, initially grey, with LargeSteps. A part of the back is not visible at
@@ -152,7 +149,6 @@ class GlobeAndMirror:
     texture_resolution: int = fields.texture_resolution(32)
     reference_spp: int = fields.reference_spp(512)
     max_depth: int = fields.max_depth(9, at_least=7)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the globe around the origin, with the mirror behind it at its left, oriented so that the camera sees the globe in its
@@ -182,7 +178,7 @@ _FROM_CENTRE = 0.72
 
 @register(name="three-textures", position=31)
 @dataclass(frozen=True)
-class ThreeTextures:
+class ThreeTextures(fields.Rendered):
     """The paint of three objects under a sky with a sun, seen from all sides.
 
     Several views. Three unknown reflectances of texture_resolution² texels, initially grey, with LargeSteps. No image shows the lower end
@@ -194,7 +190,6 @@ class ThreeTextures:
     views: int = fields.integer(4, "cameras, at equal angles around the objects", at_least=1, at_most=32)
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(4, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the objects on the ground y = 0, each at 0.72 from the y axis, the ball at +z."""

@@ -10,7 +10,7 @@ motions of a square that does not overlap its true position do not change the lo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -19,7 +19,6 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.core.rotations import rotation
 from unrender.gallery import fields, meshes, parts, textures
-from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
 _SUN = np.array([0.4, 1.0, -0.25])
@@ -33,17 +32,12 @@ _REACH = 0.6
 
 @register(name="shadow", position=18)
 @dataclass(frozen=True)
-class Shadow:
+class Shadow(fields.Rendered):
     """The position of a ball outside of the image: two numbers, from its shadow, initially away from the true one.
 
     One view. The unknowns are x and z of the ball's translation, bounded so that its shadow is in the image. A plateau: the loss does not
     change until the shadows overlap. The renderer's path gradient is zero everywhere.
     """
-
-    resolution: int = fields.resolution(48)
-    reference_spp: int = fields.reference_spp(1024)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the floor y = 0, with the camera below the ball, looking straight down, so that the shadow's shape does not change."""
@@ -75,7 +69,7 @@ class Shadow:
 
 @register(name="bunny", position=19)
 @dataclass(frozen=True)
-class Bunny:
+class Bunny(fields.Rendered):
     """The position and direction of an animal: three numbers; the start overlaps the reference.
 
     One view. The unknowns are x and z of its translation, and its rotation about the vertical. There is no plateau: it starts a fraction
@@ -83,12 +77,8 @@ class Bunny:
     code, or read from a file.
     """
 
-    resolution: int = fields.resolution(48)
     mesh: str = meshes.option("PLY or OBJ file of an animal, y upwards, in place of the one made by code")
     detail: int = fields.integer(1, "d: the mesh made by code has about 3600 d^2 vertices", at_least=1, at_most=16)
-    reference_spp: int = fields.reference_spp(1024)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the animal, 1 along its longest side, on the floor y = 0 at the origin, with the sun at the camera's left."""
@@ -112,7 +102,6 @@ class Bunny:
 
 def _animal(detail: int) -> list[meshes.Sheet]:
     """Return a sitting hare that looks along +x and slightly to the camera: body, haunch, chest, head, muzzle, two ears, a tail."""
-
     turn = rotation((0, 1, 0), np.radians(-35))  # from +x towards the camera
 
     def ball(centre: tuple[float, float, float], radii: tuple[float, float, float], tilt: float = 0.0) -> meshes.Sheet:
@@ -149,7 +138,7 @@ _CUP, _ELSEWHERE = (0.0, 0.0), (0.0, 2.0)
 
 @register(name="mug", position=17)
 @dataclass(frozen=True)
-class Mug:
+class Mug(fields.Rendered):
     """The rotation of a cup: one angle, with the handle initially hidden behind it.
 
     One view. The unknown is the rotation about the vertical and, with `label`, also a texture (label², 3) on the cup's front, initially
@@ -158,11 +147,7 @@ class Mug:
     25 degrees or more (σ) overcomes both.
     """
 
-    resolution: int = fields.resolution(48)
-    reference_spp: int = fields.reference_spp(1024)
-    max_depth: int = fields.max_depth(2, at_least=2)
     label: int = fields.integer(0, "texels along a side of an unknown label on the cup, 0 for no label", at_least=0)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the cup, 1 high, on a table y = 0 around the y axis, with the camera and the higher sun in front of it."""
@@ -269,17 +254,12 @@ _ONE = (_Square((0.85, 0.5, 0.1), (0.7, 0.6), (-0.9, -0.7)),)
 
 @register(name="box2", position=15)
 @dataclass(frozen=True)
-class Box2:
+class Box2(fields.Rendered):
     """The position of a square: two numbers, initially without overlap with the true position.
 
     One view. The unknowns are x and y of the square's translation, bounded to the image. A plateau: until the square overlaps its true
     position, the loss changes only at pixels that the square's edges share.
     """
-
-    resolution: int = fields.resolution(48)
-    reference_spp: int = fields.reference_spp(1024)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         return _scene(_ONE, 0.2, self.resolution)
@@ -291,17 +271,12 @@ class Box2:
 
 @register(name="box10", position=16)
 @dataclass(frozen=True)
-class Box10:
+class Box10(fields.Rendered):
     """The positions of five squares: ten numbers, initially without overlap with the true positions.
 
     One view. The unknowns are x and y of each square's translation, bounded to the image. Every coordinate has a plateau, and squares can
     occlude each other.
     """
-
-    resolution: int = fields.resolution(48)
-    reference_spp: int = fields.reference_spp(1024)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         return _scene(_FIVE, 0.18, self.resolution)

@@ -6,20 +6,19 @@ not be formed. Path gradients, whose cost does not depend on the number of texel
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from unrender.core.registry import register
 from unrender.gallery import fields, parts, textures
-from unrender.losses import L2, Loss
 from unrender.scene.parameter import Parameter
 
 
 @register(name="poster", position=20)
 @dataclass(frozen=True)
-class Poster:
+class Poster(fields.Rendered):
     """The grey texture of a poster in direct light.
 
     One view. One unknown, the reflectance (texture_resolution², 1), initially constant: 1024 numbers by default. The loss is a convex
@@ -29,9 +28,6 @@ class Poster:
 
     resolution: int = fields.resolution(64)
     texture_resolution: int = fields.texture_resolution(32)
-    reference_spp: int = fields.reference_spp(1024)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the poster, x and y in [-1, 1] at z = 0, filling the image, with the lamp before it, above the field of view."""

@@ -1,4 +1,4 @@
-"""Problems `lamp`, `ajar` and `plain-and-textured`: paint in rooms with a lamp.
+"""Problems `lamp`, `ajar`, `plain-and-textured`, `indirect-room` and `wall`: paint in rooms with a lamp.
 
 In `lamp`, light and albedo multiply: a mural of half the albedo under a lamp of twice the radiance looks the same. They are distinguished
 by the bulb, which the camera sees, and by the plaster and the floor, whose albedos are known. `ajar` is after Balint et al. 2023, Fig. 6,
@@ -6,10 +6,16 @@ and Veach's scene on which it is based. Nearly every emitter sample is occluded 
 a bounce in the corridor, and few samples see it. `plain-and-textured` is the case for several resolutions in adaptive pixel sampling
 (Fig. 5 of its paper). All pixels of the bin depend on the same three numbers, whereas the pixels of the cushion depend on different ones.
 Judged individually, both seem to deserve as many samples, although the bin needs almost none.
+
+The lamp of `indirect-room` stands on the floor and points up, in a shade that is black inside. Only the ceiling sees it. From anywhere
+else no emitter can be sampled, and with few samples per pixel the image is mostly noise. With the L1 loss this noise also biases the
+gradient of a plain loop. `wall` is the simplest texture problem with noise. Sixteen pixels show every texel, and the best step of each is
+nearly known from the image alone. Without noise, a few steps of the right length would suffice.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,9 +24,65 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.core.rotations import rotation
 from unrender.gallery import fields, meshes, parts, textures
-from unrender.losses import L2, Loss, RelativeL2
+from unrender.losses import L1, Loss, RelativeL2
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
+
+
+@register(name="indirect-room", position=1)
+@dataclass(frozen=True)
+class IndirectRoom(fields.Rendered):
+    """A photograph on the back wall of a room that is lit only by light bounced off its ceiling.
+
+    One view. One unknown, the wall's reflectance (texture_resolution², 3), initially grey, with LargeSteps.
+    """
+
+    resolution: int = fields.resolution(128)
+    texture_resolution: int = fields.texture_resolution(64)
+    reference_spp: int = fields.reference_spp(1536)
+    max_depth: int = fields.max_depth(6, at_least=3)
+    loss: Loss = field(default=L1(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the room: x and y in [-1, 1], z in [-1, 2.2], with the camera inside, looking along -z."""
+        picture = textures.bitmap(textures.photograph("astronaut", self.texture_resolution))
+        room = parts.room(parts.diffuse(0.75), parts.diffuse(0.6, 0.08, 0.06), parts.diffuse(0.12, 0.42, 0.1))
+        return {
+            "type": "scene",
+            "camera": parts.camera((0, 0, 2.1), (0, 0, -1), 40.0, self.resolution),
+            **room,
+            "back": parts.rectangle((0, 0, -1), (1, 0, 0), (0, 1, 0), {"type": "diffuse", "reflectance": picture}),
+            **parts.uplight((0.0, -0.999, 0.5), (40e3, 36e3, 30e3)),
+        }
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the wall's texture, initially grey, with LargeSteps as in the paper's reconstruction (Fig. 9)."""
+        return (Parameter("back.bsdf.reflectance.data", initial=0.5, preconditioner=LargeSteps(2.0)),)
+
+
+@register(name="wall", position=26)
+@dataclass(frozen=True)
+class Wall(fields.Rendered):
+    """A photograph of few texels on a wall that fills the image, lit only by indirect light.
+
+    One view. One unknown, the wall's reflectance (texture_resolution², 3), initially grey. The room is that of `indirect-room`.
+    """
+
+    resolution: int = fields.resolution(80)
+    texture_resolution: int = fields.texture_resolution(20)
+    reference_spp: int = fields.reference_spp(3072)
+    max_depth: int = fields.max_depth(6, at_least=3)
+    loss: Loss = field(default=L1(), metadata=fields.LOSS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the room, with a camera whose image ends at the edges of the wall, 3.1 away and 2 wide."""
+        room = IndirectRoom(texture_resolution=self.texture_resolution).scene()
+        fov = math.degrees(2 * math.atan(1 / 3.1))
+        return {**room, "camera": parts.camera((0, 0, 2.1), (0, 0, -1), fov, self.resolution)}
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter("back.bsdf.reflectance.data", initial=0.5),)
+
 
 _BULB = np.array([0.86, 1.68, -0.25])
 """Centre of the bulb."""
@@ -28,7 +90,7 @@ _BULB = np.array([0.86, 1.68, -0.25])
 
 @register(name="lamp", position=4)
 @dataclass(frozen=True)
-class Lamp:
+class Lamp(fields.Rendered):
     """The radiance of a hanging lamp together with the mural that it lights.
 
     One view. Two unknowns: the lamp's colour (3,), initially dim white, and the mural (texture_resolution², 3), initially grey.
@@ -88,7 +150,7 @@ _LEAVES = 7
 
 @register(name="ajar", position=6)
 @dataclass(frozen=True)
-class Ajar:
+class Ajar(fields.Rendered):
     """The paint of a wall and the textures of a potted plant, in a room lit through a door ajar.
 
     One view. Three unknown reflectances of texture_resolution² texels, initially grey, with LargeSteps.
@@ -199,7 +261,7 @@ def _leaf(resolution: int) -> dict[str, Any]:
 
 @register(name="plain-and-textured", position=10)
 @dataclass(frozen=True)
-class PlainAndTextured:
+class PlainAndTextured(fields.Rendered):
     """The colour of a bin together with the texture of a cushion, in a room.
 
     One view. Two unknown reflectances, (3,) and (texture_resolution², 3), initially grey, the texture with LargeSteps.
@@ -209,7 +271,6 @@ class PlainAndTextured:
     texture_resolution: int = fields.texture_resolution(32)
     reference_spp: int = fields.reference_spp(512)
     max_depth: int = fields.max_depth(5, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the room of `parts.room` with a lamp in its ceiling, and bin and cushion on its floor y = -1."""

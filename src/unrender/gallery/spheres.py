@@ -7,7 +7,7 @@ body is unknown, too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,6 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.gallery.specification import reconstruction
-from unrender.losses import L2, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.rendering.picture_format import AOVS
 from unrender.scene.parameter import Parameter
@@ -27,7 +26,7 @@ _RADIUS = 0.7
 
 @register(name="sphere-to-mesh", position=21)
 @dataclass(frozen=True)
-class SphereToMesh:
+class SphereToMesh(fields.Rendered):
     """The shape of a body seen from all sides, by moving every vertex of a sphere.
 
     Several views. The unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2, initially a sphere at the body's
@@ -35,15 +34,12 @@ class SphereToMesh:
     shape is in its silhouettes and shadows, and that only large steps (`strength`) keep the mesh smooth.
     """
 
-    resolution: int = fields.resolution(48)
     views: int = fields.integer(6, "cameras around the body, alternately lower and higher", at_least=1, at_most=32)
     subdivisions: int = fields.integer(3, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=6)
     mesh: str = meshes.option("PLY or OBJ file of the body, in place of the one made by code")
     reference_spp: int = fields.reference_spp(512)
-    max_depth: int = fields.max_depth(2, at_least=2)
     strength: int = fields.integer(0, "λ of large steps (LargeSteps) on the mesh, 0 for none; 19 is usual", at_least=0)
     pictures: str = fields.choice("colour", f"what the images contain: colour, {', '.join(AOVS)}", ("colour", *AOVS))
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the sphere floating over a floor, under a sun, with cameras that look down, so that the floor shows its dark side's
@@ -106,7 +102,7 @@ _BLEND = 0.02
 
 @register(name="sphere-to-bunny", position=28)
 @dataclass(frozen=True)
-class SphereToBunny:
+class SphereToBunny(fields.Rendered):
     """The shape of a sitting hare with two long ears, from images from all sides, by moving every vertex of a sphere.
 
     Several views. The unknown is the sphere's vertex positions, (3 V,) with V = 10 · 4^subdivisions + 2. The light is known: a sky and a
@@ -122,8 +118,6 @@ class SphereToBunny:
         0, "step before which the mesh gets even triangles of half the edge (unrender[remesh]); 0 for never", at_least=0
     )
     reference_spp: int = fields.reference_spp(256)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the sphere under the sky and the sun."""
@@ -166,7 +160,7 @@ _WALL = 3.4
 
 @register(name="shadow-art", position=29)
 @dataclass(frozen=True)
-class ShadowArt:
+class ShadowArt(fields.Rendered):
     """A body whose shadows are a heart on one wall and a fir tree on the other, by moving every vertex of a sphere.
 
     Two views, each of a wall with the shadow of one sun. The unknown is the sphere's vertex positions, (3 V,) with V = 10 ·
@@ -177,8 +171,6 @@ class ShadowArt:
     resolution: int = fields.resolution(64)
     subdivisions: int = fields.integer(4, "s: the sphere has 10 · 4^s + 2 vertices", at_least=1, at_most=7)
     reference_spp: int = fields.reference_spp(256)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the sphere between two suns and two walls."""
@@ -199,10 +191,7 @@ class ShadowArt:
         return reconstruction(name, self)
 
     def _stage(self) -> dict[str, Any]:
-        """Return suns, walls and cameras.
-
-        Each camera is between the body and a wall, and faces the wall; each sun lights one wall only.
-        """
+        """Return suns, walls and cameras. Each camera is between the body and a wall, and faces the wall; each sun lights one wall only."""
         wall, half = parts.diffuse(0.7, 0.65, 0.55), 1.7
         return {
             "type": "scene",
@@ -250,7 +239,7 @@ _PROFILE = (
 
 @register(name="statue", position=30)
 @dataclass(frozen=True)
-class Statue:
+class Statue(fields.Rendered):
     """The shape of a bust together with the pattern of its stone, from images from all sides, starting with a grey sphere.
 
     Several views. The unknowns are the sphere's vertex positions, (3 V,), and the reflectance of its texture, (H, 2 H, 3). The light is
@@ -265,8 +254,6 @@ class Statue:
         4, "s: the sphere has 10 · 4^s + 2 vertices, without those doubled at its seam", at_least=1, at_most=7
     )
     reference_spp: int = fields.reference_spp(256)
-    max_depth: int = fields.max_depth(2, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the grey sphere under the sky and the sun."""

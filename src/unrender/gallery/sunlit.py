@@ -22,7 +22,7 @@ from unrender.core.registry import register
 from unrender.core.rotations import MITSUBA_TO_OPENGL
 from unrender.gallery import fields, meshes, parts, textures
 from unrender.io import files
-from unrender.losses import L1, L2, Loss
+from unrender.losses import L1, Loss
 from unrender.preconditioners import LargeSteps
 from unrender.scene.parameter import Parameter
 
@@ -33,7 +33,7 @@ _SUN_RADIUS = np.radians(2.5)
 
 @register(name="sunlit-vase", position=3)
 @dataclass(frozen=True)
-class SunlitVase:
+class SunlitVase(fields.Rendered):
     """The painted glaze of a vase under a sky with a small bright sun, seen from all sides.
 
     Several views. One unknown, the base colour (texture_resolution², 3), initially grey.
@@ -64,11 +64,12 @@ class SunlitVase:
 
 def vase(texture_resolution: int) -> dict[str, Any]:
     """Return the vase with its true glaze."""
-    return meshes.sheet("vase", _vase_points(96, 96), _glaze(texture_resolution), closed=True)
+    paint = textures.bitmap(_painting(texture_resolution))
+    glaze = parts.twosided({"type": "principled", "base_color": paint, "roughness": 0.35, "specular": 0.5})
+    return meshes.sheet("vase", _vase_points(96, 96), glaze, closed=True)
 
 
 def _sky() -> np.ndarray:
-    """Return the sky with its sun, see `parts.picture`."""
     return parts.picture(SUN, _SUN_RADIUS, (620.0, 560.0, 460.0))
 
 
@@ -92,11 +93,6 @@ def _vase_points(rows: int, columns: int) -> np.ndarray:
 
     radius = PchipInterpolator(*knots.T)(height)
     return meshes.lathe(radius, 1.7 * height, columns)
-
-
-def _glaze(resolution: int) -> dict[str, Any]:
-    paint = textures.bitmap(_painting(resolution))
-    return parts.twosided({"type": "principled", "base_color": paint, "roughness": 0.35, "specular": 0.5})
 
 
 def _painting(resolution: int) -> np.ndarray:
@@ -159,7 +155,8 @@ def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int =
     out = Path(folder)
     files.check_replaceable(out, (), "transforms.json", False, f"photographs: {out}", "photographs")
     variant.ensure()
-    scene = mi.load_dict({"type": "scene", "sky": parts.environment(_photographed_sky()), "vase": vase(_TEXELS)})
+    sky = parts.environment(parts.picture(SUN, 0.3, (14.0, 12.5, 10.5)))  # a veiled sun, for soft shadows
+    scene = mi.load_dict({"type": "scene", "sky": sky, "vase": vase(_TEXELS)})
     path = mi.load_dict({"type": "path", "max_depth": _MAX_DEPTH, "hide_emitters": True})
     pictures, frames = [], []
     for index in range(views):
@@ -188,17 +185,12 @@ def photographs(folder: str | Path, views: int = 24, size: int = 128, spp: int =
     return out
 
 
-def _photographed_sky() -> np.ndarray:
-    """Return a sky with a veiled sun, for soft shadows."""
-    return parts.picture(SUN, 0.3, (14.0, 12.5, 10.5))
-
-
 _DOLL_SUN = parts.unit([0.5, 0.55, 0.67])
 
 
 @register(name="sun-glossy", position=9)
 @dataclass(frozen=True)
-class SunGlossy:
+class SunGlossy(fields.Rendered):
     """The painted albedo of a glossy doll under a sky with a small bright sun, seen from all sides.
 
     Several views. One unknown, the diffuse reflectance (texture_resolution², 3) of a rough plastic, initially grey, with LargeSteps.
@@ -210,7 +202,6 @@ class SunGlossy:
     views: int = fields.integer(4, "cameras, at equal angles around the doll", at_least=1, at_most=32)
     reference_spp: int = fields.reference_spp(512)
     max_depth: int = fields.max_depth(4, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
 
     def scene(self) -> dict[str, Any]:
         """Return the doll, 1.7 high, on the ground y = 0 around the y axis, facing +z."""

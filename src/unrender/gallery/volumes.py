@@ -18,7 +18,7 @@ import numpy as np
 from unrender.core.registry import register
 from unrender.gallery import fields, parts, textures
 from unrender.gallery.specification import reconstruction
-from unrender.losses import L1, L2, Loss
+from unrender.losses import L1, Loss
 from unrender.scene.parameter import Parameter
 from unrender.scene.problem import Problem
 
@@ -45,7 +45,6 @@ def around(views: int, resolution: int, distance: float = 4.2, fov: float = 36.0
     Args:
         views: number of cameras.
         resolution: pixels along a side.
-        distance: distance from the origin.
         fov: full angle in degrees.
     """
     angles = np.pi / 6 + 2 * np.pi * np.arange(views) / views
@@ -85,7 +84,7 @@ def noise(resolution: int, octaves: int, seed: int) -> np.ndarray:
 
 @register(name="smoke", position=24)
 @dataclass(frozen=True)
-class Smoke:
+class Smoke(fields.Rendered):
     """Density and colour of a cloud of smoke under a bright sky, seen from all sides.
 
     Several views. The unknowns are extinction (grid_resolution³, 1) and albedo (grid_resolution³, 3), initially a thin grey fog.
@@ -123,8 +122,7 @@ class Smoke:
 
 
 def _smoke(resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return extinction (Z, Y, X, 1), from 0 to about 6, and albedo (Z, Y, X, 3): a rising and spreading plume, ochre below, blue
-    above."""
+    """Return extinction (Z, Y, X, 1), from 0 to about 6, and albedo (Z, Y, X, 3): a rising and spreading plume, ochre below, blue above."""
     x, y, z = positions(resolution)
     lean = 0.25 * np.sin(2 * y)
     radius = np.hypot(x - lean, z) / (0.55 + 0.25 * y)
@@ -148,7 +146,7 @@ def _sky() -> np.ndarray:
 
 @register(name="nerf-volume", position=25)
 @dataclass(frozen=True)
-class NerfVolume:
+class NerfVolume(fields.Rendered):
     """A toy of coloured balls and blocks, seen from all sides, fitted by a volume that emits and absorbs.
 
     Several views. The unknowns are extinction (grid_resolution³, 1) and emitted radiance (grid_resolution³, 3), initially a thin grey
@@ -160,7 +158,6 @@ class NerfVolume:
     views: int = fields.integer(16, "cameras, at equal angles around the toy", at_least=1, at_most=64)
     reference_spp: int = fields.reference_spp(256)
     max_depth: int = fields.max_depth(4, at_least=2)
-    loss: Loss = field(default=L2(), metadata=fields.LOSS)
     balls: int = fields.integer(
         0, "number of small coloured balls in place of the toy, a sparse volume; 0 for the toy", 0, 512
     )
@@ -222,15 +219,13 @@ def _balls(count: int) -> dict[str, Any]:
 
 @register(name="three-bodies", position=22)
 @dataclass(frozen=True)
-class ThreeBodies:
+class ThreeBodies(fields.Rendered):
     """Albedo, roughness and extinction of three balls: of paint, of metal and of fog.
 
     One view. The unknowns are a reflectance (3,), a roughness α () and an extinction (3,). The scene multiplies the extinction by 4, to
     inverse units of length.
     """
 
-    resolution: int = fields.resolution(48)
-    reference_spp: int = fields.reference_spp(1024)
     max_depth: int = fields.max_depth(6, at_least=2)
     loss: Loss = field(default=L1(), metadata=fields.LOSS)
 
@@ -273,7 +268,7 @@ def _ball(x: float, bsdf: dict[str, Any]) -> dict[str, Any]:
 
 @register(name="tea", position=23)
 @dataclass(frozen=True)
-class Tea:
+class Tea(fields.Rendered):
     """Extinction and albedo of the tea in a glass ball, in a room lit only by light bounced off its ceiling.
 
     One view. Two unknowns (3,). The scene multiplies the extinction by 10, to inverse units of length.
