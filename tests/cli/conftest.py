@@ -46,6 +46,10 @@ class Answer:
     out: str
     error: str
 
+    def refuses(self, words: str) -> bool:
+        """Whether the input was refused in one line with these words."""
+        return self.status == 2 and words in self.error and self.error.count("\n") == 1
+
 
 Unrender = Callable[..., Answer]
 

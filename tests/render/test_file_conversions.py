@@ -16,7 +16,7 @@ from unrender import methods
 from unrender.core import periodic
 from unrender.core.errors import InputError
 from unrender.io import parameter_values, volumes
-from unrender.io.file_conversion import FileConversion
+from unrender.io.parameter_values import FileConversion
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 
 HEIGHT, WIDTH = 4, 6

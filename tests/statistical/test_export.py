@@ -95,8 +95,7 @@ def test_the_numbers_of_a_homogeneous_medium(tmp_path: Path) -> None:
     parameters = elsewhere(problem)
     done = ur.app.export((problem, parameters), tmp_path / "out")
     assert done.scene is not None
-    verdict, figures = agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
-    assert verdict, figures
+    assert agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
 
 
 @pytest.mark.parametrize("name", quick(RENDERED, "mug"))
@@ -105,8 +104,7 @@ def test_plain_mitsuba_renders_the_runs_picture(name: str, tmp_path: Path) -> No
     parameters = elsewhere(problem)
     done = ur.app.export((problem, parameters), tmp_path / "scene")
     view = len(problem.views) - 1
-    verdict, figures = agree(ours(problem, parameters, view), theirs(done.scene, problem.views[view].sensor), size=2)
-    assert verdict, figures
+    assert agree(ours(problem, parameters, view), theirs(done.scene, problem.views[view].sensor), size=2)
     assert not done.notices
 
 
@@ -119,8 +117,7 @@ def test_a_wrong_texture_is_seen(tmp_path: Path) -> None:
     pixels = np.array(mi.Bitmap(str(texture)))
     pixels[:4, :4] *= 1.2
     mi.Bitmap(pixels).write(str(texture))
-    verdict, figures = agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
-    assert not verdict, figures
+    assert not agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
 
 
 @pytest.mark.slow
@@ -146,8 +143,7 @@ def test_the_tutorials_cornell_box(assets: Path, tmp_path: Path) -> None:
         problem = ur.Problem(path, [ur.Parameter(key) for key in keys], black, max_depth=4)
         parameters = elsewhere(problem, 0.1)
         done = ur.app.export((problem, parameters), tmp_path / f"exported-{number}")
-        verdict, figures = agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
-        assert verdict, figures
+        assert agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
         assert not done.notices
 
 
@@ -212,8 +208,7 @@ def still() -> tuple[Problem, dict[str, np.ndarray]]:
 def test_ready_made_objects_and_parameters_of_every_kind(still: Any, tmp_path: Path) -> None:
     problem, parameters = still
     done = ur.app.export(still, tmp_path / "scene")
-    verdict, figures = agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
-    assert verdict, figures
+    assert agree(ours(problem, parameters, 0), theirs(done.scene, 0), size=2)
 
 
 @pytest.mark.slow

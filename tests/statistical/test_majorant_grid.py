@@ -13,7 +13,7 @@ import pytest
 from fog import DEPTH, SIZE, fog, media_keys, scene, voxels
 from test_volume_gradients import limit, own, scores
 from test_volume_pair import changed, runs, volpath
-from zscores import agree
+from zscores import agree, check_pair
 
 from unrender.rendering.mitsuba.integrators import majorant_supergrid
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -52,16 +52,12 @@ def test_images_agree_with_volpath_and_majorants_that_are_too_low_are_seen(monke
     renderer = MitsubaRenderer(several(), DEPTH)
     assert renderer.pair.majorants(previous=False, both=False)
     expected = volpath(renderer)
-    verdict, figures = agree(
-        runs(renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected
-    )
-    assert verdict, figures
+    assert agree(runs(renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected)
     monkeypatch.setattr(majorant_supergrid, "_MARGIN", 0.5)
     wrong = MitsubaRenderer(several(), DEPTH)
-    verdict, figures = agree(
-        runs(wrong.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected
+    assert not agree(runs(wrong.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS)).images), expected), (
+        "majorants of half the extinction went unseen"
     )
-    assert not verdict, f"majorants of half the extinction went unseen: {figures}"
 
 
 @pytest.mark.slow
@@ -70,13 +66,7 @@ def test_both_images_of_a_pair_agree_with_separate_renders() -> None:
     keys = media_keys(renderer)
     session = renderer.prepare(keys, "path")
     current, previous = changed(renderer, keys)
-    pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
-    for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
-        verdict, figures = agree(runs(images), runs(alone.images))
-        assert verdict, figures
-        verdict, figures = agree(1.03 * runs(images), runs(alone.images))
-        assert not verdict, f"a bias of 3 % went unseen: {figures}"
+    check_pair(session, current, previous, RUNS, SPP, fault=1.03)
 
 
 @pytest.mark.slow
@@ -88,12 +78,7 @@ def test_a_cell_that_is_empty_in_one_state_only_is_lost_in_neither() -> None:
     half = np.arange(VOXELS) < VOXELS // 2
     states = [{key: renderer.array(full * half[:, None, None, None])}, {key: renderer.array(full)}]
     for current, previous in (states, states[::-1]):
-        pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
-        for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-            verdict, figures = agree(
-                runs(images), runs(session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS)).images)
-            )
-            assert verdict, figures
+        check_pair(session, current, previous, RUNS, SPP)
 
 
 @pytest.mark.slow

@@ -69,14 +69,12 @@ def test_both_images_agree_with_separate_renders_and_a_planted_fault_is_seen(mon
     # The current paths are those of `prb`, so that its adjoint replays them.
     np.testing.assert_array_equal(now, alone(of, SCALE, 0.4, previous=False, seed=1))
     apart = alone(of, SCALE, 0.4, previous=True, seed=2)
-    verdict, figures = agree(before, apart, size=4)
-    assert verdict, figures
+    assert agree(before, apart, size=4)
     blind = MitsubaRenderer(room, DEPTH, [SCALE])
     session = blind.prepare([SCALE], "path")
     monkeypatch.setattr(session, "_moved_kernel", MovedPair(DEPTH, areas=False))
     _, wrong = pair(blind, SCALE, 0.4, "path", RUNS, SPP)
-    verdict, figures = agree(wrong, apart, size=4)
-    assert not verdict, f"areas left out of the density went unseen: {figures}"
+    assert not agree(wrong, apart, size=4), "areas left out of the density went unseen"
 
 
 def test_other_materials_agree() -> None:
@@ -89,8 +87,7 @@ def test_other_materials_agree() -> None:
     walls = {name: {**room()[name], "bsdf": bsdf} for name, bsdf in kinds.items()}
     of = MitsubaRenderer(lambda: room(**walls), DEPTH, [VERTICES])
     _, before = pair(of, VERTICES, 0.1, "path", RUNS, SPP)
-    verdict, figures = agree(before, alone(of, VERTICES, 0.1, previous=True, seed=2), size=4)
-    assert verdict, figures
+    assert agree(before, alone(of, VERTICES, 0.1, previous=True, seed=2), size=4)
 
 
 def crowded(tracer: MovedPair, sky: bool = False) -> tuple[Any, Any, Any]:
@@ -131,13 +128,11 @@ def test_moving_shadows_agree_and_bounds_that_miss_what_moves_are_seen(monkeypat
     session, now, before = crowded(MovedPair(DEPTH))
     request, other = SampleRequest(0, RUNS * SPP, 1, RUNS), SampleRequest(0, RUNS * SPP, 2, RUNS)
     apart = np.array(session.image(before, other).images, float)
-    verdict, figures = agree(np.array(session.image_pair(now, before, request, "path").previous, float), apart, size=4)
-    assert verdict, figures
+    assert agree(np.array(session.image_pair(now, before, request, "path").previous, float), apart, size=4)
     monkeypatch.setattr(BoundingEllipsoids, "meet", lambda self, ray, t: t < 0)
     session._moved_kernel = MovedPair(DEPTH)
     wrong = np.array(session.image_pair(now, before, request, "path").previous, float)
-    verdict, figures = agree(wrong, apart, size=4)
-    assert not verdict, f"rays that what moves is in the way of went unseen: {figures}"
+    assert not agree(wrong, apart, size=4), "rays that what moves is in the way of went unseen"
 
 
 def test_segments_that_meet_what_is_bounded_meet_its_ellipsoid() -> None:

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from scipy import stats
-from zscores import agree, z_scores
+from zscores import Agreement, agree, z_scores
 
 import unrender as ur
 from tiers import quick
@@ -158,7 +158,7 @@ def corner() -> dict[str, Any]:
     }
 
 
-def gradients_agree() -> tuple[bool, str]:
+def gradients_agree() -> Agreement:
     """Return whether path gradients of the tint are the slope of the L2 loss, whose pictures are Mitsuba's."""
     start, width, path = np.array([0.6, 0.3, 0.2]), 0.05, mi.load_dict({"type": "path", "max_depth": 3})
     loaded = mi.load_dict(corner())
@@ -185,19 +185,17 @@ def gradients_agree() -> tuple[bool, str]:
     estimate = partial(estimator.estimate, problem, point, estimator.init(problem, point))
     found = np.stack([as_numpy(estimate(ur.Key(seed))[0]).gradient[TINT] for seed in range(16)])
     z = z_scores(found.astype(np.float64), expected)
-    return bool(np.abs(z).max() < stats.norm.isf((1 - (1 - LEVEL) ** (1 / 3)) / 2)), f"{z}"
+    return Agreement(bool(np.abs(z).max() < stats.norm.isf((1 - (1 - LEVEL) ** (1 / 3)) / 2)), f"{z}")
 
 
 def test_probabilities_of_lobes_that_depend_on_the_unknown_do_not_bias_the_gradient() -> None:
     register_adaptive()
-    agreed, figures = gradients_agree()
-    assert agreed, figures
+    assert gradients_agree()
 
 
 def test_a_density_that_is_not_the_sampled_one_is_seen() -> None:
     register_adaptive(consistent=False)
-    agreed, figures = gradients_agree()
-    assert not agreed, figures
+    assert not gradients_agree()
 
 
 def test_both_states_of_a_pair_are_right_though_one_chooses_the_lobes() -> None:
@@ -210,5 +208,4 @@ def test_both_states_of_a_pair_are_right_though_one_chooses_the_lobes() -> None:
     pairs = [ur.render_pair(problem, now, before, spp=256, seed=seed) for seed in range(12)]
     for state, values in enumerate((now, before)):
         own = [ur.render(problem, values, spp=256, seed=100 + seed) for seed in range(12)]
-        agreed, figures = agree(np.stack([pair[state] for pair in pairs]), np.stack(own), size=2)
-        assert agreed, figures
+        assert agree(np.stack([pair[state] for pair in pairs]), np.stack(own), size=2)

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from fog import DEPTH, SCENES, cloud, media_keys, scene, two_media
-from zscores import agree
+from zscores import agree, check_pair
 
 from tiers import quick
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
@@ -45,8 +45,7 @@ def changed(renderer: MitsubaRenderer, keys: list[str]) -> tuple[dict[str, Any],
 def test_the_kernel_agrees_with_volpath(name: str) -> None:
     renderer = MitsubaRenderer(SCENES[name](), DEPTH)
     ours = renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS))
-    verdict, figures = agree(runs(ours.images), volpath(renderer))
-    assert verdict, figures
+    assert agree(runs(ours.images), volpath(renderer))
 
 
 @pytest.mark.parametrize("depth", quick([1, 2, 12], 2))
@@ -54,8 +53,7 @@ def test_paths_are_as_long_as_volpath_s(depth: int) -> None:
     """Roulette included: at 12 it has ended most paths."""
     renderer = MitsubaRenderer(two_media(), depth)
     ours = renderer.prepare([], None).image({}, SampleRequest(0, RUNS * SPP, 1, RUNS))
-    verdict, figures = agree(runs(ours.images), volpath(renderer, depth))
-    assert verdict, figures
+    assert agree(runs(ours.images), volpath(renderer, depth))
 
 
 @pytest.mark.parametrize("name", quick(SCENES, "cloud, all lights"))
@@ -64,13 +62,7 @@ def test_both_images_of_the_pair_agree_with_separate_renders(name: str) -> None:
     keys = [*media_keys(renderer), "floor.bsdf.reflectance.value"]
     session = renderer.prepare(keys, "path")
     current, previous = changed(renderer, keys)
-    pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
-    for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-        alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
-        verdict, figures = agree(runs(images), runs(alone.images))
-        assert verdict, figures
-        verdict, figures = agree(1.03 * runs(images), runs(alone.images))
-        assert not verdict, f"a bias of 3 % went unseen: {figures}"
+    check_pair(session, current, previous, RUNS, SPP, fault=1.03)
 
 
 @pytest.mark.parametrize("ending", ["sigma_t.data", "albedo.data"])
@@ -83,11 +75,7 @@ def test_what_is_empty_or_black_now_but_was_not_before_is_not_lost(ending: str) 
     full = renderer.values([key])
     none = {key: full[key] * 0.0}
     for current, previous in ((none, full), (full, none)):
-        pair = session.image_pair(current, previous, SampleRequest(0, RUNS * SPP, 1, RUNS), "path")
-        for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
-            alone = session.image(state, SampleRequest(0, RUNS * SPP, seed, RUNS))
-            verdict, figures = agree(runs(images), runs(alone.images))
-            assert verdict, figures
+        check_pair(session, current, previous, RUNS, SPP)
 
 
 def test_the_difference_of_a_pair_is_far_less_noisy_than_that_of_two_renders() -> None:

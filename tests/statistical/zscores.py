@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from scipy import stats
+
+from unrender.rendering.renderer import SampleRequest
 
 
 def blocks(images: np.ndarray, size: int) -> np.ndarray:
@@ -25,11 +30,29 @@ def z_scores(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.sign(t) * stats.norm.isf(stats.t.sf(np.abs(t), freedom).clip(1e-300))
 
 
-def agree(a: np.ndarray, b: np.ndarray, size: int = 8, level: float = 1e-3) -> tuple[bool, str]:
-    """Whether two sets (runs, H, W, 3) of independent images agree: as a whole and per block, at `level` after Šidák.
+@dataclass(frozen=True)
+class Agreement:
+    """A verdict, which is its truth value, and the figures that a failed assertion shows."""
 
-    Returns the verdict and the figures, for the assertion's message.
-    """
+    verdict: bool
+    figures: str
+
+    def __bool__(self) -> bool:
+        return self.verdict
+
+
+def check_pair(session: Any, current: Any, previous: Any, runs: int, spp: int, fault: float | None = None) -> None:
+    """Both images of a pair on shared paths agree with separate ones; times `fault` they do not."""
+    pair = session.image_pair(current, previous, SampleRequest(0, runs * spp, 1, runs), "path")
+    for state, images, seed in ((current, pair.images, 2), (previous, pair.previous, 3)):
+        alone = session.image(state, SampleRequest(0, runs * spp, seed, runs)).images
+        both, single = (np.stack([np.array(image, np.float64) for image in of]) for of in (images, alone))
+        assert agree(both, single)
+        assert fault is None or not agree(fault * both, single), f"a factor of {fault} went unseen"
+
+
+def agree(a: np.ndarray, b: np.ndarray, size: int = 8, level: float = 1e-3) -> Agreement:
+    """Whether two sets (runs, H, W, 3) of independent images agree: as a whole and per block, at `level` after Šidák."""
     worst, count = 0.0, 0
     whole = np.abs(z_scores(a.mean(axis=(1, 2, 3))[:, None], b.mean(axis=(1, 2, 3))[:, None])).max()
     parts = np.abs(z_scores(blocks(a, size), blocks(b, size)))
@@ -37,4 +60,4 @@ def agree(a: np.ndarray, b: np.ndarray, size: int = 8, level: float = 1e-3) -> t
     limit_parts = stats.norm.isf((1 - (1 - level) ** (1 / count)) / 2)
     limit_whole = stats.norm.isf(level / 2)
     figures = f"whole |z| {whole:.2f} (limit {limit_whole:.2f}), worst of {count} blocks {worst:.2f} (limit {limit_parts:.2f})"
-    return bool(whole < limit_whole and worst < limit_parts), figures
+    return Agreement(bool(whole < limit_whole and worst < limit_parts), figures)

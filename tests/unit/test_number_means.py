@@ -13,7 +13,7 @@ from tests.analytic import AnalyticRenderer
 from unrender.optimizers import Adam, AveragedNewton, Partitioned
 from unrender.optimizers.base import Measuring, averaged_by
 from unrender.runs import number_means, verify
-from unrender.runs.number_trace import NumberTrace
+from unrender.runs.number_means import NumberTrace
 
 TRUTH = {"gain": np.array([0.5, 0.3], np.float32)}
 SEEDS = range(12)
@@ -114,7 +114,7 @@ def test_numbers_that_the_optimizer_averages_are_left_to_it() -> None:
 
 
 def test_a_trace_of_many_steps_has_few_rows_of_equal_means(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("unrender.runs.number_trace._MOST_ROWS", 8)
+    monkeypatch.setattr("unrender.runs.number_means._MOST_ROWS", 8)
     trace = NumberTrace()
     for step in range(50):
         trace.append(np.array([step, -step], np.float64))
