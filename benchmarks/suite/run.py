@@ -96,10 +96,11 @@ def loop(
     every: int,
     setting: dict[str, Any],
     timer: Callable[[], float] = time.perf_counter,
+    integrator: Any = None,
 ) -> Points:
-    """A run of the stock loop."""
+    """A run of the stock loop, with an integrator other than `prb` if given."""
     fall: Any = ur.schedules.Cosine(1) if setting["falling"] else None
-    options = {"seed": seed, "every": every, "fall": fall, "error": error, "timer": timer}
+    options = {"seed": seed, "every": every, "fall": fall, "error": error, "timer": timer, "integrator": integrator}
     history = stock_loop(problem, setting["spp"], setting["rate"], seconds, **options)
     return [(h["seconds"], h["parameter_error"]) for h in history]
 

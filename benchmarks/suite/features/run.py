@@ -18,8 +18,7 @@ from benchmarks.internals import Lenses, Relief, dr, mi, parts, textures
 from benchmarks.races import TUNING_SEED, relative_error, search
 from benchmarks.runner.records import Record
 from benchmarks.runner.timing import work_time
-from benchmarks.stock_loop import stock_loop
-from benchmarks.suite.run import compare
+from benchmarks.suite.run import Points, compare, loop
 from benchmarks.timed_runs import timed_run
 
 MERGE = ("problems.*",)
@@ -142,15 +141,15 @@ def run(
         made = PROBLEMS[name]()
         error = relative_error(made)
         integrator = _PTRACER if name == "caustic" else None
-        given: dict[str, Any] = {"every": 2, "error": error, "timer": work_time, "integrator": integrator}
 
-        def loop(samples: int, rate: float, seed: int, made: ur.Problem = made, given: Any = given) -> Any:
-            history = stock_loop(made, samples, rate, seconds, seed=seed, **given)
-            return [(entry["seconds"], entry["parameter_error"]) for entry in history]
+        def theirs_of(
+            n: int, rate: float, seed: int, made: Any = made, error: Any = error, of: Any = integrator
+        ) -> Points:
+            return loop(made, error, seconds, seed, 2, {"spp": n, "rate": rate, "falling": False}, work_time, of)
 
-        tuned = {n: search(rates, lambda rate, n=n: loop(n, rate, TUNING_SEED)[-1][1]) for n in spp}
+        tuned = {n: search(rates, lambda rate, n=n, of=theirs_of: of(n, rate, TUNING_SEED)[-1][1]) for n in spp}
         samples = min(tuned, key=lambda n: min(one["error"] for one in tuned[n][1]))
-        theirs = [loop(samples, tuned[samples][0], seed) for seed in range(seeds)]
+        theirs = [theirs_of(samples, tuned[samples][0], seed) for seed in range(seeds)]
         kept = (timed_run(made, seconds, seed) for seed in range(seeds))
         mine = [[(at, error(values)) for at, values in one.found] for one in kept]
         found = compare(theirs, mine, seconds)
