@@ -24,12 +24,4 @@ __getattr__, _ = lazy.attach(
         "turntable": "evaluation.turntable",
     },
 )
-__all__ = [
-    "ImportOptions",
-    "distribute",
-    "export",
-    "import_capture",
-    "judge",
-    "sweep",
-    "turntable",
-]
+__all__ = ["ImportOptions", "distribute", "export", "import_capture", "judge", "sweep", "turntable"]

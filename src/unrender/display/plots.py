@@ -25,7 +25,6 @@ class Line:
     """A curve; x is ascending, and all arrays have the same length.
 
     Attributes:
-        name: name in the legend.
         x, y: points of the curve.
         low, high: limits of the band around it, or None.
         colour: index into the page's colours, from 0.
@@ -66,7 +65,6 @@ class Curve:
     """A line in the chart's coordinates.
 
     Attributes:
-        name: name in the legend.
         path, band: attribute `d` of the SVG paths of the line and of its band; "" for no band.
         colour: index into the page's colours, from 0 to 5.
     """
@@ -84,7 +82,6 @@ class Chart:
     Attributes:
         title, x_label: labels of the vertical and of the horizontal axis.
         description: text alternative.
-        curves: curves in drawing order.
         x_ticks, y_ticks: (coordinate, label).
         logarithmic: whether the vertical axis is logarithmic.
         more: number of omitted lines.
@@ -118,7 +115,6 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
         title: label of the vertical axis.
         lines: curves; values that are not finite leave a gap.
         axis: horizontal axis, "seconds" or "samples", from 0.
-        end: end of the horizontal axis.
     """
     x_label, format_value = axis_format(axis)
     shown = [line for line in lines if np.isfinite(line.y).any()]

@@ -246,7 +246,6 @@ def read_arrays(
     Sizes are checked before memory is allocated.
 
     Args:
-        path: path of the archive.
         most_bytes: largest total size of the arrays.
         check: function of each array's shape, called before memory is allocated; raises `InputError` for an unsuitable one.
         one: whether there must be exactly one array.

@@ -101,10 +101,7 @@ def member_leads_out(name: str) -> bool:
 def write_arrays(
     path: Path, arrays: Mapping[str, np.ndarray], compress: bool = True, durable: bool = True, name_too: bool = True
 ) -> Path:
-    """Write an .npz archive of float32 arrays; see `write`.
-
-    With `compress`, archives of less than `COMPRESSED_BYTES` are compressed.
-    """
+    """Write an .npz archive of float32 arrays; see `write`. With `compress`, archives of less than `COMPRESSED_BYTES` are compressed."""
     buffer = io.BytesIO()
     values = {k: np.asarray(v, np.float32) for k, v in arrays.items()}
     small = sum(value.nbytes for value in values.values()) < COMPRESSED_BYTES - _HEADERS

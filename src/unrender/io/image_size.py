@@ -224,26 +224,21 @@ def _check_scanlines(data: bytes, width: int, height: int) -> None:
                 left -= count
 
 
-def _pfm(data: bytes, _: IO[bytes]) -> Sizes:
-    match = re.match(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s", data)
-    if match is None:
-        raise ValueError("no resolution")
-    return [(int(match[2]), int(match[3]), 3 if match[1] == b"F" else 1)]
+def _netpbm(pattern: bytes, coloured: bytes) -> _Reader:
+    """Return the reader of a text header; `pattern` has its type, of which those `coloured` have three channels, width and height."""
+
+    def read(data: bytes, _: IO[bytes]) -> Sizes:
+        if (match := re.match(pattern, data)) is None:
+            raise ValueError("no resolution")
+        return [(int(match[2]), int(match[3]), 3 if match[1] in coloured else 1)]
+
+    return read
 
 
-def _ppm(data: bytes, _: IO[bytes]) -> Sizes:
-    match = re.match(rb"P6\s+(\d{1,9})\s+(\d{1,9})\s+(\d{1,5})\s", data)
-    if match is None:
-        raise ValueError("no resolution")
-    return [(int(match[1]), int(match[2]), 3)]
-
-
-def _pnm(data: bytes, _: IO[bytes]) -> Sizes:
-    """Return the size from a header that Pillow accepts: P1 to P6, with comments between the numbers."""
-    match = re.match(rb"P([1-6])(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", data)
-    if match is None:
-        raise ValueError("no resolution")
-    return [(int(match[2]), int(match[3]), 3 if match[1] in b"36" else 1)]
+_pfm = _netpbm(rb"P([Ff])\s+(\d{1,9})\s+(\d{1,9})\s", b"F")
+_ppm = _netpbm(rb"P(6)\s+(\d{1,9})\s+(\d{1,9})\s+(\d{1,5})\s", b"6")
+_pnm = _netpbm(rb"P([1-6])(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s", b"36")
+"""Readers of what Mitsuba accepts, and of what Pillow does: P1 to P6, with comments between the numbers."""
 
 
 def _webp(data: bytes, _: IO[bytes]) -> Sizes:

@@ -146,8 +146,6 @@ def resize(values: np.ndarray, height: int, width: int, around: bool = False) ->
 
     Args:
         values: the image.
-        height: height of the result.
-        width: width of the result.
         around: whether the left and right borders are neighbours, as in an environment map.
     """
     if values.shape[:2] == (height, width):

@@ -6,6 +6,7 @@ range, or with counts that differ from its data, causes a segmentation fault or 
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import struct
@@ -173,18 +174,13 @@ def _check_text(file: IO[bytes], header: _Header, vertices: int, path: Path) -> 
                 raise InputError(f"{path}: cut short: element {element.name} has fewer than {element.count} rows")
             pending += block[:left]
             if len(block) > left:
-                words = _before(block[left:], words)
+                words = itertools.chain([block[left:]], words)
             left -= min(left, len(block))
             complete = len(pending) // width * width
             if element.name == "face":
                 _check_words(pending[:complete], element, vertices, row, path)
             row += complete // width
             pending = pending[complete:]
-
-
-def _before(block: list[bytes], words: Iterator[list[bytes]]) -> Iterator[list[bytes]]:
-    yield block
-    yield from words
 
 
 def _words(file: IO[bytes]) -> Iterator[list[bytes]]:

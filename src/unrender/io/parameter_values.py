@@ -17,6 +17,8 @@ one-channel texture by its luminance, a grey one all channels.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,43 @@ import numpy as np
 from unrender.core import periodic
 from unrender.core.errors import InputError
 from unrender.io import bounded_files, images, resampling, volumes
-from unrender.io.file_conversion import MESH_FILES, PLAIN, FileConversion
+
+MESH_FILES = (".obj", ".ply", ".serialized")
+"""File name extensions of meshes."""
+
+
+@dataclass(frozen=True)
+class FileConversion:
+    """Conversion that the renderer applies to this parameter when it loads it from a file of the scene.
+
+    Attributes:
+        raw: whether 8- and 16-bit images are linear; otherwise they are sRGB.
+        half: whether the renderer stores values in half precision.
+        repeated: number of columns at each end of the second axis that repeat those of the opposite end; Mitsuba's environment maps have
+            one. The parameter has the shape (H, W + 2 `repeated`, C), and its images have (H, W).
+        vertices: function that returns the parameter's values from a mesh file as a flat float32 array; None for other parameters.
+    """
+
+    raw: bool = False
+    half: bool = False
+    repeated: int = 0
+    vertices: Callable[[Path], np.ndarray] | None = field(default=None, compare=False, repr=False)
+
+    def picture_shape(self, shape: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the shape (H, W, C) of an image that fills a parameter of this shape without scaling."""
+        return periodic.interior_shape(shape, self.repeated)
+
+    def stored(self, values: np.ndarray) -> np.ndarray:
+        """Return float32 values rounded to the renderer's precision. Values beyond the range of half precision are not changed."""
+        if not self.half:
+            return values
+        with np.errstate(over="ignore"):
+            rounded = values.astype(np.float16).astype(np.float32)
+        return np.where(np.isfinite(rounded), rounded, values)
+
+
+PLAIN = FileConversion()
+"""Conversion that stores values unchanged."""
 
 
 def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAIN) -> tuple[np.ndarray, str]:
@@ -128,7 +166,6 @@ def _from_grid(path: Path, shape: tuple[int, ...]) -> tuple[np.ndarray, str]:
 
 
 def _check_shape(array_shape: tuple[int, ...], shape: tuple[int, ...], conversion: FileConversion) -> None:
-    """Raise `InputError` if an array of this shape cannot fill the parameter; called before the array is read."""
     number, colour = array_shape in ((), (1,)), len(array_shape) == 1 and len(shape) > 1 and array_shape[0] == shape[-1]
     same = array_shape in (shape, conversion.picture_shape(shape)) or _is_unflattened(array_shape, shape)
     if not (number or colour or same):

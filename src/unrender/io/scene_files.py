@@ -12,6 +12,7 @@ import os
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 from xml.parsers import expat
@@ -71,20 +72,15 @@ def _plain(path: Path) -> None:
         raise InputError(f"{path}: larger than {_LARGEST_ASSET >> 30} GiB")
 
 
-def _splats(path: Path) -> None:
-    mesh_files.check_ply(path, splats=True)
-
-
 _CHECKS: dict[str, Callable[[Path], int | None]] = {
     **dict.fromkeys(("bitmap", "envmap"), _picture),
     **dict.fromkeys(("gridvolume", "sdfgrid"), volumes.check_vol),
-    **dict.fromkeys(("ellipsoids", "ellipsoidsmesh"), _splats),
+    **dict.fromkeys(("ellipsoids", "ellipsoidsmesh"), partial(mesh_files.check_ply, splats=True)),
     **dict.fromkeys(("measured", "measured_polarized"), lambda path: check_tensors(path)),
     "ply": mesh_files.check_ply,
     "obj": mesh_files.check_obj,
     "spectrum": lambda path: check_spectrum(path),
 }
-
 
 _MAGIC = b"tensor_file"
 _MOST_FIELDS, _MOST_AXES = 1000, 16
@@ -168,8 +164,7 @@ class SceneFiles:
 def of(scene: Path) -> list[Path]:
     """Return the XML file, its includes, and existing textures, meshes and other files that they refer to; each once.
 
-    Raises:
-        InputError: see `read`.
+    Raises `InputError`, see `read`.
     """
     files = read(scene)
     return list(dict.fromkeys([*files.xml, *files.named]))
@@ -178,9 +173,8 @@ def of(scene: Path) -> list[Path]:
 def read(scene: Path) -> SceneFiles:
     """Follow a scene's XML and collect its files.
 
-    Raises:
-        InputError: the XML cannot be read, declares entities, is nested too deeply, has too many elements, includes a file outside of the
-            scene's folder, uses an undefined parameter, or refers to a malformed spectrum file.
+    Raises `InputError` if the XML cannot be read, declares entities, is nested too deeply, has too many elements, includes a file outside
+    of the scene's folder, uses an undefined parameter, or refers to a malformed spectrum file.
     """
     path = scene.absolute()
     reader = _Reader(path.parent.resolve())
@@ -189,8 +183,7 @@ def read(scene: Path) -> SceneFiles:
 
 
 def resolve(name: str, search: Sequence[Path]) -> Path | None:
-    """Return the first file of this name in the folders `search`, as Mitsuba does; None if there is none. Absolute names are
-    unchanged."""
+    """Return the first file of this name in the folders `search`, as Mitsuba does; None if there is none. Absolute names are unchanged."""
     path = Path(name)
     places = [path] if path.is_absolute() else [place / path for place in search]
     return next((place for place in places if os.path.exists(place)), None)

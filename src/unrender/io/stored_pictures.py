@@ -27,10 +27,8 @@ class PictureStore:
     def add(self, values: np.ndarray) -> StoredPicture:
         """Store an image (H, W, ...) of float32 without loss.
 
-        It takes half the bytes if 16-bit floats represent it, and a quarter if it has at most 256 levels from 0 to 1, as masks have.
-
-        Raises:
-            InputError: the file cannot be written, for example because the disk is full.
+        It takes half the bytes if 16-bit floats represent it, and a quarter if it has at most 256 levels from 0 to 1, as masks have. Raises
+        `InputError` if the file cannot be written, for example because the disk is full.
         """
         stored, levels = _compact(np.ascontiguousarray(values, np.float32))
         start = -(-self._end // _PAGE) * _PAGE

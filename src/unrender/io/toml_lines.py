@@ -29,7 +29,6 @@ LARGEST = 3 << 17
 _MOST_DOTS = 200, 1 << 15
 """Largest number of dots in a line and in the file: `tomllib` takes quadratic time for a key of many parts."""
 
-
 _SYNTAX = re.compile(r"""["'#\[\]{}]""")
 _KEY = re.compile(r"""(?:[^"'=#]|"(?:[^"\\]|\\.)*"|'[^']*')*=""")
 
@@ -217,7 +216,6 @@ def read(file: Path, model: type[_M], tables: Mapping[str, type[Table]]) -> tupl
 
     Args:
         file: file of at most `toml_lines.LARGEST` bytes.
-        model: model of the top level.
         tables: models of the fields that are a table or a list of tables.
 
     Raises:

@@ -21,7 +21,7 @@ from unrender.methods.rules.starts import varied_keys
 from unrender.methods.rules.traits import Traits
 from unrender.methods.smoothed import SIGMA_HELP
 from unrender.optimizers.base import Optimizer
-from unrender.optimizers.schedule_free import ScheduleFree
+from unrender.optimizers.recipes import ScheduleFree
 from unrender.scene.problem import Problem
 
 

@@ -8,8 +8,7 @@ from unrender.optimizers.cma_es import CMAES
 from unrender.optimizers.lbfgs import LBFGS
 from unrender.optimizers.newton import Newton, NewtonCG
 from unrender.optimizers.partitioned import Partitioned
-from unrender.optimizers.recipes import SGD, Adam, MetaAdam
-from unrender.optimizers.schedule_free import ScheduleFree
+from unrender.optimizers.recipes import SGD, Adam, MetaAdam, ScheduleFree
 
 __all__ = [
     "CMAES",

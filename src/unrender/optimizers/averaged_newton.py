@@ -165,7 +165,8 @@ class AveragedNewton:
         )
         added, fluctuation = (np.zeros_like(hessian) if x is None else x for x in (added, fluctuation))
         scale = coordinate_scales(estimate, state, parameters)
-        region = scale * self._reaches(parameters)
+        reaches = {key: _OF_LINEAR if key in self.linear else 1.0 for key in parameters}
+        region = scale * trees.repeat_per_element(reaches, parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()
         noise, gradient_noise = state.noise.copy(), state.gradient_noise.copy()
         shares, counts = state.shares.copy(), state.counts.copy()
@@ -175,7 +176,9 @@ class AveragedNewton:
             both = np.ix_(block, block)
             news = gradient[block] - (matrix[both] @ x[block] - target[block])
             surprise = _surprise(news, fluctuation[both] + shares[block].max() * gradient_noise[both])
-            weight = self._weight(counts[block].min() / surprise, state.lengths[block].max())
+            count, length = counts[block].min() / surprise, state.lengths[block].max()
+            weight = (1.0 + self.averaging) / (count + 1.0 + self.averaging)
+            weight = max(weight, length * length / (1.0 + length * length))
             scatter[both] *= (1.0 - weight) ** 2
             if counts[block].min() > 0.0:
                 scatter[both] += weight**2 * np.outer(news, news) / (1.0 + shares[block].max())
@@ -227,16 +230,6 @@ class AveragedNewton:
         known = state.matrix.any(axis=1)  # the others are in no model
         counts = trees.parts(np.where(known, state.counts, np.inf if known.any() else 0.0)[None], parameters)
         return {key: x[0] for key, x in split.items() if counts[key].min() >= _FEWEST_MODELS and x.all()}
-
-    def _reaches(self, parameters: Tree) -> np.ndarray:
-        """Return the factor of the trust region of each element, (n,)."""
-        factors = {key: _OF_LINEAR if key in self.linear else 1.0 for key in parameters}
-        return trees.repeat_per_element(factors, parameters)
-
-    def _weight(self, count: float, length: float) -> float:
-        """Return the weight of a model after `count` others and a step of this length."""
-        usual = (1.0 + self.averaging) / (count + 1.0 + self.averaging)
-        return max(usual, length * length / (1.0 + length * length))
 
     def _radius(self, radius: float, step: np.ndarray, gradient: np.ndarray) -> float:
         """Return the next radius of a block's trust region, from the gradient at the end of its last step.

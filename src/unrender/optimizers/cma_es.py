@@ -119,7 +119,8 @@ class CMAES:
         losses = np.asarray(evaluate(points * scale), np.float64)
         if losses.shape != (len(points),):
             raise InputError(f"CMAES: losses must have shape ({len(points)},), one per point, got {losses.shape}")
-        ranks = _ranks(losses)
+        known = np.where(np.isfinite(losses), losses, np.inf)
+        ranks = np.unique(known, return_inverse=True)[1].astype(np.int32)  # equal losses have equal ranks
         search.update(ranks)
         state = replace(state, ranks=np.concatenate([state.ranks, ranks[None]]))
         object.__setattr__(state, "_search", search)
@@ -139,12 +140,6 @@ class CMAES:
 
     def _random(self, generation: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, generation])
-
-
-def _ranks(losses: np.ndarray) -> np.ndarray:
-    """Return ranks from 0 for the smallest loss; equal losses have equal ranks, and those that are not finite the last."""
-    known = np.where(np.isfinite(losses), losses, np.inf)
-    return np.unique(known, return_inverse=True)[1].astype(np.int32)
 
 
 class _Search:

@@ -187,14 +187,10 @@ class NewtonCG:
             gradient, product, self.trust_radius, self.iterations, self.tolerance, self.damping
         )
         if self.line and step.any():
-            step = self._line_search(step, self._losses(estimate, scale * step, parameters))
+            theta, moved = trees.ravel(parameters), scale * step
+            evaluate = estimate.require("NewtonCG", LossFunction).evaluate
+            step = self._line_search(step, evaluate(np.stack([theta - moved, theta, theta + moved])))
         return apply_direction("NewtonCG", self, scale * step, state, parameters)
-
-    @staticmethod
-    def _losses(estimate: Estimate, step: np.ndarray, parameters: Tree) -> np.ndarray:
-        """Return the losses one step behind the parameters, at the parameters, and one step ahead, (3,)."""
-        theta = trees.ravel(parameters)
-        return estimate.require("NewtonCG", LossFunction).evaluate(np.stack([theta - step, theta, theta + step]))
 
     def _line_search(self, step: np.ndarray, losses: np.ndarray) -> np.ndarray:
         """Return the multiple >= 0 of `step` in the trust radius that minimises the parabola through the three losses."""

@@ -46,7 +46,6 @@ class Partitioned:
     (`HybridGradient` with `GaussNewton`). In steps without a block the scalars do not change.
 
     Args:
-        keys: keys of parameters.
         optimizer: optimizer of `keys`. One that requires more than the gradient uses the block of these keys (`BlockEstimate`).
         others: optimizer of all other parameters; it may require the gradient only.
     """

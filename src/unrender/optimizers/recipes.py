@@ -1,17 +1,27 @@
-"""Recipes of first order: Adam (Kingma and Ba 2015), gradient descent, and the rule of meta-estimation (Balint et al. 2023)."""
+"""Recipes of first order: Adam (Kingma and Ba 2015), gradient descent, the rule of meta-estimation (Balint et al. 2023), and schedule-free
+Adam (Defazio et al. 2024, "The Road Less Scheduled"), whose learning rate decays with the gradient's noise."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from unrender.core import checks
+from unrender.core.errors import InputError
 from unrender.core.registry import register
+from unrender.core.trees import Tree
 from unrender.optimizers import rates
-from unrender.optimizers.chain import Recipe
-from unrender.optimizers.transforms.base import StepTransform
+from unrender.optimizers.chain import ChainState, Recipe
+from unrender.optimizers.transforms.agreement_rate import AgreementRate
+from unrender.optimizers.transforms.base import StepTransform, checked_keys
+from unrender.optimizers.transforms.fitted_sobolev import ApplyPreconditioner, FittedSobolev
+from unrender.optimizers.transforms.lasting_agreement import LastingAgreement
 from unrender.optimizers.transforms.momentum import DecayingSum, GradientMean
+from unrender.optimizers.transforms.pull_to_start import PullToStart
 from unrender.optimizers.transforms.scale import ScaleByDeviation, ScaleByRms
+from unrender.optimizers.transforms.schedule_free_average import ScheduleFreeAverage
+from unrender.optimizers.transforms.wiener_shrinkage import WienerShrinkage
+from unrender.preconditioners.base import Preconditioner
 from unrender.schedules import Schedule
 
 
@@ -112,3 +122,105 @@ class MetaAdam(Recipe):
 
     def compose(self) -> tuple[StepTransform, ...]:
         return (ScaleByDeviation(self.epsilon),)
+
+
+@register
+@dataclass(frozen=True)
+class ScheduleFree(Recipe):
+    """Adam steps without momentum on z, with gradients at a point between z and its weighted mean x.
+
+    At step t, counted from 0, with the gradient g at the parameters y:
+
+        z ← z − η_t w g / (√v̂ + ε),   x ← (1 − c) x + c z,   y ← (1 − β) z + β x,   c = (1 + r) / (t + 1 + r)
+
+    The result of a run is y, which is near x. An average has less noise than an iterate, and slowly moving parameters suit estimators
+    that reuse earlier samples. The chain has seven transforms, whose docstrings contain their formulas:
+
+    - `FittedSobolev` smooths the gradients of `preconditioned` by S, whose strength it fits to them.
+    - `LastingAgreement` estimates how much of the agreement of gradients is reused noise.
+    - `AgreementRate` sets η_t. The rate needs no horizon; it decays with the gradient's noise.
+    - `ScaleByRms` divides by √v̂ + ε. All gradients have equal weight in v̂ from step 1 / (1 − β₂) on.
+    - `ApplyPreconditioner` applies S again, to the direction.
+    - `WienerShrinkage` multiplies by w, which shortens the steps of elements with little signal.
+    - `ScheduleFreeAverage` updates z, x and y.
+
+    Adam normalises every element's step, so weakly observed elements follow a random walk, which w prevents. Parameters outside of
+    `preconditioned` have no neighbours from which w can be estimated, and take unscaled steps; those in `uniform` take steps in proportion
+    to their gradients. Use `wiener=False` with pixel mini-batches: two successive gradients then hardly share a pixel, so their product
+    shows little signal anywhere, and the decaying learning rate averages the noise instead.
+
+    Where the smoothing becomes weaker, the learning rate restarts at 0.3 η_0 or less, because neighbours no longer average the noise.
+    Where it becomes stronger again, or the rate falls by more than a quarter at once, z restarts at x.
+
+    Args:
+        learning_rate: η_0, in units of the parameter, > 0, for the parameters without their own; or {key: rate, "*": rate of the others}.
+        beta: β, in [0, 1).
+        beta_2: β₂, initial decay of the mean square, in [0, 1).
+        epsilon: ε, in units of the gradient, > 0.
+        averaging: r, >= 0.
+        growth: q of `AgreementRate`, >= 0; 0 for a rate that never grows.
+        decay: p of `AgreementRate`, >= 0; 0 for a rate that never decays.
+        schedule: additional factor of every learning rate by step; see `unrender.schedules`.
+        preconditioner: S, applied to the gradients and to the steps of z for the parameters in `preconditioned`. It replaces the
+            preconditioner of a `Parameter`, which would optimise u = S⁻¹ x without knowledge of the bounds. The strength of `Sobolev` is
+            an upper limit; it is fitted to the gradients, see `StrengthFit`.
+        preconditioned: keys of parameters.
+        wiener: whether the steps of these parameters are multiplied by w.
+        reparameterised: Keys of parameters with another variable (`unrender.parameterisations`), whose size does not measure their
+            progress.
+        uniform: keys of parameters whose elements are all divided by the largest √v̂ among them. Elements that the pictures hardly show
+            then hardly move.
+        pulled: {key: weight} of parameters with a `PullToStart` before all other transforms.
+    """
+
+    learning_rate: float | Mapping[str, float] = 0.1
+    beta: float = 0.9
+    beta_2: float = 0.95
+    epsilon: float = 1e-12
+    averaging: float = 2.0
+    growth: float = 0.1
+    decay: float = 1.5
+    schedule: Schedule | None = None
+    preconditioner: Preconditioner | None = None
+    preconditioned: tuple[str, ...] = ()
+    wiener: bool = True
+    reparameterised: tuple[str, ...] = ()
+    uniform: tuple[str, ...] = ()
+    pulled: Mapping[str, float] = field(default_factory=dict)
+    _smoothing: FittedSobolev = field(default_factory=FittedSobolev, init=False, repr=False, compare=False)
+
+    def __post_init__(self):
+        checks.flags(self)
+        rates.check("ScheduleFree", self.learning_rate, self.schedule)
+        for name in ("beta", "beta_2"):
+            checks.number("ScheduleFree", name, getattr(self, name), above=0.0, below=1.0, inclusive=True)
+        checks.number("ScheduleFree", "epsilon", self.epsilon, above=0.0)
+        checks.number("ScheduleFree", "averaging", self.averaging, above=0.0, inclusive=True)
+        checks.number("ScheduleFree", "growth", self.growth, above=0.0, inclusive=True)
+        checks.number("ScheduleFree", "decay", self.decay, above=0.0, inclusive=True)
+        keys = checked_keys("ScheduleFree: preconditioned", self.preconditioned)
+        object.__setattr__(self, "preconditioned", keys)
+        object.__setattr__(self, "_smoothing", FittedSobolev(self.preconditioner, keys))
+        moved = checked_keys("ScheduleFree: reparameterised", self.reparameterised)
+        object.__setattr__(self, "reparameterised", moved)
+        object.__setattr__(self, "uniform", checked_keys("ScheduleFree: uniform", self.uniform))
+
+    def init(self, parameters: Tree, learning_rates: Mapping[str, float] | None = None) -> ChainState:
+        """Return the state before the first step. Raises `InputError` for an unknown parameter, or one that S does not support."""
+        for name in ("preconditioned", "reparameterised", "uniform", "pulled"):
+            if unknown := next((key for key in getattr(self, name) if key not in parameters), None):
+                raise InputError(f'ScheduleFree: {name}: unknown parameter "{unknown}"')
+        return super().init(parameters, learning_rates)
+
+    def compose(self) -> tuple[StepTransform, ...]:
+        shrunk = self.preconditioned if self.wiener and self.preconditioner is not None else ()
+        return (
+            *((PullToStart(self.pulled),) if self.pulled else ()),
+            self._smoothing,
+            LastingAgreement(),
+            AgreementRate(self.growth, self.decay, self.reparameterised),
+            ScaleByRms(self.beta_2, self.epsilon, self.uniform, long_memory=True),
+            ApplyPreconditioner(),
+            WienerShrinkage(shrunk),
+            ScheduleFreeAverage(self.beta, self.averaging),
+        )

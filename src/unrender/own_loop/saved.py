@@ -26,7 +26,6 @@ class RendererState:
 
     Attributes:
         step: number of renders so far.
-        seed: seed of the random numbers.
         streams: {index of the sensor as text, or "mini-batches": its state}.
     """
 
@@ -86,7 +85,6 @@ def _check_options(path: Path, saved: Any, options: dict[str, Any]) -> None:
 
 
 def _fits(state: Any, pattern: RendererState) -> bool:
-    """Return whether it is a state with the same components."""
     if not isinstance(state, RendererState) or not isinstance(state.streams, dict):
         return False
     known = next(iter(pattern.streams.values()))

@@ -56,8 +56,6 @@ def coupled_gradient(
     Bias: the weight w depends on the samples that it weights. This shrinks the gradient toward zero, most in the first steps.
 
     Args:
-        session: session for both states.
-        space: space in which they share samples.
         parameters: θ_n.
         request: samples of the adjoint, in one group, independent of those of the image.
         derivative: g_n, (1, H, W, 3).
@@ -123,7 +121,6 @@ class Rendered:
 
     Attributes:
         frames: records of the launches.
-        shape: shape of the returned image.
         batch: its pixels; None for a full image.
     """
 

@@ -232,7 +232,9 @@ class Exchange:
             case "numpy":
                 return arrays.numpy(image)
             case "drjit":
-                self._check_device()
+                if not self._on_device:
+                    expected = "give its parameters as NumPy or PyTorch arrays"
+                    raise InputError(f"Renderer: this renderer computes in NumPy; {expected}")
                 return image
             case "torch":
                 like = next(x for x in inputs.values.values() if frameworks.is_torch(x))
@@ -300,12 +302,6 @@ class Exchange:
         if expected == () and int(np.prod(shape)) == 1:
             return arrays.reshape(value, ())
         raise InputError(f"parameter {key}: expected shape {expected}, got {shape}")
-
-    def _check_device(self) -> None:
-        if not self._on_device:
-            raise InputError(
-                "Renderer: this renderer computes in NumPy; give its parameters as NumPy or PyTorch arrays"
-            )
 
 
 def _kind(value: Any) -> str:

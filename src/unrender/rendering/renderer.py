@@ -16,7 +16,7 @@ import numpy as np
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.io.file_conversion import PLAIN, FileConversion
+from unrender.io.parameter_values import PLAIN, FileConversion
 from unrender.rendering.parameter_errors import Role
 
 Space = Literal["path", "primary"]

@@ -12,16 +12,6 @@ if TYPE_CHECKING:
 
 __getattr__, _ = lazy.attach(
     __name__,
-    {
-        "Live": "live",
-        "TensorBoard": "callbacks",
-        "sensitivity": "image_sensitivity",
-        "uncertainty": "map_uncertainty",
-    },
+    {"Live": "live", "TensorBoard": "callbacks", "sensitivity": "image_sensitivity", "uncertainty": "map_uncertainty"},
 )
-__all__ = [
-    "Live",
-    "TensorBoard",
-    "sensitivity",
-    "uncertainty",
-]
+__all__ = ["Live", "TensorBoard", "sensitivity", "uncertainty"]

@@ -55,8 +55,7 @@ class Callback(Listener):
         """Called before each step. This time is not counted as the run's."""
 
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
-        """Called after a step, before its record is made. `applied` is false if the estimate or the optimizer's step
-        was not finite."""
+        """Called after a step, before its record is made. `applied` is false if the estimate or the optimizer's step was not finite."""
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """Called after each step, with its record, the last of the history. `run.stop()` ends the run."""
@@ -79,6 +78,17 @@ class Callback(Listener):
         return []
 
 
+def _passed_on(event: Callable[..., None]) -> Any:
+    def call(self: UserCallbacks, run: Run, *arguments: Any) -> None:
+        bound = [getattr(callback, event.__name__) for callback in self._callbacks]
+        if overridden := [each for each in bound if getattr(each, "__func__", None) is not event]:
+            with run.shown():
+                for each in overridden:
+                    each(run, *arguments)
+
+    return call
+
+
 class UserCallbacks(Callback):
     """The user's callbacks as one.
 
@@ -89,41 +99,17 @@ class UserCallbacks(Callback):
     def __init__(self, callbacks: Sequence[Callback]):
         self._callbacks = tuple(callbacks)
 
-    def on_warm_up(self, run: Run, fresh: dict[str, Any], warm: dict[str, Any]) -> None:
-        self._call(Callback.on_warm_up, run, fresh, warm)
-
-    def on_start(self, run: Run) -> None:
-        self._call(Callback.on_start, run)
-
-    def before_step(self, run: Run) -> None:
-        self._call(Callback.before_step, run)
-
-    def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
-        self._call(Callback.on_update, run, estimate, applied)
-
-    def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        self._call(Callback.on_step, run, record)
+    on_warm_up, on_start, before_step = map(_passed_on, (Callback.on_warm_up, Callback.on_start, Callback.before_step))
+    on_update, on_step, on_end = map(_passed_on, (Callback.on_update, Callback.on_step, Callback.on_end))
+    on_error = _passed_on(Callback.on_error)
 
     def on_result(self, run: Run, result: Result) -> Result:
         for callback in self._callbacks:
             result = callback.on_result(run, result)
         return result
 
-    def on_error(self, run: Run, error: BaseException) -> None:
-        self._call(Callback.on_error, run, error)
-
-    def on_end(self, run: Run, result: Result) -> None:
-        self._call(Callback.on_end, run, result)
-
     def warnings(self, run: Run) -> list[str]:
         return [line for callback in self._callbacks for line in callback.warnings(run)]
-
-    def _call(self, event: Callable[..., None], run: Run, *arguments: Any) -> None:
-        bound = [getattr(callback, event.__name__) for callback in self._callbacks]
-        if overridden := [each for each in bound if getattr(each, "__func__", None) is not event]:
-            with run.shown():
-                for each in overridden:
-                    each(run, *arguments)
 
 
 _LARGEST = 512

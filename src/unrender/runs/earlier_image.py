@@ -77,7 +77,6 @@ def stays(loss: float, step: int, change: float, error: float) -> bool:
     The loss is that of pictures with little noise. A rise counts as no change, so a change whose noise is large proves nothing.
 
     Args:
-        loss: loss at the end.
         step: number of completed steps.
         change, error: change of the loss since that step, and its standard error.
     """
@@ -122,7 +121,6 @@ def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays:
     """Return the warning about a difference at the end of a run of `steps` steps whose loss has hardly fallen since `step`.
 
     Args:
-        problem: problem of the run.
         differs: the difference.
         step, steps: earlier step and last step that were compared.
         stays: whether it is certain that the loss has hardly fallen.
@@ -142,7 +140,6 @@ def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -
     """Return a warning if the image differs from the references by a tenth beyond noise, and the loss still falls, or may do so.
 
     Args:
-        problem: problem of the run.
         last, earlier: images of the last and of an earlier step, with the same random numbers. Averages over steps would lower the loss
             without progress, so neither is of averages.
     """

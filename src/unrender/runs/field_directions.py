@@ -81,11 +81,9 @@ def add_field_directions(
 
     Args:
         numbers: the numbers alone.
-        differences: differences along each number.
         keys: keys of the textures and grids, see `fields_of`; at least one.
         sensitivities: see `unrender.sensitivity`.
         change: root mean square of a difference.
-        key: key of the random numbers.
         until: time after which nothing is started.
     """
     adjoints = _Adjoints(numbers, keys, sensitivities, key)
@@ -192,9 +190,7 @@ class _Adjoints:
 
     Args:
         numbers: point and views.
-        keys: keys of the textures and grids.
         sensitivities: {key: √diag(JᵀJ)}, see `unrender.sensitivity`.
-        key: key of the random numbers.
     """
 
     def __init__(self, numbers: Numbers, keys: Sequence[str], sensitivities: Mapping[str, np.ndarray], key: Key):

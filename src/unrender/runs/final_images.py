@@ -201,7 +201,6 @@ def _pictures(
 
 
 def _maps(result: Result, view: int, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """Return the control weights and pixel probabilities of a view, as far as the run has them."""
     weights, probabilities = (result.info.get(name, {}) for name in ("control_weight", "pixel_probability"))
     maps = {}
     if view in weights:
@@ -229,7 +228,8 @@ def _undetermined(
     if not result.steps:
         return [], (), {}
     lines = undetermined_cells(sensitivities)
-    spp, seconds = _trial_spp(problem), min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
+    seconds = min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
+    spp = power_of_two(min(max(_TRIAL_PATHS // math.prod(problem.sizes[0]), 1), _most_spp(problem) // 2))
     per_pass = _pass_spp(problem)
     lines += common_factor(problem, result.parameters, spp, seconds, per_pass, most)
     slow = min(slowdown(), MOST_SLOWDOWN)
@@ -337,9 +337,3 @@ def _pass_spp(problem: Problem) -> int:
     """Return the samples per pixel of one pass, few enough for the least pictures of all views. All passes share one kernel."""
     pixels = sum(height * width for height, width in problem.sizes)
     return power_of_two(min(_PASS_PATHS // pixels, _MOST_PASS, _most_spp(problem) // 2))
-
-
-def _trial_spp(problem: Problem) -> int:
-    """Return the samples per pixel of quick test renderings."""
-    height, width = problem.sizes[0]
-    return power_of_two(min(max(_TRIAL_PATHS // (height * width), 1), _most_spp(problem) // 2))

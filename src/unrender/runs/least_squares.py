@@ -124,7 +124,6 @@ def compile_check(problem: Problem, values: Mapping[str, np.ndarray]) -> None:
 
 
 def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: float) -> NumbersCheck:
-    """Return the lines, or the keys where there is no time."""
     key, change = Key(0, 0, _STREAM), _SHIFT * numbers.slope()
     widths, longest = _FIRST_WIDTH * numbers.limits, 0.0
     for index in range(_PASSES + 1):

@@ -145,7 +145,7 @@ def _step(run: Run) -> dict[str, Any]:
             memory.evaluate_in_turn(state.optimizer)
     finite = not culprit
     if culprit:
-        _warn_of_skipping(run, culprit)
+        _warn_once(run, f"{culprit} was not finite; such steps are not applied")
     run.clock += time.perf_counter() - started
 
     run.step += 1
@@ -180,20 +180,15 @@ def _not_finite(estimate: Estimate) -> str:
     return ""
 
 
-def _warn_of_skipping(run: Run, culprit: str) -> None:
-    """Warn of a step that is not applied, once per cause."""
-    line = f"{culprit} was not finite; such steps are not applied"
+def _warn_once(run: Run, line: str) -> None:
     if not any(known.endswith(line) for known in run.warnings):
         run.warnings.append(f"step {run.step}: {line}")
 
 
 def _warn_of_shortened(run: Run, keys: Sequence[str]) -> None:
-    """Warn of shortened steps of meshes, once per mesh."""
     for key in keys:
         also = " or passed through others" if run.problem.unknowns[key].parameter.self_intersection == "prevent" else ""
-        line = f"{key}: triangles would have turned over{also}; such steps are shortened"
-        if not any(known.endswith(line) for known in run.warnings):
-            run.warnings.append(f"step {run.step}: {line}")
+        _warn_once(run, f"{key}: triangles would have turned over{also}; such steps are shortened")
 
 
 @dataclass(frozen=True)

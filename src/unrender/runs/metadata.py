@@ -44,8 +44,7 @@ class RunAnnotations:
 
 
 def first_values(run: Run) -> dict[str, np.ndarray]:
-    """Return {key: array} of a run before its first step, at the scene's resolution, without copies where equal to the problem's
-    arrays."""
+    """Return {key: array} of a run before its first step, at the scene's resolution, without copies where equal to the problem's arrays."""
     known = run.problem.unknowns
     return {k: known[k].initial if np.array_equal(known[k].initial, x) else x for k, x in run.full().items()}
 

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 from unrender.core import arrays, memory, trees
-from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 
 _DECAY = 0.9
@@ -34,7 +33,7 @@ class GradientNoise:
         each other, and would otherwise appear free of noise.
         """
         if variance is not None:
-            sums = sum(arrays.total(x) for x in variance.values()), _square(gradient)
+            sums = sum(map(arrays.total, variance.values())), sum(map(memory.square, gradient.values()))
             arrays.evaluate(sums)
             noise, square = (arrays.number(x) for x in sums)
             return min(noise / square, 1.0) if square > 0 else None
@@ -61,7 +60,3 @@ class GradientNoise:
         rho = (1 - _DECAY) / (1 + _DECAY)
         noise = (mean_square - square_of_mean / self.weight**2) / (1 - rho)
         return min(max(noise / mean_square, 0.0), 1.0)
-
-
-def _square(tree: Tree) -> Array:
-    return sum(memory.square(x) for x in tree.values())

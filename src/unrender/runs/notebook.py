@@ -28,8 +28,7 @@ Curve = tuple[np.ndarray, np.ndarray]
 
 
 def loss_curve(history: Sequence[Mapping[str, Any]]) -> Curve:
-    """Return the loss from the steps' samples: means over up to 200 groups of consecutive steps; NaN for a group without finite
-    values."""
+    """Return the loss from the steps' samples: means over up to 200 groups of consecutive steps; NaN for a group without finite values."""
     seconds = np.array([record["seconds"] for record in history], float)
     values = np.array([record["loss"] for record in history], float)
     values[~np.isfinite(values)] = np.nan

@@ -27,13 +27,7 @@ from unrender.runs.callbacks import Callback, PhaseTimes, UserCallbacks
 from unrender.runs.folder import method_file
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.loop import descend, prepare
-from unrender.runs.metadata import (
-    RunAnnotations,
-    describe,
-    describe_run,
-    fingerprint_of,
-    first_values,
-)
+from unrender.runs.metadata import RunAnnotations, describe, describe_run, fingerprint_of, first_values
 from unrender.runs.notebook import NotebookProgress
 from unrender.runs.number_means import NumberMeans
 from unrender.runs.other_start import OtherStart

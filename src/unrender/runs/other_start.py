@@ -10,7 +10,7 @@ from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.methods.rules.starts import better_place, number_of_places
 from unrender.runs.callbacks import Callback
 from unrender.runs.loop import begin_at
-from unrender.runs.number_trace import NumberTrace
+from unrender.runs.number_means import NumberTrace
 from unrender.runs.result import Result
 from unrender.runs.verification import misfit_of_numbers
 

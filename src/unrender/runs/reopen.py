@@ -91,10 +91,8 @@ def _of_scene(parts: Mapping[str, str]) -> dict[str, str]:
 def problem_of(directory: str | Path) -> Problem:
     """Recreate the problem of a run folder.
 
-    It is read from the original problem file, if it still exists (so that changes are detected), else from the folder's copy.
-
-    Raises:
-        InputError: the problem was made in Python, or problem.toml is malformed.
+    It is read from the original problem file, if it still exists (so that changes are detected), else from the folder's copy. Raises
+    `InputError` if the problem was made in Python, or problem.toml is malformed.
     """
     folder = Path(directory)
     origin = read_run_record(folder).problem.origin

@@ -29,7 +29,7 @@ from unrender.runs.folder.state import check_alike, not_finite, unpack
 from unrender.runs.folder.writer import RunWriter
 from unrender.runs.loop import descend, initialize, prepare
 from unrender.runs.metadata import RunAnnotations, describe_run, fingerprint_of, first_values
-from unrender.runs.number_trace import NumberTrace
+from unrender.runs.number_means import NumberTrace
 from unrender.runs.optimize import check, connected, open_writer
 from unrender.runs.result import NON_FINITE, Result
 from unrender.runs.run import SNAPSHOT_COUNTS, Run, raise_termination
@@ -140,11 +140,10 @@ class _UnusableCheckpoint(InputError):
 
 
 def _description(run: Run, stored: StoredRun, fingerprint: dict[str, str]) -> dict[str, Any]:
-    """Return the description of the run for its result."""
     record = stored.record
-    annotations = RunAnnotations(
-        record.method, _method_settings(record), record.choices, record.command, stored.method.final_spp
-    )
+    # without the settings that every run has
+    settings = {k: v for k, v in record.settings.items() if k not in ("estimator", "optimizer", "steps", "seconds")}
+    annotations = RunAnnotations(record.method, settings, record.choices, record.command, stored.method.final_spp)
     description = describe_run(run, annotations)
     description["problem"] |= {"fingerprint": fingerprint, "origin": origin(run.problem)}
     return description
@@ -193,13 +192,7 @@ def _changes(run: Run, stored: StoredRun, source: Checkpoint | None) -> str:
     return shortened(changed)
 
 
-def _method_settings(record: RunRecord) -> dict[str, Any]:
-    """Return the settings of the method, without those that every run has."""
-    return {k: v for k, v in record.settings.items() if k not in ("estimator", "optimizer", "steps", "seconds")}
-
-
 def _check_budget_left(folder: Path, method: Method, source: Checkpoint | None) -> None:
-    """Raise `InputError` if the budget ends before the checkpoint."""
     done = 0 if source is None else source.manifest.step
     if method.steps is not None and method.steps < done:
         raise InputError(
@@ -239,11 +232,7 @@ class _Restore(Callback):
         self.writer.resume(run.history, run.result())
 
     def _unpack(
-        self,
-        source: Checkpoint,
-        fresh: dict[str, Any],
-        warm: dict[str, Any],
-        shapes: Mapping[str, tuple[int, ...]],
+        self, source: Checkpoint, fresh: dict[str, Any], warm: dict[str, Any], shapes: Mapping[str, tuple[int, ...]]
     ) -> dict[str, Any]:
         try:
             return _unpack(source, fresh, warm, shapes)
@@ -307,7 +296,6 @@ def _ahead(source: Checkpoint) -> int:
 
 
 def _check_candidate(candidate: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
-    """Raise `InputError` unless it is a `Candidate` of parameters with these shapes."""
     if not isinstance(candidate, dict) or candidate.keys() != {"step", "loss", "parameters"}:
         raise InputError(f"{where}: expected step, loss and parameters, got {repr(candidate)[:60]}")
     if not all(isinstance(candidate[name], (int, float)) for name in ("step", "loss")):
@@ -322,7 +310,6 @@ def _check_candidate(candidate: Any, shapes: Mapping[str, tuple[int, ...]], wher
 
 
 def _check_sent(sent: Any, shapes: Mapping[str, tuple[int, ...]], where: str) -> None:
-    """Raise `InputError` unless it is an `Outbox.snapshot` of parameters with these shapes, or coarser ones."""
     if not isinstance(sent, dict) or (sent and sent.keys() != shapes.keys()):
         raise InputError(f"{where}: expected what workers have of {', '.join(shapes)}, got {repr(sent)[:60]}")
     for key, pair in sent.items():

@@ -22,7 +22,7 @@ from unrender.methods.plan import Plan
 from unrender.optimizers.base import Choosing, Measuring, Optimizer
 from unrender.runs.least_squares import pixel_weights
 from unrender.runs.noise import GradientNoise
-from unrender.runs.number_trace import NumberTrace
+from unrender.runs.number_means import NumberTrace
 from unrender.runs.result import INTERRUPTED, TERMINATED, Result
 from unrender.scene.problem import Problem
 
@@ -44,12 +44,10 @@ class Run:
         clock: seconds of optimisation so far.
         parameters: current parameters (arrays of the renderer), possibly at a coarse resolution.
         state: further state from step to step.
-        callbacks: callbacks in calling order.
         description: fields of `Result` that are known before the first step, see `metadata.describe_run`.
         initial: {key: array}, initial parameters at the scene's resolution.
         history: one record per step.
         warmup_seconds: seconds of tracing and compiling.
-        estimate: last estimate.
         skipped: number of steps that were not applied.
         ahead: number of steps by which resolutions are ahead of the schedule of `CoarseToFine`, see `refinement.hurry`.
         warnings: one line each.
@@ -208,7 +206,6 @@ class Candidate:
 
     Attributes:
         step: number of completed steps.
-        loss: loss of a new image.
         parameters: {key: array} at the scene's resolution.
     """
 

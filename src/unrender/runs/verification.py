@@ -196,9 +196,7 @@ def fit_status(problem: Problem, status: str, warnings: Sequence[str], few: bool
     truth, neither do those below a quarter of the picture.
 
     Args:
-        problem: problem of the run.
         status: status without the warnings.
-        warnings: warnings of the run.
         few: whether the run had few steps. Lines that suggest more of them then do not change the status.
     """
     answers = (MAY_IMPROVE, NOT_CONVERGED, PRIOR, NOISY, *((MORE_STEPS,) if few else ()))

@@ -356,7 +356,6 @@ def _other_meshes(problem: Problem) -> bool:
 
 
 def _lines(first: Picture, last: Picture, best: str, best_loss: float, memory: Memory | None, worse: bool) -> list[str]:
-    """Return the warnings, one sentence each."""
     lines = []
     if worse:
         outcomes = {"end": "no earlier parameters can be kept", "start": "the result holds the initial parameters"}

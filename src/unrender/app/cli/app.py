@@ -10,8 +10,7 @@ import typer
 from unrender.app.cli.catalogue import gallery, methods
 from unrender.app.cli.compare import compare
 from unrender.app.cli.import_ import import_
-from unrender.app.cli.report import report, watch
-from unrender.app.cli.results import export, judge, turntable
+from unrender.app.cli.results import export, judge, report, turntable, watch
 from unrender.app.cli.run import resume, run
 from unrender.app.cli.sweep import sweep_command
 

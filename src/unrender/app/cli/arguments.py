@@ -66,9 +66,7 @@ FinalSpp = Annotated[
     ),
 ]
 
-
 Seed = Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random numbers.")]
-
 
 AllowOutside = Annotated[
     bool,
@@ -81,12 +79,10 @@ AllowOutside = Annotated[
 ]
 """Option that takes effect when it is parsed, see `io.confinement`."""
 
-
 NoCache = Annotated[
     bool,
     typer.Option("--no-cache", help="Render a gallery problem's references without the cache.", show_default=False),
 ]
-
 
 WorkersOption = Annotated[
     str | None,
@@ -96,7 +92,6 @@ WorkersOption = Annotated[
         show_default=False,
     ),
 ]
-
 
 Insecure = Annotated[
     bool,
@@ -111,8 +106,7 @@ Insecure = Annotated[
 def workers(text: str | None, insecure: bool = False) -> Workers | None:
     """Return the value of --workers and --insecure; None for this process, which also runs a single worker without an address.
 
-    Raises:
-        InputError: --workers is invalid, or --insecure is given without it.
+    Raises `InputError` if --workers is invalid, or --insecure is given without it.
     """
     if text is None:
         if insecure:
@@ -256,7 +250,6 @@ def open_problem(name: str, options: Mapping[str, str], cached: bool = True) -> 
     """Open the problem of a TOML file or of the gallery. A variant must be active. Raise `InputError`.
 
     Args:
-        options: options of a gallery problem.
         cached: whether its references are read from and written to the cache.
     """
     with phases.phase("loading"), contextlib.nullcontext() if cached else cache.bypassed():

@@ -76,7 +76,6 @@ def gallery(
 
 
 def _refuse_unused(typed: Sequence[str], name: str | None) -> None:
-    """Raise `InputError` for options that would be ignored."""
     opens = ("--out", "--problem-set")
     needs = {"--spp": ("--out",), "--overwrite": ("--out",), "--variant": opens, "--no-cache": opens}
     for option in typed:

@@ -37,7 +37,6 @@ _DEFAULT = ("stock", "auto")
 _POLL_SECONDS = 0.5
 _MARKS = ("compare.json", "*-seed*/run.json", "*-seed*/lock")
 
-
 _Seconds = Annotated[
     float | None,
     typer.Option(help="Time for each run, with compilation and final pictures. [default: 20 without --steps]"),
@@ -111,7 +110,6 @@ def compare(
 
 
 def _report(console: Console, directories: Sequence[Path], folder: Path, new: bool = False) -> None:
-    """Write the page of a comparison of `new` or earlier runs, and print its tables and notices."""
     with phases.phase("page"):
         from unrender.app import report
 

@@ -152,7 +152,6 @@ def _hardware() -> list[tuple[str, str]]:
 
 
 def _cache() -> list[tuple[str, str]]:
-    """Return the location and size of the caches of references and kernels."""
     place = cache.root()
     if place is None:
         return [("cache", f"switched off ({cache.ENVIRONMENT_VARIABLE} is empty)")]

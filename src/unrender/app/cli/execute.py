@@ -24,6 +24,7 @@ from unrender.runs.metadata import RunAnnotations
 from unrender.runs.other_start import BEGUN_AGAIN
 from unrender.runs.progress import Progress
 from unrender.runs.result import Result
+from unrender.runs.resume import StoredRun, resume_run
 from unrender.scene.notebook import describe_views
 from unrender.scene.problem import Problem
 from unrender.statistics import debiased
@@ -92,6 +93,16 @@ def execution(
         "annotations": annotations,
     }
     live.clear()
+
+
+def resumed(
+    stored: StoredRun, problem: Problem, callbacks: Sequence[Callback], force: bool = False, **times: Any
+) -> Result:
+    """Continue a run, and remove the files of its live page at the end. See `resume_run` for the arguments."""
+    live = Live(stored.folder, problem.name, stored.record.method, stored.record.command)
+    result = resume_run(stored, problem, force, [*callbacks, live], **times)
+    live.clear()
+    return result
 
 
 def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarray | None] | None = None) -> str:

@@ -67,7 +67,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _command(words: list[str]) -> Callable[[], Any]:
-    """Return the function that executes a command line."""
     if words == ["doctor"]:  # works even if other modules cannot be imported
         from unrender.app.cli.doctor import doctor
 

@@ -177,7 +177,6 @@ def conclude(
     Raises:
         typer.Exit: the run was interrupted, failed, or is doubtful.
     """
-
     from unrender.app.cli.execute import summarise
 
     written = None
@@ -263,10 +262,9 @@ def resume(
             )
     with Progress(console) as progress:
         with phases.phase("loading"):
-            from unrender.app.cli.execute import introduce
+            from unrender.app.cli.execute import introduce, resumed
             from unrender.runs import reopen
-            from unrender.runs.live import Live
-            from unrender.runs.resume import load_run, resume_run
+            from unrender.runs.resume import load_run
 
             processes = check_workers(workers, compress, insecure)
             stored = load_run(directory, steps, seconds)
@@ -274,10 +272,8 @@ def resume(
             running = arguments.use_variant(variant or stored.record.variant or "auto", threads or alone)
             problem = reopen.problem_of(directory)
         introduce(console, problem, running)
-        live = Live(directory, problem.name, stored.record.method, stored.record.command)
         theirs = variant_again(variant, stored.record)
         with distributed(problem, processes, compress, theirs, threads or alone, console) as shared:
-            listeners, spent = [progress, live], progress.seconds
-            result = resume_run(stored, shared, force, listeners, earlier=spent, began=progress.budget_began)
-        live.clear()
+            times = {"earlier": progress.seconds, "began": progress.budget_began}
+            result = resumed(stored, shared, [progress], force, **times)
         conclude(console, problem, result, directory, progress)

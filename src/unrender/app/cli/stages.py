@@ -157,10 +157,8 @@ def reopen(
 def run_remaining(run: StagesRun, console: Console, progress: Progress) -> None:
     """Run the remaining stages, and release the lock.
 
-    The next stage after a doubtful one starts with the parameters that this verified.
-
-    Raises:
-        typer.Exit: a stage was interrupted or failed, which ends the run; or, at the end, a stage is doubtful.
+    The next stage after a doubtful one starts with the parameters that this verified. Raises `typer.Exit` if a stage was interrupted or
+    failed, which ends the run, or if a stage is doubtful at the end.
     """
     try:
         _run_stages(run, console, progress)
@@ -215,15 +213,13 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
 def _run_stage(
     run: StagesRun, index: int, values: Mapping[str, Any], console: Console, progress: Progress
 ) -> tuple[Problem, Result]:
-    """Start a stage, or resume it."""
-    from unrender.app.cli.execute import RunOrder, execution, introduce
+    from unrender.app.cli.execute import RunOrder, execution, introduce, resumed
     from unrender.app.stages import stages_file
     from unrender.methods import method
     from unrender.runs import reopen as runs
     from unrender.runs.folder import schema
-    from unrender.runs.live import Live
     from unrender.runs.optimize import optimize
-    from unrender.runs.resume import load_run, resume_run
+    from unrender.runs.resume import load_run
 
     stages, stage = run.stages, run.stages.stages[index]
     folder = stages_file.folder_of(stages, index, run.out)
@@ -232,11 +228,8 @@ def _run_stage(
         stored = load_run(folder, *stages_file.split(stages)[index])
         problem = runs.problem_of(folder)
         introduce(console, problem, run.variant)
-        live = Live(folder, problem.name, stored.record.method, stored.record.command)
-        listeners, spent = [progress, live], progress.seconds
-        result = resume_run(stored, problem, False, listeners, earlier=spent, began=progress.budget_began)
-        live.clear()
-        return problem, result
+        times = {"earlier": progress.seconds, "began": progress.budget_began}
+        return problem, resumed(stored, problem, [progress], **times)
     with phases.phase("loading"):
         problem = run.problem.of_stage(stage, values, run.out / _SCENES / folder.name)
     introduce(console, problem, run.variant)

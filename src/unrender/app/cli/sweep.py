@@ -102,7 +102,8 @@ def sweep_command(
     console = Console(highlight=False)
     where = arguments.workers(workers, insecure)
     if _is_sweep(what):
-        _check_alone(context, what)
+        if refused := arguments.typed_options(context, _FREE):
+            raise InputError(f"sweep {what}: continues with its original options; leave out {refused[0]}")
         record = _extended(read_sweep(Path(what)), trials)
         run_trials(console, Session(Path(what), where, threads), record, _search_of(record.plan)[1])
         return
@@ -271,12 +272,6 @@ def _search_of(plan: SweepPlan) -> tuple[SweepPlan, Search]:
     count = plan.trials or _TRIALS
     kind = Random if plan.search == "random" else TPE
     return plan.model_copy(update={"trials": count}), kind(axes, count, plan.seed)
-
-
-def _check_alone(context: typer.Context, folder: str) -> None:
-    """Raise `InputError` for options that a continued sweep takes from sweep.json."""
-    if refused := arguments.typed_options(context, _FREE):
-        raise InputError(f"sweep {folder}: continues with its original options; leave out {refused[0]}")
 
 
 def _extended(record: SweepRecord, trials: int | None) -> SweepRecord:

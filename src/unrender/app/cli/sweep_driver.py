@@ -7,16 +7,15 @@ import math
 import secrets
 import shlex
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import typer
 from rich.table import Table
 from rich.text import Text
 
-from unrender.app.cli import arguments, report, signals, tasks
+from unrender.app.cli import arguments, results, signals, tasks
 from unrender.app.cli.execute import introduce
 from unrender.app.cli.signals import FAILED, INTERRUPTED, TERMINATED
 from unrender.app.cli.tasks import Job, RunTask, TaskDisplay
@@ -24,7 +23,6 @@ from unrender.app.distributed.cluster import Ended, Executor, InProcess, OnWorke
 from unrender.app.sweeps.record import (
     RUN_FOLDERS,
     SWEEP,
-    RunOutcome,
     SweepPlan,
     SweepRecord,
     TrialRecord,
@@ -50,7 +48,7 @@ _SHOWN, _SHOWN_LIVE = 10, 5
 
 def line(trial: TrialRecord) -> str:
     """Return the line of a trial: number, settings, error with its standard error, and status."""
-    what = f"trial {trial.number}: {_settings(trial)}: "
+    what = f"trial {trial.number}: {_settings(trial.settings)}: "
     if trial.status == "failed":
         return f"{what}failed: {trial.message}"
     share = max((float(share) for share in trial.runs[0].rungs), default=0.0)
@@ -136,8 +134,8 @@ def _error(trial: TrialRecord) -> str:
     return of_one_run(trial.error, trial.standard_error)
 
 
-def _settings(trial: TrialRecord) -> str:
-    return ", ".join(f"{name}={value}" for name, value in trial.settings.items())
+def _settings(values: Mapping[str, str]) -> str:
+    return ", ".join(f"{name}={value}" for name, value in values.items())
 
 
 _POLL_SECONDS = 0.5
@@ -149,7 +147,6 @@ class Session:
     """One call of the command.
 
     Attributes:
-        folder: folder of the sweep.
         workers: workers that run the trials; None for this process.
         threads: processor threads per run; None for an automatic choice.
         fresh: whether the sweep starts from the beginning, regardless of the folder's contents.
@@ -216,7 +213,7 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
         state.save(session.folder, "finished" if trials.done else "interrupted")
         show(console, state.record)
         if best_folders(session.folder, state.record):
-            console.say(f"page: {report.write_page(session.folder, state.record)}")
+            console.say(f"page: {results.write_page(session.folder, state.record)}")
     finally:
         if not trials.done and (session.folder / SWEEP).exists():
             state.save(session.folder, "interrupted")
@@ -266,12 +263,7 @@ def _executor(console: Console, session: Session, record: SweepRecord) -> Iterat
         if cluster is not None:
             yield OnWorkers(cluster, tasks.on_worker), job, problem, cluster.variant
         else:
-            yield InProcess(partial(_here, problem)), job, problem, running
-
-
-def _here(problem: Problem, job: Job, run_tasks: list[RunTask]) -> tuple[list[RunOutcome], dict[str, bytes]]:
-    """Run the tasks in this process, with the result of `tasks.on_worker`."""
-    return tasks.in_turn(job, run_tasks, problem), {}
+            yield InProcess(lambda job, runs: (tasks.in_turn(job, runs, problem), {})), job, problem, running
 
 
 def _announce(console: Console, session: Session, state: _State, executor: Executor) -> None:
@@ -284,7 +276,6 @@ def _announce(console: Console, session: Session, state: _State, executor: Execu
 
 
 def _drive(console: Console, session: Session, state: _State, executor: Executor, job: Job) -> None:
-    """Run trials until all have ended, or one is interrupted."""
     plan, trials = state.record.plan, state.trials
     display = TaskDisplay(
         console, trials.search.trials, "trials", lambda: _table(list(trials.ended.values()), _SHOWN_LIVE)
@@ -294,8 +285,9 @@ def _drive(console: Console, session: Session, state: _State, executor: Executor
         while not trials.done and not state.stopped:
             while executor.pending < executor.slots and (started := trials.next()) is not None:
                 run_tasks = _tasks(plan, started)
-                label = ", ".join(f"{name}={value}" for name, value in started.settings.items())
-                display.begin(started.number, label, tuple(session.folder / task.name for task in run_tasks))
+                display.begin(
+                    started.number, _settings(started.settings), tuple(session.folder / task.name for task in run_tasks)
+                )
                 state.running[started.number] = started
                 executor.start(started.number, job, run_tasks)
             for ended in executor.wait(_POLL_SECONDS):
@@ -309,7 +301,6 @@ def _drive(console: Console, session: Session, state: _State, executor: Executor
 
 
 def _advise_on_few_steps(state: _State, record: TrialRecord, display: TaskDisplay) -> None:
-    """Print advice, once, if the seconds of a run allowed few steps."""
     plan = state.record.plan
     ends = [run.steps for run in record.runs if run.status in ENDED]
     if (

@@ -18,7 +18,7 @@ from rich import live
 from rich.text import Text
 
 from unrender.app.cli import arguments
-from unrender.app.cli.execute import RunOrder, execution
+from unrender.app.cli.execute import RunOrder, execution, resumed
 from unrender.app.distributed.cluster import prepare_worker
 from unrender.app.sweeps.record import RunOutcome
 from unrender.app.sweeps.trials import RUNG_FILE, Pruning, read_rungs, stated_error
@@ -32,11 +32,10 @@ from unrender.runs.callbacks import Callback
 from unrender.runs.folder import reader, schema
 from unrender.runs.folder.lock import holder
 from unrender.runs.folder.schema import CHECKPOINTS, ENDED, LIVE, LIVE_STATUS, RECORD, LiveStatus
-from unrender.runs.live import Live
 from unrender.runs.optimize import optimize
 from unrender.runs.progress import Progress
 from unrender.runs.result import PRUNED
-from unrender.runs.resume import load_run, resume_run
+from unrender.runs.resume import load_run
 from unrender.scene.problem import Problem
 
 _PATIENCE_SECONDS = 30.0
@@ -71,7 +70,6 @@ class RunTask:
     """One run. It is serialisable.
 
     Attributes:
-        name: name of its run folder in the job's folder.
         method, settings: as typed.
         steps, seconds, seed, final_spp: see `RunOrder`.
         limits: see `Pruning`; None for a run whose intermediate errors are not evaluated.
@@ -109,7 +107,7 @@ def carry_out(
     if record is None or record.status not in ENDED:
         looking = [] if task.limits is None else [Pruning(folder, task.limits)]
         listeners = [progress, *looking, *callbacks]
-        if record is None or record.steps == 0 or not _resumed(folder, problem, listeners, record.command):
+        if record is None or record.steps == 0 or not _resumed(folder, problem, listeners):
             chosen = method(task.method)
             order = RunOrder(
                 chosen, task.settings, task.steps, task.seconds, task.seed, task.final_spp, job.command,
@@ -201,13 +199,10 @@ def _problem(name: str, options: tuple[tuple[str, str], ...], cached: bool) -> P
 # ---------------------------------------------------------------------- parts
 
 
-def _resumed(folder: Path, problem: Problem, callbacks: Sequence[Callback], command: str) -> bool:
+def _resumed(folder: Path, problem: Problem, callbacks: Sequence[Callback]) -> bool:
     """Resume the run from its last checkpoint if possible; return whether this succeeded."""
     try:
-        stored = load_run(folder)
-        page = Live(folder, problem.name, stored.record.method, command)
-        resume_run(stored, problem, callbacks=[*callbacks, page], began=time.perf_counter())
-        page.clear()
+        resumed(load_run(folder), problem, callbacks, began=time.perf_counter())
     except InputError:
         return False
     return True

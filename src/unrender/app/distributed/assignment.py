@@ -102,7 +102,6 @@ def needed(problem: Problem, views: Sequence[int], has_memory: bool) -> tuple[di
 
     Args:
         problem: the full problem.
-        views: views of the share.
         has_memory: whether the image estimator has memory of views.
     """
     parameters = {key: _COPIES * _FLOAT * math.prod(shape) for key, shape in problem.shapes().items()}

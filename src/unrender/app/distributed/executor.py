@@ -61,12 +61,8 @@ class DistributedExecutor:
 
     Args:
         problem: the full problem.
-        hosts: hosts of the shares.
         compress: see `Outbox`.
         variant: see `Executor.variant`.
-
-    Attributes:
-        traffic: traffic of the last step.
     """
 
     def __init__(

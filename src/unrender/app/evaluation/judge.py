@@ -182,12 +182,7 @@ def _problem(
     bounds = {parameter.key: parameter.bounds for parameter in problem.parameters if parameter.keys is None}
     plain = [Parameter(key, bounds=bounds.get(key)) for key in shared]
     target = Problem(
-        other.origin["scene"],
-        plain,
-        other.original_views,
-        max_depth=problem.max_depth,
-        name=other.name,
-        partial=True,
+        other.origin["scene"], plain, other.original_views, max_depth=problem.max_depth, name=other.name, partial=True
     )
     if not isinstance(target.renderer, MitsubaRenderer):
         raise InputError(f"{held_out}: it is not rendered by Mitsuba")

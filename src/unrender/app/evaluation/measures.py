@@ -71,8 +71,7 @@ def shown(image: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> tuple[
 def measure(image: np.ndarray, photograph: np.ndarray, mask: np.ndarray) -> Measures:
     """Return the measures of a rendering against a photograph, both linear (H, W, 3), with a mask (H, W) that is positive inside.
 
-    Raises:
-        InputError: the mask is empty.
+    Raises `InputError` if the mask is empty.
     """
     if not (mask > 0).any():
         raise InputError("a mask without a pixel")
@@ -201,17 +200,14 @@ def write_pictures(
         cells = (target, rendered, third)
         if index < MOST_ROWS:
             box = _box(mask)
-            label = _label(name, measures[index]) if measures else name
-            rows.append((label, [cell[box] for cell in cells]))
+            of = measures[index] if measures else None
+            ssim = f"  SSIM {of.ssim:.3f}" if of is not None and of.ssim is not None else ""
+            rows.append((name if of is None else f"{name}  {of.psnr:.2f} dB{ssim}", [cell[box] for cell in cells]))
         stem = f"{index:04d}-{ready_made.file_name(name)}"
         for kind, cell in zip(kinds, cells, strict=True):
             (folder / FOLDER / f"{stem}-{kind}.png").write_bytes(png(cell))
     last = "under the other light" if relit else f"difference x {_DIFFERENCE}"
     (folder / SHEET).write_bytes(sheet(rows, ["photograph", "rendering", last]))
-
-
-def _label(name: str, measures: Measures) -> str:
-    return f"{name}  {measures.psnr:.2f} dB" + ("" if measures.ssim is None else f"  SSIM {measures.ssim:.3f}")
 
 
 def _box(mask: np.ndarray) -> tuple[slice, slice]:

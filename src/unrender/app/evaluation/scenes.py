@@ -23,8 +23,7 @@ HELD_OUT = "held-out.toml"
 def find(run: Path, problem: Problem) -> Path:
     """Return held-out.toml in the folder of the problem file of a run, or in that of its stages.
 
-    Raises:
-        InputError: the file does not exist.
+    Raises `InputError` if the file does not exist.
     """
     staged = stages_file.stage_of(run)
     origin = problem.origin.get("file", problem.origin.get("scene")) if staged is None else staged[0].problem
@@ -42,11 +41,7 @@ _LEVEL = 0.3
 
 
 def export_scene(problem: Problem, parameters: Mapping[str, np.ndarray], folder: Path) -> Path:
-    """Export a result to a new folder and return its scene file.
-
-    Raises:
-        InputError: plain Mitsuba cannot represent the scene.
-    """
+    """Export a result to a new folder and return its scene file. Raises `InputError` if plain Mitsuba cannot represent the scene."""
     scene = export((problem, parameters), folder).scene
     if scene is None:
         raise InputError(
@@ -56,11 +51,7 @@ def export_scene(problem: Problem, parameters: Mapping[str, np.ndarray], folder:
 
 
 def read_light(path: Path) -> np.ndarray:
-    """Read an environment map, (H, W, 3) linear.
-
-    Raises:
-        InputError: a malformed or too small picture, or negative values.
-    """
+    """Read an environment map, (H, W, 3) linear. Raises `InputError` for a malformed or too small picture, or negative values."""
     try:
         values = images.read(path).values
     except InputError as error:

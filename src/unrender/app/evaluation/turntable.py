@@ -231,8 +231,7 @@ def check_video(path: Path, overwrite: bool) -> None:
 def write_video(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Write frames (H, W, 3), bytes, of even width and height, at `rate` frames per second, in the order of their arrival.
 
-    Raises:
-        InputError: the video cannot be written.
+    Raises `InputError` if the video cannot be written.
     """
     ending = path.suffix.lower()
     if not ending:

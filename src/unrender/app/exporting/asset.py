@@ -85,8 +85,7 @@ class Asset:
 def read(path: Path) -> Asset:
     """Return the asset of a scene file.
 
-    Raises:
-        InputError: the scene has no mesh, a material has maps but its mesh no texture coordinates, or a map is too large.
+    Raises `InputError` if the scene has no mesh, a material has maps but its mesh no texture coordinates, or a map is too large.
     """
     scene: Any = load(path)
     notices: list[str] = []
@@ -123,7 +122,6 @@ def _part(shape: Any, notices: list[str]) -> Part | None:
 
 
 def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """Return vertices, faces, normals and texture coordinates of a shape."""
     parameters: Any = mesh_layout.traverse(shape)
     if mesh_layout.POSITIONS not in parameters:  # a rectangle, whose mesh is made when it is rendered
         corners = np.array([[-1.0, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1], [-1, 1, 0, 1]])
@@ -148,10 +146,7 @@ def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np
 def read_environment(scene: Any, notices: list[str]) -> tuple[np.ndarray | None, np.ndarray]:
     """Return the environment map of a live scene and its rotation, as in `Asset`. Append a line to `notices` for each other light.
 
-    The map of a turntable has its orientation at the first camera.
-
-    Raises:
-        InputError: the map is too large.
+    The map of a turntable has its orientation at the first camera. Raises `InputError` if the map is too large.
     """
     environment, to_world = None, np.eye(3)
     for emitter in scene.emitters():

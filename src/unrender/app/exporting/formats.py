@@ -243,8 +243,7 @@ OWN = frozenset(name for known in FORMATS.values() for name in known.files)
 def check(formats: Sequence[str]) -> tuple[str, ...]:
     """Return the formats to write, with those that they need, each once.
 
-    Raises:
-        InputError: an unknown format, or a missing package.
+    Raises `InputError` for an unknown format, or a missing package.
     """
     known = (MITSUBA, *FORMATS)
     for name in formats:

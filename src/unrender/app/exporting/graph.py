@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 import mitsuba as mi
 import numpy as np
 
-from unrender.app.exporting.ready_made import BITMAPS, MESHES, VOLUMES, file_name
+from unrender.app.exporting.ready_made import BITMAPS, MESHES, VOLUMES, new_file
 from unrender.core.errors import InputError
 from unrender.io import images
 from unrender.io.volumes import write_grid
@@ -212,9 +212,7 @@ def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: 
 
     Args:
         graph: the description; its live scene already has all recovered values.
-        value: recovered value.
         key: key of the parameter, which names its file.
-        folder: folder of the exported scene.
 
     Raises:
         InputError: a description cannot hold this parameter.
@@ -240,9 +238,8 @@ def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: 
 
 
 def _mesh(graph: SceneGraph, place: Place, folder: Path) -> None:
-    """Write the current mesh, in world space."""
     mesh, old = place.owner, graph.nodes[place.node].props
-    path = _path(folder, MESHES, graph.names[place.node] or f"mesh-{place.node}", ".ply")
+    path = new_file(folder, MESHES, graph.names[place.node] or f"mesh-{place.node}", ".ply")
     mesh.write_ply(str(path))
     properties = {name: old[name] for name in old.keys() if old.type(name) in _REFERENCES or name == "flip_normals"}  # noqa: SIM118
     props = graph.replace(place.node, "ply")
@@ -259,10 +256,10 @@ _REFERENCES = (mi.Properties.Type.ResolvedReference, mi.Properties.Type.Referenc
 def _map(props: Any, value: np.ndarray, name: str, folder: Path) -> None:
     plugin = props.plugin_name()
     if plugin == "gridvolume":
-        path = _path(folder, VOLUMES, name, ".vol")
+        path = new_file(folder, VOLUMES, name, ".vol")
         write_grid(path, value)
     elif plugin in ("bitmap", "envmap"):
-        path = _path(folder, BITMAPS, name, ".exr")
+        path = new_file(folder, BITMAPS, name, ".exr")
         # Mitsuba repeats the first column behind the last one, and the last before the first.
         images.write(value[:, 1:-1, :3] if plugin == "envmap" else value, path)
     else:
@@ -326,9 +323,3 @@ def _native(value: np.ndarray) -> Any:
 def _forget(props: Any, name: str) -> None:
     if name in props:
         del props[name]
-
-
-def _path(folder: Path, kind: str, name: str, ending: str) -> Path:
-    path = folder / kind / (file_name(name) + ending)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path

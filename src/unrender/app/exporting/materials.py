@@ -66,10 +66,7 @@ def read_material(bsdf: Any) -> tuple[Material, list[str]]:
     """Return the material of a live BSDF, and a line for each property that is not exported.
 
     Of `plastic` and `roughplastic` the diffuse reflectance, α and the index of refraction are exported. Materials other than these,
-    `principled` and `diffuse` become grey.
-
-    Raises:
-        InputError: a map is too large, or maps have different `to_uv`.
+    `principled` and `diffuse` become grey. Raises `InputError` if a map is too large, or maps have different `to_uv`.
     """
     values: Any = mi.traverse(bsdf)
     notes: list[str] = []
@@ -176,11 +173,7 @@ def _is_used(values: Any, key: str) -> bool:
 
 
 def _to_uv(values: Any, keys: Any) -> np.ndarray | None:
-    """Return the common transformation of the maps.
-
-    Raises:
-        InputError: maps have different transformations.
-    """
+    """Return the common transformation of the maps. Raises `InputError` if maps have different transformations."""
     matrices = [np.array(values[f"{key}.to_uv"].matrix, float) for key in keys if f"{key}.to_uv" in values]
     matrices = [matrix.reshape(3, 3) for matrix in matrices]
     if any(not np.allclose(matrix, matrices[0]) for matrix in matrices[1:]):

@@ -44,11 +44,7 @@ class FilesOnly:
         self._placed: list[tuple[Any, str]] = []
 
     def dictionary(self, description: Mapping[str, Any], place: tuple[str, ...] = ()) -> dict[str, Any]:
-        """Return the description with files in place of objects.
-
-        Raises:
-            InputError: an object has no description.
-        """
+        """Return the description with files in place of objects. Raises `InputError` if an object has no description."""
         converted: dict[str, Any] = {}
         for key, value in description.items():
             here = (*place, key)
@@ -82,7 +78,7 @@ class FilesOnly:
         return self.dictionary(description, place)
 
     def _mesh(self, mesh: Any, place: tuple[str, ...]) -> dict[str, Any]:
-        path = self._path(MESHES, place, ".ply")
+        path = new_file(self._folder, MESHES, ".".join(place), ".ply")
         mesh.write_ply(str(path))
         description: dict[str, Any] = {"type": "ply", "filename": str(path)}
         if mesh.id() and mesh.id() != place[-1]:
@@ -97,18 +93,13 @@ class FilesOnly:
     def _bitmap(self, value: Any, place: tuple[str, ...]) -> str:
         bitmap = value if isinstance(value, mi.Bitmap) else None
         eight = bitmap is not None and bitmap.component_format() in (mi.Struct.Type.UInt8, mi.Struct.Type.UInt16)
-        path = self._path(BITMAPS, place[:-1], ".png" if eight else ".exr")
+        path = new_file(self._folder, BITMAPS, ".".join(place[:-1]), ".png" if eight else ".exr")
         images.write(np.array(value) if bitmap is None else bitmap, path)
         return str(path)
 
     def _volume(self, value: Any, place: tuple[str, ...]) -> str:
-        path = self._path(VOLUMES, place[:-1], ".vol")
+        path = new_file(self._folder, VOLUMES, ".".join(place[:-1]), ".vol")
         return str(write_grid(path, value if isinstance(value, mi.VolumeGrid) else np.array(value, np.float32)))
-
-    def _path(self, kind: str, place: tuple[str, ...], ending: str) -> Path:
-        path = self._folder / kind / (file_name(".".join(place)) + ending)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return path
 
 
 def diffuse_description(bsdf: Any) -> dict[str, Any] | None:
@@ -140,6 +131,13 @@ def _diffuse(bsdf: Any, parameters: Any, key: str) -> dict[str, Any] | None:
     if kind == "SRGBReflectanceSpectrum" and len(flat) == 3:
         return {"type": "diffuse", "reflectance": {"type": "rgb", "value": flat}}
     return None
+
+
+def new_file(folder: Path, kind: str, name: str, ending: str) -> Path:
+    """Return the path of a file in a sub-folder (`BITMAPS`, `VOLUMES`, `MESHES`), which is created."""
+    path = folder / kind / (file_name(name) + ending)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def file_name(text: str) -> str:

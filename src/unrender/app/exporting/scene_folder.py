@@ -252,7 +252,6 @@ def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: i
 
 
 def _gather_files(graph: SceneGraph, folder: Path) -> None:
-    """Copy the files that the description refers to into the folder, and refer to the copies."""
     taken: dict[Path, str] = {}
     for index in sorted(graph.used()):
         node = graph.nodes[index]

@@ -35,7 +35,6 @@ def write(
 
     Args:
         parameters: {key: array}.
-        folder: folder of the export.
         related: {name: {key: array}}, maps that belong to large parameters, such as standard errors: maps/<key>.<name>.exr, .vol or
             .npy.
     """

@@ -19,7 +19,6 @@ class ImageMetric:
     """A metric of a picture against its reference.
 
     Attributes:
-        name: the name in headings.
         description: the definition, for readers.
         larger_is_better: whether larger values are better.
         compute: the function from (picture, reference) to a number, or None where the metric is undefined.
@@ -155,9 +154,7 @@ def relative_error(run: RunFolder, keys: Sequence[str]) -> Series | None:
 
 def image_error(run: RunFolder) -> float | None:
     """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without pictures."""
-    errors = [root_mean_square(view.result, view.reference) for view in run.views.values()]
-    known = [error for error in errors if error is not None]
-    return float(np.mean(known)) if known else None
+    return _mean([root_mean_square(view.result, view.reference) for view in run.views.values()])
 
 
 def smoothed_loss(run: RunFolder, window: float) -> Series | None:

@@ -47,7 +47,6 @@ class ErrorAtBudget:
     Attributes:
         share: fraction of the time of the shortest run, or of the fewest samples.
         seconds, samples: the position; one of the two is None.
-        error: error of the metric.
         ratio: ratio of the median to that of the first method; None where that is 0 or not finite.
     """
 
@@ -101,7 +100,6 @@ class Metric:
 
     Attributes:
         name: "loss", "relative parameter error", or the key of a parameter.
-        title: title for readers.
         best_of_first: the lowest median over the runs of the first method.
         improves: whether `best_of_first` is less than the initial median.
         methods: {label of the method: outcome}.
@@ -154,8 +152,7 @@ class Comparison:
 def compare_groups(groups: tuple[Group, ...]) -> Comparison:
     """Compare methods up to the shortest run's time, and up to the fewest samples.
 
-    Raises:
-        InputError: no truth is known, and no loss is finite.
+    Raises `InputError` if no truth is known, and no loss is finite.
     """
     ends = {axis: min(float(getattr(run.history, axis)[-1]) for group in groups for run in group.runs) for axis in AXES}
     end = ends["seconds"]

@@ -57,11 +57,10 @@ def group(runs: Sequence[RunFolder]) -> tuple[Group, ...]:
 
 
 def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
-    """Raise `InputError` for runs that cannot be compared; return the weaknesses of the comparison, one line each.
+    """Return the weaknesses of the comparison, one line each.
 
-    Raises:
-        InputError: no runs, the same run twice, a run without steps, different parameters or sizes of pictures, or references or true
-            values that differ by more than 1 %.
+    Raises `InputError` for no runs, the same run twice, a run without steps, different parameters or sizes of pictures, or references or
+    true values that differ by more than 1 %.
     """
     if not runs:
         raise InputError("compare: give at least one run folder")
@@ -116,7 +115,6 @@ def check_comparable(runs: Sequence[RunFolder]) -> list[str]:
 
 
 def _default_rate(run: RunFolder) -> bool:
-    """Return whether a run of a registered method had the method's default learning rate."""
     from unrender.methods import method  # imports all methods
 
     rate, options = "learning_rate", run.record.settings.get("options", {})

@@ -20,10 +20,7 @@ _SCRIPT = "viewer.js"
 
 
 def render(template: str, more_script: str = "", **context: Any) -> bytes:
-    """Render the page as UTF-8.
-
-    Its content security policy allows only `viewer.js` and, after it, `more_script`.
-    """
+    """Render the page as UTF-8. Its content security policy allows only `viewer.js` and, after it, `more_script`."""
     script = source(_SCRIPT) + (source(more_script) if more_script else "")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"

@@ -92,11 +92,7 @@ def compare(directories: Sequence[str | Path], out: str | Path) -> Path:
 
 
 def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list[str]]:
-    """Return the numbers of a comparison and its weaknesses, one line each.
-
-    Raises:
-        InputError: as in `compare`.
-    """
+    """Return the numbers of a comparison and its weaknesses, one line each. Raises `InputError`, as in `compare`."""
     runs = [read(directory) for directory in directories]
     with np.errstate(over="ignore", invalid="ignore"):  # runs that diverged are compared, too
         notices = grouping.check_comparable(runs)
@@ -107,11 +103,7 @@ def load_comparison(directories: Sequence[str | Path]) -> tuple[Comparison, list
 
 
 def write_comparison(comparison: Comparison, notices: list[str], out: str | Path) -> Path:
-    """Write the page, its picture and its numbers; return the path of the page.
-
-    Raises:
-        InputError: `out` cannot be written to.
-    """
+    """Write the page, its picture and its numbers; return the path of the page. Raises `InputError` if `out` cannot be written to."""
     from unrender.app.report.equal_time import overview_figure  # matplotlib takes a second to import
 
     folder = Path(out)

@@ -47,7 +47,6 @@ class Panel:
     """Stacks of pictures, side by side on a wide screen.
 
     Attributes:
-        title: title of the panel.
         note: remark on the exposure or the scale.
         stacks: pictures from top to bottom, for each stack.
         first_is_large: whether the first stack is larger than the others.
@@ -70,7 +69,6 @@ def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE
     Args:
         view: index of the view.
         shown: pictures of the view.
-        encoder: the encoder of the pictures.
         name: name of the result, "Current" while the run continues.
     """
     factor = metrics.exposure(shown.reference)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from unrender.app.report import curves, tone_mapping
-from unrender.app.report.curves import Series
 from unrender.display import formatting, plots
 from unrender.display.plots import Chart, Line
 from unrender.rendering import parameter_errors
@@ -48,7 +47,12 @@ def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], ax
     single = len(set(keys)) == 1
     measures = [run.measure(key) for run in runs.values() for key in run.known]
     title = parameter_errors.title(measures) if single else "Parameter error, relative to the start"
-    errors = {label: _error(run, single) for label, run in runs.items()}
+    errors = {
+        label: curves.parameter_error(run, run.known[0])
+        if single and run.known
+        else curves.relative_error(run, run.known)
+        for label, run in runs.items()
+    }
     lines = {
         title: [Line(k, getattr(s, axis), s.values, colour=colours[k]) for k, s in errors.items() if s is not None],
         "Loss": [_binned(label, run, "loss", axis, colours[label]) for label, run in runs.items()],
@@ -58,12 +62,6 @@ def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], ax
     }
     all_charts = [plots.chart(name, of, axis, max(ends)) for name, of in lines.items()]
     return [chart for chart in all_charts if chart is not None]
-
-
-def _error(run: RunFolder, single: bool) -> Series | None:
-    if single and run.known:
-        return curves.parameter_error(run, run.known[0])
-    return curves.relative_error(run, run.known)
 
 
 def _binned(label: str, run: RunFolder, column: str, axis: str, colour: int) -> Line:

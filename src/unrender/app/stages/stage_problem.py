@@ -55,9 +55,8 @@ class StagedProblem:
     def read(cls, stages: Stages) -> StagedProblem:
         """Read the problem file of the stages.
 
-        Raises:
-            InputError: the file is malformed, a stage names an unknown that is no parameter of it, leaves out an unknown that no scene
-                can hold, or remeshes a mesh whose first triangles later stages need.
+        Raises `InputError` if the file is malformed, a stage names an unknown that is no parameter of it, leaves out an unknown that no
+        scene can hold, or remeshes a mesh whose first triangles later stages need.
         """
         problem = Problem.from_file(stages.problem)
         known, scene = problem.renderer.parameters(), scene_renderer(problem.renderer)

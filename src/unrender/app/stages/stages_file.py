@@ -66,7 +66,6 @@ class RunOptions:
     """Options of a run in stages that do not affect its results.
 
     Attributes:
-        variant: variant of Mitsuba.
         threads: number of threads; None for one per core.
         checkpoint_every, final_spp: see `optimize` and `RunAnnotations`.
     """
@@ -167,8 +166,7 @@ def _parsed(path: Path) -> dict[str, Any]:
 def read(path: str | Path) -> Stages:
     """Read the stages of a TOML file.
 
-    Raises:
-        InputError: "stages.toml:12: stages[0].share: ...": the file, the line, the field, the expected value.
+    Raises `InputError`, "stages.toml:12: stages[0].share: ...": the file, the line, the field, the expected value.
     """
     file = Path(path)
     model, content = toml_lines.read(file, _Stages, {"stages": _Stage, "run": _Run})
@@ -210,11 +208,7 @@ def text(stages: Stages, note: str) -> str:
 
 
 def write(stages: Stages, folder: Path) -> None:
-    """Write the file of a run in stages, with the absolute path of the problem.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the file of a run in stages, with the absolute path of the problem. Raises `OSError` if it cannot be written."""
     absolute = replace(stages, problem=stages.problem.resolve())
     note = "Stages of a run: `unrender resume` continues with the unfinished ones"
     files.write(folder / FILE, toml_lines.encode(text(absolute, note), str(folder / FILE)))
@@ -246,8 +240,7 @@ def folder_of(stages: Stages, index: int, out: Path) -> Path:
 def run_folders(directory: Path) -> list[Path]:
     """Return the run folders of a folder of stages, including stages that have not started; any other folder is returned alone.
 
-    Raises:
-        InputError: the file of stages is malformed.
+    Raises `InputError` if the file of stages is malformed.
     """
     if not (directory / FILE).is_file():
         return [directory]
@@ -260,8 +253,7 @@ def run_folders(directory: Path) -> list[Path]:
 def last_result(directory: Path) -> Path:
     """Return the run folder of the last started stage of a folder of stages; any other folder is returned as it is.
 
-    Raises:
-        InputError: the file of stages is malformed.
+    Raises `InputError` if the file of stages is malformed.
     """
     if (directory / schema.RECORD).is_file():
         return directory
@@ -271,8 +263,7 @@ def last_result(directory: Path) -> Path:
 def stage_of(run: Path) -> tuple[Stages, int] | None:
     """Return the stages of a run folder and its index among them; None for a folder without stages.
 
-    Raises:
-        InputError: the file of stages is malformed.
+    Raises `InputError` if the file of stages is malformed.
     """
     out, name = run.resolve().parent, run.resolve().name
     if not is_of_run(out / FILE):

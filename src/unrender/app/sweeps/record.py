@@ -148,11 +148,7 @@ class SweepRecord(BaseModel):
 
 
 def read_sweep(folder: Path) -> SweepRecord:
-    """Return the record in the folder of a sweep.
-
-    Raises:
-        InputError: no record exists, or it is malformed.
-    """
+    """Return the record in the folder of a sweep. Raises `InputError` if no record exists, or it is malformed."""
     if bounded_files.kind(folder / SWEEP) != "file":
         raise InputError(f"{folder}: holds no sweep ({SWEEP} is missing)")
     record = schema.validate(SweepRecord, bounded_files.read_object(folder / SWEEP, folder), str(folder / SWEEP))
@@ -163,11 +159,7 @@ def read_sweep(folder: Path) -> SweepRecord:
 
 
 def write_sweep(folder: Path, record: SweepRecord) -> None:
-    """Write sweep.json to a temporary file and rename it.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write sweep.json to a temporary file and rename it. Raises `InputError` if the file cannot be written."""
     files.write(folder / SWEEP, schema.encode(SweepRecord, record.model_dump(), str(folder / SWEEP)))
 
 

@@ -22,7 +22,6 @@ class Axis:
     """An option and its possible values.
 
     Attributes:
-        name: name of the option.
         text: text after NAME=, as typed.
         choices: values as text; () for a range.
         low, high: ends of a range, both included.
@@ -57,11 +56,7 @@ class Axis:
         return repr(min(max(float(f"{number:.{_DIGITS}g}"), self.low), self.high))
 
     def points(self) -> tuple[str, ...]:
-        """Return the values on a grid, without repetition.
-
-        Raises:
-            InputError: a range without a number of points.
-        """
+        """Return the values on a grid, without repetition. Raises `InputError` for a range without a number of points."""
         if self.choices:
             return self.choices
         if self.count is None:
@@ -181,11 +176,7 @@ def _range(name: str, values: str, method: Method) -> Axis | None:
 
 
 def _is_integer(name: str, method: Method) -> bool:
-    """Return whether the option accepts integers only.
-
-    Raises:
-        InputError: an option that is not a number, or an unknown option.
-    """
+    """Return whether the option accepts integers only. Raises `InputError` for an option that is unknown or not a number."""
     if name not in method.options.model_fields:
         method.configure({name: 0})  # says so
     words = method.expected(name)
@@ -238,8 +229,7 @@ class Search(Protocol):
 class Grid:
     """All combinations of the points of the axes; the last axis varies fastest.
 
-    Raises:
-        InputError: a range without a number of points, or more combinations than 100 000.
+    Raises `InputError` for a range without a number of points, or more combinations than 100 000.
     """
 
     axes: Sequence[Axis]
@@ -290,9 +280,7 @@ class TPE:
 
     The settings of a trial are a function of the axes, of the seed and of the outcomes reported before. The same sequence of calls
     gives the same trials, with one version of Optuna. Trials in progress count as bad, so that their settings are not proposed again.
-
-    Raises:
-        InputError: Optuna is not installed.
+    Raises `InputError` if Optuna is not installed.
     """
 
     axes: Sequence[Axis]

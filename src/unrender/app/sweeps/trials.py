@@ -78,12 +78,9 @@ def is_hopeless(errors: Mapping[float, float], limits: Mapping[float, float]) ->
 def stated_error(run: RunFolder) -> tuple[float, float | None]:
     """Return the error that a sweep minimises, and its standard error if it has one.
 
-    Parameters with a known truth have the error of their measure (`run.measure`), such as root mean square. With several of them, it is
-    the mean of the ratios to the initial errors. Without truth, it is the debiased root mean square error of the final pictures, the
-    mean over views.
-
-    Raises:
-        InputError: neither the truth nor an error of pictures is known.
+    Parameters with a known truth have the error of their measure (`run.measure`), such as root mean square. With several of them, it is the
+    mean of the ratios to the initial errors. Without truth, it is the debiased root mean square error of the final pictures, the mean over
+    views. Raises `InputError` if neither the truth nor an error of pictures is known.
     """
     if run.error_after:
         return _combined(run.error_after, run.error_before), None
@@ -122,17 +119,16 @@ class Pruning(Callback):
         passed = [share for share in RUNGS if max(self._errors, default=0.0) < share <= run.progress()]
         if not passed or run.stopped:
             return
-        self._errors[passed[-1]] = self._measure(run)
+        if run.problem.has_truth:
+            error = _combined(run.problem.parameter_error(run.parameters), self._initial)
+        else:
+            error = _picture_error(run.problem, run.full())
+        # The greatest number in place of infinity or NaN can be compared and written.
+        self._errors[passed[-1]] = error if math.isfinite(error) else float(np.finfo(np.float64).max)
         if is_hopeless(self._errors, self._limits):
             run.stop(PRUNED)
         text = json.dumps({str(share): value for share, value in self._errors.items()}) + "\n"
         files.write(self._path, text.encode(), durable=False)
-
-    def _measure(self, run: Run) -> float:
-        problem = run.problem
-        if problem.has_truth:
-            return _finite(_combined(problem.parameter_error(run.parameters), self._initial))
-        return _finite(_picture_error(problem, run.full()))
 
 
 def read_rungs(path: Path) -> dict[float, float]:
@@ -154,11 +150,6 @@ def _combined(errors: Mapping[str, float], initial: Mapping[str, float]) -> floa
     if len(errors) == 1:
         return next(iter(errors.values()))
     return float(np.mean([error / (initial.get(key) or 1.0) for key, error in errors.items()]))
-
-
-def _finite(error: float) -> float:
-    """Return the error, with the greatest float64 in place of infinity or NaN, so that it can be compared and written."""
-    return error if math.isfinite(error) else float(np.finfo(np.float64).max)
 
 
 def _picture_error(problem: Problem, values: Mapping[str, np.ndarray]) -> float:
@@ -228,7 +219,8 @@ class Trials:
             while self.dependent and self._reported <= number - self.window:
                 if self._reported not in self.ended:
                     return None
-                self._tell(self._reported)
+                trial = self.ended[self._reported]
+                self.search.tell(trial.number, TrialOutcome(trial.status, trial.error, _rungs(trial)))
                 self._reported += 1
             settings = self.search.ask(number)
             self._asked += 1
@@ -250,10 +242,6 @@ class Trials:
         """The finished trial of the least error, the first one of equal ones."""
         finished = [t for _, t in sorted(self.ended.items()) if t.status == "finished" and t.error is not None]
         return min(finished, key=lambda trial: trial.error if trial.error is not None else math.inf, default=None)
-
-    def _tell(self, number: int) -> None:
-        trial = self.ended[number]
-        self.search.tell(number, TrialOutcome(trial.status, trial.error, _rungs(trial)))
 
     def _limits(self, number: int) -> dict[float, float]:
         if not self.prune:

@@ -54,16 +54,14 @@ class Connection(H11Protocol):
         """True if the last request showed the token."""
         return bool(self.scope) and _ADMITTED in self.scope.get("state", {})
 
-    def _is_stranger(self) -> bool:
-        return not self.admitted and not self.transport.is_closing()
-
     def connection_made(self, transport: Any) -> None:
         """Start the clock. If too many connections have not shown the token, close the oldest of them."""
         super().connection_made(transport)
         self._start_clock()
         if len(self.connections) <= self.strangers:
             return
-        strangers = [each for each in self.connections if isinstance(each, Connection) and each._is_stranger()]
+        known = (each for each in self.connections if isinstance(each, Connection))
+        strangers = [each for each in known if not each.admitted and not each.transport.is_closing()]
         if len(strangers) > self.strangers:
             min(strangers, key=lambda each: each.began).transport.abort()
 

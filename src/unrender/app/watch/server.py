@@ -69,11 +69,7 @@ class Address:
 
 
 def listen(port: int) -> socket.socket:
-    """Open a listening socket on 127.0.0.1; port 0 selects any free port.
-
-    Raises:
-        InputError: the port cannot be used.
-    """
+    """Open a listening socket on 127.0.0.1; port 0 selects any free port. Raises `InputError` if the port cannot be used."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -92,7 +88,6 @@ def serve(
 
     Args:
         directories: run folders.
-        address: address of the page.
         on: a socket of `listen`.
         on_admission: called once, at the first request that shows the token.
     """
@@ -125,7 +120,6 @@ def application(
 
     Args:
         directories: run folders.
-        address: address of the page.
         refusal_seconds: delay of a 403, so that repeated requests take no time from the runs.
         on_admission: as for `serve`.
     """
@@ -158,7 +152,10 @@ class _AccessControl:
             return
         answer = self._refusal(scope)
         if answer is None:
-            self._admit(scope)
+            connections.admit(scope)
+            if self._on_admission is not None:
+                self._on_admission()
+                self._on_admission = None
         else:
             answer.headers["connection"] = "close"
             await asyncio.sleep(self._refusal_seconds)
@@ -171,12 +168,6 @@ class _AccessControl:
             await send(message)
 
         await (answer or self._app)(scope, receive, send_with_headers)
-
-    def _admit(self, scope: Scope) -> None:
-        connections.admit(scope)
-        if self._on_admission is not None:
-            self._on_admission()
-            self._on_admission = None
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers = dict(scope["headers"])
@@ -285,7 +276,6 @@ class _Page:
 
 
 def _number(request: Request, name: str) -> float:
-    """Return a number of the query; 0 if it is missing."""
     text = request.query_params.get(name, "0")
     try:
         number = float(text)

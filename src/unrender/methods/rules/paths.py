@@ -21,7 +21,7 @@ from unrender.methods.rules.traits import Traits, refusal
 from unrender.methods.smoothed import parse_widths, widths_of
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.partitioned import Partitioned
-from unrender.optimizers.schedule_free import ScheduleFree
+from unrender.optimizers.recipes import ScheduleFree
 from unrender.optimizers.transforms.agreement_rate import FEWEST_ELEMENTS
 from unrender.preconditioners import Sobolev
 from unrender.rendering.partial import PartialDerivatives

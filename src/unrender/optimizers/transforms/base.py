@@ -51,7 +51,6 @@ class StepUpdate:
     transform may set `steps` instead.
 
     Attributes:
-        estimate: Estimate of this step.
         parameters: Current values, {key: array}.
         made: Number of previous steps of the chain.
         learning_rates: {key: η}, in units of the parameter.

@@ -152,7 +152,6 @@ class StrengthFit:
         return replace(self, fresh=(*self.fresh, row)[-2 * _ROWS :], unjudged=self.unjudged + 1)
 
     def _tested(self) -> StrengthFit:
-        """Return the fit after a test by the new gradients."""
         rows = np.stack(self.fresh)
         products, squares = rows[:, 0], rows[:, 1]
         first, before = _share(self.sums), self._before
@@ -175,7 +174,8 @@ class StrengthFit:
             and looked[best] * self.count >= _LEAST_LEFT**2 * self.sums[best, 0]
         ):
             return fit._changed(float(self._shares[best]), square, squares[:, 0].mean())
-        return replace(fit, confirmed=_most_confirmed(rows))
+        share, error = _confirmed(rows, 0)
+        return replace(fit, confirmed=min(max(share + 2.0 * error, _LEAST_CONFIRMED), 1.0))
 
     def _changed(self, share: float, level: float, before: float) -> StrengthFit:
         """Return the fit with another strength; `level` and `before` are |S g|² with it and with the previous one."""
@@ -230,12 +230,6 @@ def _confirmed(rows: np.ndarray, candidate: int) -> tuple[float, float]:
     ratio = products.sum() / agreement.sum()
     error = (products - ratio * agreement).std(ddof=1) * math.sqrt(len(rows)) / agreement.sum()
     return float(ratio), float(error)
-
-
-def _most_confirmed(rows: np.ndarray) -> float:
-    """Return the confirmed fraction at the current strength plus two standard errors, clamped to [0.02, 1]."""
-    share, error = _confirmed(rows, 0)
-    return min(max(share + 2.0 * error, _LEAST_CONFIRMED), 1.0)
 
 
 def _share(sums: np.ndarray) -> float:

@@ -147,7 +147,9 @@ def _completed(state: GradientBlocks) -> GradientBlocks:
         weight = 1.0 if state.blocks == 2 else 0.5  # of this block, relative to all earlier ones
         fractions, inflations, growths = {}, {}, {}
         for key, lasting, square in zip(mean, numbers[::2], numbers[1::2], strict=True):
-            new = _fraction(lasting, arrays.number(state.agreement[key]) / state.count)
+            agreement = arrays.number(state.agreement[key]) / state.count
+            # Nothing can last where successive gradients do not agree.
+            new = min(max(lasting / agreement, -1.0), 1.0) if agreement > 0.0 else 1.0
             fractions[key] = (1.0 - weight) * state.fractions[key] + weight * new
             new = _inflation(lasting, square, arrays.number(state.squares[key]) / state.count, state.count)
             inflations[key] = (1.0 - weight) * state.inflations[key] + weight * new
@@ -163,11 +165,6 @@ def _completed(state: GradientBlocks) -> GradientBlocks:
         inflations=inflations,
         growths=growths,
     )
-
-
-def _fraction(lasting: float, agreement: float) -> float:
-    """Return their ratio within [-1, 1]; 1 if successive gradients do not agree, because nothing can last."""
-    return min(max(lasting / agreement, -1.0), 1.0) if agreement > 0.0 else 1.0
 
 
 def _inflation(lasting: float, square: float, mean_square: float, count: int) -> float:

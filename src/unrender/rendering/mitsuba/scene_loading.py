@@ -16,7 +16,7 @@ import numpy as np
 from unrender.backend import variant
 from unrender.core.errors import InputError
 from unrender.io import bounded_files
-from unrender.io.file_conversion import PLAIN, FileConversion
+from unrender.io.parameter_values import PLAIN, FileConversion
 from unrender.io.volumes import read_grid
 from unrender.rendering.mitsuba import description as loading
 from unrender.rendering.mitsuba import emissive, turntable_light

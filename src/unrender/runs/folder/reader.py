@@ -84,8 +84,7 @@ class RunFolder:
 def read(directory: str | Path) -> RunFolder:
     """Read and check a run folder.
 
-    Raises:
-        InputError: it is missing, or one of its files or fields is missing, malformed, or outside of the folder.
+    Raises `InputError` if it is missing, or one of its files or fields is missing, malformed, or outside of the folder.
     """
     path = Path(directory)
     record = read_run_record(path)
@@ -121,11 +120,7 @@ def read(directory: str | Path) -> RunFolder:
 
 
 def read_run_record(folder: Path) -> RunRecord:
-    """Return the record of a run folder.
-
-    Raises:
-        InputError: the folder is missing or not a run folder, or run.json is malformed.
-    """
+    """Return the record of a run folder. Raises `InputError` if the folder is missing or not a run folder, or run.json is malformed."""
     if (kind := bounded_files.kind(folder)) != "folder":
         around = itertools.islice(folder.parent.iterdir(), _MOST_LISTED) if folder.parent.is_dir() else []
         siblings = [p.name for p in around if p.is_dir()]

@@ -262,8 +262,7 @@ def validate(model: type[Model], content: Any, where: str) -> Model:
 def encode(model: type[BaseModel], content: Any, where: str) -> bytes:
     """Return the bytes of a JSON file that the reader accepts as the model.
 
-    Raises:
-        InputError: the reader would reject them; one line that begins with `where` and names the field.
+    Raises `InputError` if the reader would reject them; one line that begins with `where` and names the field.
     """
     try:
         data = encode_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", where)

@@ -129,7 +129,8 @@ class RunWriter(Callback):
         Raises `InputError` if they cannot be written. It is also raised if they could not be read again; the earlier run is then still
         there.
         """
-        self._check(result)
+        contents.check_writable(self.folder, result, "running")
+        method_file.encode(self.method, self.folder / METHOD)
         try:
             if (self.folder / RECORD).exists() or (self.folder / METHOD).exists():
                 _clear(self.folder)
@@ -261,16 +262,10 @@ class RunWriter(Callback):
         self._lock.acquire()
 
     def _save(self, result: Result, status: str) -> None:
-        """Write the result. Raises `InputError` if it cannot be written."""
         self._restore_folder(result)
         if self._taken_over:
             raise InputError(f"run folder {self.folder}: another run has taken its place; the result is not saved")
         contents.write_result(self.folder, result, status)
-
-    def _check(self, result: Result) -> None:
-        """Raise `InputError` if the reader would reject the files of this run."""
-        contents.check_writable(self.folder, result, "running")
-        method_file.encode(self.method, self.folder / METHOD)
 
     def _write_start(self, result: Result) -> None:
         self.save_problem(self.folder)
@@ -294,7 +289,6 @@ class RunWriter(Callback):
         self._written_step = result.steps
 
     def _thin(self, records: list[dict[str, Any]]) -> None:
-        """Remove records of earlier steps, in memory and in the file."""
         thinned_records = thinned(records)
         self._thin_from = (
             self._history.size + THINNED_FROM // 8
@@ -338,7 +332,6 @@ class RunWriter(Callback):
 
 
 def _clear(folder: Path) -> None:
-    """Remove the files of an earlier run, and nothing else."""
     for name in _FILES:
         (folder / name).unlink(missing_ok=True)
     checkpoint.clear(folder)

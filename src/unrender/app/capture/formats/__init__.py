@@ -54,7 +54,6 @@ FORMATS = {
 }
 """{name: format}, in order of precedence if a folder has several."""
 
-
 LIGHTS = "lights"
 """Name of the format of `lights`, which has no poses."""
 

@@ -187,11 +187,7 @@ class Cluster:
 
 
 def load_ray() -> Any:
-    """Return the module `ray`, configured to be silent.
-
-    Raises:
-        InputError: it is not installed; the message states what to install.
-    """
+    """Return the module `ray`, configured to be silent. Raises `InputError` if it is not installed; the message states what to install."""
     for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
     if has_token() and "ray" not in sys.modules:  # an imported ray has read the mode already

@@ -77,8 +77,7 @@ def private_cluster(ray: Any) -> Iterator[dict[str, Any]]:
 def check_private(ray: Any) -> None:
     """Check that a cluster that was just started listens on the loopback interface alone, and asks for the token.
 
-    Raises:
-        InputError: it does not.
+    Raises `InputError` if it does not.
     """
     address = ray.get_runtime_context().gcs_address
     asks = ray._raylet.get_authentication_mode() == ray._raylet.AuthenticationMode.TOKEN
@@ -104,8 +103,7 @@ def _clear_token_cache(ray: Any) -> None:
 def private_folder() -> Iterator[Path]:
     """Make a folder of mode 0700 with a short path, and remove it at the end: also after this process was killed.
 
-    Raises:
-        InputError: there is no place for one that others cannot change.
+    Raises `InputError` if there is no place for one that others cannot change.
     """
     base = _base()
     _remove_left_over(base)
@@ -185,8 +183,7 @@ def has_token() -> bool:
 def check_token(address: str) -> None:
     """Check that the cluster requires a token, and that other users cannot read it.
 
-    Raises:
-        InputError: anyone who can reach the cluster could run programs as this user.
+    Raises `InputError` if anyone who can reach the cluster could run programs as this user.
     """
     mode = os.environ.get("RAY_AUTH_MODE", "disabled").lower()
     if mode == "disabled" or (mode == "token" and not has_token()):
@@ -204,8 +201,7 @@ def check_token(address: str) -> None:
 def check_cluster(ray: Any, address: str) -> None:
     """Check that other users of this machine cannot change the folders of the cluster's nodes here.
 
-    Raises:
-        InputError: they can, or the cluster refuses the connection.
+    Raises `InputError` if they can, or the cluster refuses the connection.
     """
     for folder in sorted({node.session_dir for node in _nodes(ray, address)}):
         if folder and os.path.isdir(folder) and (reason := can_change(Path(folder))):
