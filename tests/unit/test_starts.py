@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -16,6 +17,7 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules import starts
 from unrender.methods.rules.brightness import start_factors
 from unrender.methods.rules.constants import CONSTANTS
+from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
 from unrender.scene.parameter import Parameter
@@ -256,3 +258,12 @@ def test_places_of_a_shape_share_launches(shape: tuple[int, int], views: int, mo
     launches.clear()
     pictures.images_of([{**states[0], "lamp": np.full(1, 2.0)}], ["lamp"])  # no pose: each state has its own launches
     assert "image_batch" not in launches
+
+
+@pytest.mark.parametrize(
+    ("other", "told"), [("fill.rotation.x", True), ("fill.rotation.y", False), ("box.rotation.x", False)]
+)
+def test_lights_that_may_be_exchanged_have_a_line(other: str, told: bool) -> None:
+    infos = {key: ParameterInfo((), rigid=True, light="box" not in key) for key in ("lamp.rotation.x", other)}
+    found = starts.exchangeable(cast(Any, SimpleNamespace(poses=list(infos), infos=infos)))
+    assert [line.startswith("lamp, fill may end in each other's place") for line in found] == [True] * told

@@ -731,6 +731,20 @@ def test_a_difference_in_few_pixels_counts(improved: bool) -> None:
         assert "the final picture differs" in found
 
 
+@pytest.mark.parametrize("light", [True, False])
+def test_many_poses_of_lights_must_fit_as_few_numbers_do(light: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    keys, generator = [f"lamp_{n}.rotation.x" for n in range(32)], np.random.default_rng(0)
+    renderer = AnalyticRenderer(dict.fromkeys(keys, np.zeros(1)), np.zeros((48, 32)))
+    known = {key: replace(info, rigid=True, light=light) for key, info in renderer.parameters().items()}
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
+    problem = ur.Problem(renderer, [ur.Parameter(key) for key in keys], [ur.View(np.zeros((4, 4, 3)))])
+    arguments: Any = np.ones((512, 3)), np.ones(512), [(16, 32)]
+    noise = generator.normal(0.0, 0.01, (4, 512, 3))
+    assert not verification.misfit_of_numbers(problem, noise, *arguments)
+    found = verification.misfit_of_numbers(problem, 0.1 + noise, *arguments)
+    assert ("two lights are in each other's place" in found) is light
+
+
 def test_saturated_pixels_are_no_difference_for_a_loss_that_takes_them_as_bounds() -> None:
     """The true picture is brighter there. Another pixel that differs counts."""
     light, generator = np.asarray(made().views[0].reference), np.random.default_rng(0)

@@ -17,7 +17,7 @@ from unrender.methods.base import Options
 from unrender.methods.plan import Plan
 from unrender.methods.rules import RULES
 from unrender.methods.rules.constants import CONSTANTS
-from unrender.methods.rules.starts import varied_keys
+from unrender.methods.rules.starts import exchangeable, varied_keys
 from unrender.methods.rules.traits import Traits
 from unrender.methods.smoothed import SIGMA_HELP
 from unrender.optimizers.base import Optimizer
@@ -93,6 +93,6 @@ class AutoMethod(Options):
     def plan(self, problem: Problem) -> Plan:
         traits = Traits(problem, self, CONSTANTS)
         plan = next(plan for rule in RULES if (plan := rule(traits)) is not None)
-        plan = replace(plan, reasons=(*plan.reasons, *traits.notes))
+        plan = replace(plan, reasons=(*plan.reasons, *traits.notes, *exchangeable(traits)))
         few = traits.elements <= CONSTANTS.few_numbers
         return replace(plan, other_starts=tuple(varied_keys(problem, list(traits.infos)))) if few else plan

@@ -133,7 +133,7 @@ def misfit_of_numbers(
     improved: bool = True,
     at_truth: Callable[[], float] | None = None,
 ) -> str:
-    """Return a warning if only few numbers are unknown and the images differ from the references; else "".
+    """Return a warning if only few numbers, or poses of lights, are unknown and the images differ from the references; else "".
 
     Least squares of few numbers end where the difference is noise. Elsewhere their standard errors mean nothing. Noise of the references
     does not count, since pixels do not share it. It counts after a run without improvement, whose difference may be in few pixels.
@@ -148,8 +148,10 @@ def misfit_of_numbers(
         improved: whether the images are better than at the start.
         at_truth: see `Misfit.is_references_noise`.
     """
-    elements = sum(math.prod(shape) for shape in problem.shapes().values())
-    if elements > _FEW_NUMBERS or len(residuals) < 2:
+    infos = [problem.renderer.parameters()[key] for key in problem.shapes()]
+    lights = all(info.rigid and info.light for info in infos)
+    few = sum(math.prod(info.shape) for info in infos) <= _FEW_NUMBERS
+    if not (few or lights) or len(residuals) < 2:
         return ""
     if line := next((warning for warning in known if DIFFERS in warning), ""):
         return line
@@ -159,8 +161,9 @@ def misfit_of_numbers(
     if difference is None or difference.is_references_noise(at_truth):
         return ""
     noise = f"this picture's noise does not explain: {NOISY}, or" if difference.by_pixel else "noise does not explain:"
+    exchanged = "two lights are in each other's place, or " if lights and len(infos) > 1 else ""
     return (
-        f"{difference.describe()}, which {noise} {prior_cause(problem)}the run needs more steps, another start or other bounds, "
+        f"{difference.describe()}, which {noise} {prior_cause(problem)}{exchanged}the run needs more steps, another start or other bounds, "
         "or something that is not among the unknowns is wrong; hence no standard errors"
     )
 

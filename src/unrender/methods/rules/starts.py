@@ -84,6 +84,22 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
     return replace(plan, settings={**plan.settings, **settings}, reasons=(*plan.reasons, reason))
 
 
+def exchangeable(traits: Traits) -> list[str]:
+    """Return a line about lights whose poses have the same unknown coordinates; [] for none.
+
+    A descent may end with two of them in each other's place. The loss there may exceed that of the truth by less than noise, so pictures of
+    other starts do not tell (`shapes.lights`).
+    """
+    lights: dict[str, list[str]] = {}
+    for key in traits.poses:
+        if traits.infos[key].light:
+            lights.setdefault(_owner(key), []).append(key.removeprefix(_owner(key)))
+    coordinates = [sorted(own) for own in lights.values()]
+    alike = [name for name, own in zip(lights, coordinates, strict=True) if coordinates.count(own) > 1]
+    place = "may end in each other's place, where the picture is nearly the same; the start decides"
+    return [f"{listed(alike)} {place}"] if alike else []
+
+
 def better_place(
     problem: Problem,
     pictures: FreshPictures,
@@ -234,10 +250,14 @@ def _groups(problem: Problem, keys: Sequence[str]) -> list[list[str]]:
     """Return the keys whose places are compared together: those of each shape, and all others."""
     groups: dict[str, list[str]] = {}
     for key in keys:
-        parts = key.split(".")
-        end = next((i for i, part in enumerate(parts) if part in _MOTIONS), len(parts))
-        groups.setdefault(".".join(parts[:end]) if _is_shape(problem, key) else "", []).append(key)
+        groups.setdefault(_owner(key) if _is_shape(problem, key) else "", []).append(key)
     return list(groups.values())
+
+
+def _owner(key: str) -> str:
+    """Return the name of what a pose moves."""
+    parts = key.split(".")
+    return ".".join(parts[: next((i for i, part in enumerate(parts) if part in _MOTIONS), len(parts))])
 
 
 def _range(problem: Problem, key: str, value: float) -> Bounds:
