@@ -21,7 +21,7 @@ from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
 from unrender.methods.plan import Plan
 from unrender.methods.rules import sampling
-from unrender.methods.rules.starts import best_start
+from unrender.methods.rules.starts import best_start, stands_out
 from unrender.methods.rules.traits import Traits
 from unrender.methods.smoothed import widths_of
 from unrender.optimizers.averaged_newton import AveragedNewton
@@ -73,9 +73,10 @@ def few_numbers(traits: Traits) -> Plan | None:
     """Return Gauss-Newton steps if few numbers are unknown, and one is a light's or changes the form of the image; else None.
 
     Numbers of a BSDF or medium, such as a roughness, count if some unknown has no path gradient, or if the film is small. Poses take these
-    steps if derivative images at the start explain the residual; on a plateau a smoothed loss is needed. Poses of lights may be combined
-    with other numbers, such as intensities. A light on a plateau takes them too if a better start is found elsewhere. So does any number
-    without a path gradient, since a smoothed loss is far noisier. A shape on a plateau takes them from the best of some places.
+    steps if derivative images at the start explain the residual, or if its picture is better than those around it; on a plateau a smoothed
+    loss is needed. Poses of lights may be combined with other numbers, such as intensities. A light on a plateau takes them too if a better
+    start is found elsewhere. So does any number without a path gradient, since a smoothed loss is far noisier. A shape on a plateau takes
+    them from the best of some places.
     """
     constants, problem, keys = traits.constants, traits.problem, tuple(traits.infos)
     nonlinear = traits.poses or [key for key, info in traits.infos.items() if info.nonlinear] or _of_scattering(traits)
@@ -98,7 +99,8 @@ def few_numbers(traits: Traits) -> Plan | None:
         least = constants.explained if shapes else constants.explained_light
         if not problem.loss.linear:
             return None
-        plateau = not _explained(problem.initial(), problem, trial) > least
+        explained = _explained(problem.initial(), problem, trial) > least
+        plateau = not (explained or stands_out(problem, traits.poses))
     why = f"are not linear in {listed(nonlinear)}" if nonlinear else f"are linear in {listed(traits.lights)}"
     reason = f"{_reason(traits, keys, estimator)}: pictures {why}"
     plan = Plan(problem, estimator, _optimizer(traits, keys), reasons=(reason,))

@@ -217,6 +217,29 @@ class _Comparison:
         return losses
 
 
+def stands_out(problem: Problem, keys: Sequence[str]) -> bool:
+    """Return whether initial poses have a much better picture than at least half of the poses around them.
+
+    These differ in one coordinate, by the length of the object or by a radian. Near the solution they are worse, though noise may hide
+    what derivative images explain of the residual. On a plateau they are as good.
+    """
+    pictures, known = FreshPictures(problem, 0, _PATHS, _NUMBER), problem.renderer.parameters()
+    values = {key: unknown.initial for key, unknown in problem.unknowns.items()}
+    places = [values]
+    for key in keys:
+        own, distance = values[key], 1.0 if known[key].angle else known[key].length
+        for change in distance * np.concatenate([np.eye(own.size), -np.eye(own.size)]):
+            moved = problem.unknowns[key].project(own + change.reshape(own.shape))
+            places.append({**values, key: np.asarray(moved, np.float32)})
+    first, *others = (pictures.losses(images) for images in pictures.images_of(places, keys))
+    worse = 0
+    for other in others:
+        rise = difference(first, other, sampled=pictures.sampled)
+        clear = rise.value > _ERRORS * rise.standard_error
+        worse += clear and mean_and_error(first)[0] < _BETTER * mean_and_error(other)[0]
+    return 2 * worse >= len(others) > 0
+
+
 def varied_keys(problem: Problem, keys: Sequence[str]) -> list[str]:
     """Return the keys of unknowns whose places can be compared: directions, and numbers between two bounds that change the form of
     the picture."""
