@@ -61,7 +61,7 @@ pictures = ur.render(problem, spp=4)  # of the start
             "function use",
             *("class Problem", "class Parameter", "class View", "class unrender.scene.CoarseToFine"),
             "class unrender.scene.prior.Prior",
-            *("class unrender.scene.mesh_regularizer.MeshRegularizer", "class unrender.scene.remeshing.Remeshing"),
+            *("class unrender.scene.meshes.MeshRegularizer", "class unrender.scene.meshes.Remeshing"),
             *("function render", "function render_pair", "class unrender.io.Grid"),
             *("function unrender.io.read_grid", "function unrender.io.write_grid"),
         ),

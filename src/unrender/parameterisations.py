@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -41,6 +41,7 @@ class Transform(Protocol):
         ...
 
 
+@runtime_checkable
 class Parameterisation(Protocol):
     """A rule that defines the optimizer's variable from a parameter's bounds and initial values."""
 

@@ -17,9 +17,8 @@ from unrender.core.random import Key
 from unrender.estimators.sample_groups import GradientRequest
 from unrender.pixels.base import DrawStatistics, MiniBatch
 from unrender.runs.folder.state import pack, unpack
-from unrender.scene.batches import FullView
+from unrender.scene.batches import FullView, SampleCounts, SampleShares, rounded
 from unrender.scene.executor import LOCAL
-from unrender.scene.sample_counts import SampleCounts, SampleShares, rounded
 
 CV, Counts = ur.images.RecursiveControlVariate, ur.pixels.AdaptiveCounts
 

@@ -15,7 +15,7 @@ from unrender.core.random import Key
 from unrender.estimators.sample_groups import GradientRequest
 from unrender.images.plain import PlainState
 from unrender.pixels import pixel_statistics
-from unrender.pixels.map_denoising import pool
+from unrender.pixels.pixel_statistics import pool
 from unrender.pixels.tiles import cut
 from unrender.runs.folder.state import pack, unpack
 from unrender.scene.executor import LOCAL

@@ -16,7 +16,7 @@ from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.pixels import pixel_statistics
 from unrender.pixels import tiles as cells_module
-from unrender.pixels.map_denoising import denoise_side_by_side
+from unrender.pixels.pixel_statistics import denoise_side_by_side
 from unrender.pixels.tiles import Grid, InverseCdfTable, Tiles, cut
 from unrender.scene.batches import FullView, PixelBatch, PixelSample
 from unrender.scene.references import References

@@ -16,14 +16,13 @@ from unrender.core.trees import Tree
 from unrender.rendering import picture_format
 from unrender.rendering import renderer as port
 from unrender.rendering.camera_poses import PosedCameras
-from unrender.rendering.exposure import ExposedRenderer
+from unrender.rendering.exposure import ExposedRenderer, VignettedRenderer
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession
 from unrender.rendering.partial import HeldParameters, PartialDerivatives
 from unrender.rendering.picture_format import PictureFormat
 from unrender.rendering.renderer import Camera, EmitterMoments, SampleRequest
 from unrender.rendering.response import RespondingRenderer
 from unrender.rendering.tied import Tie, TiedRenderer
-from unrender.rendering.vignetting import VignettedRenderer
 from unrender.rendering.worlds import World, with_worlds
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 

@@ -11,7 +11,7 @@ import pytest
 import unrender as ur
 from tests.contract.analytic import exact_gradient, problem
 from unrender.core.random import Key
-from unrender.pixels.views import Views
+from unrender.pixels.uniform import Views
 
 WEIGHTS = np.array([8.0, 2.0, 1.0, 1.0, 1e-6])
 

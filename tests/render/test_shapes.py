@@ -18,11 +18,11 @@ from tiers import quick
 from unrender.core.random import Key
 from unrender.gallery import meshes
 from unrender.methods.base import method
+from unrender.rendering.mitsuba.film import views_of
 from unrender.rendering.mitsuba.geometry_terms import BoundaryTerm
 from unrender.rendering.mitsuba.integrators.boundary_paths import Picture
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.session import MitsubaSession
-from unrender.rendering.mitsuba.view_weights import views_of
 from unrender.rendering.renderer import SampleRequest
 
 SIZE = 16

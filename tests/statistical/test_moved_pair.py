@@ -14,8 +14,8 @@ import pytest
 from zscores import agree
 
 from unrender.gallery import meshes
-from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids, bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
+from unrender.rendering.mitsuba.integrators.moved_vertices import BoundingEllipsoids, bounding_ellipsoids
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.renderer import SampleRequest, Space

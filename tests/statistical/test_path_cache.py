@@ -17,10 +17,10 @@ from unrender.core import arrays
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import turntable_light
 from unrender.rendering.mitsuba.integrators.emitters import EmitterConnection
-from unrender.rendering.mitsuba.path_cache import lookups
 from unrender.rendering.mitsuba.path_cache import session as caching
-from unrender.rendering.mitsuba.path_cache.lookups import Lookups
+from unrender.rendering.mitsuba.path_cache import tracing
 from unrender.rendering.mitsuba.path_cache.session import CachingSession
+from unrender.rendering.mitsuba.path_cache.tracing import Lookups
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -315,7 +315,7 @@ def test_a_light_that_another_holds_is_not_served() -> None:
 
 @pytest.mark.slow
 def test_a_light_that_is_never_looked_up_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lookups, "_check_around", lambda owner, around: None)
+    monkeypatch.setattr(tracing, "_check_around", lambda owner, around: None)
     with pytest.raises(AssertionError, match="Not equal"):
         compare(*states(turntable, ("sky.map.data", FLOOR)))
 

@@ -30,9 +30,8 @@ from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
-from unrender.scene.parameter import Parameter, ParameterSettings
+from unrender.scene.parameter import Parameter, ParameterSettings, Unknown
 from unrender.scene.problem import Problem
-from unrender.scene.unknown import Unknown
 from unrender.scene.view import View
 
 SHAPE = (4, 4)

@@ -20,12 +20,18 @@ from unrender.pixels import Views
 from unrender.preconditioners import Sobolev
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.runs.watches import MeshWatch
-from unrender.scene import remeshing
-from unrender.scene.mesh_checks import check_regularizer, check_self_intersection, check_surfaces, mesh_notices
-from unrender.scene.mesh_regularizer import MeshRegularizer
-from unrender.scene.remeshing import Remeshing
+from unrender.scene.meshes import (
+    MeshRegularizer,
+    Remeshing,
+    _check_size,
+    check_regularizer,
+    check_self_intersection,
+    check_surfaces,
+    mesh_notices,
+    remeshing_of,
+)
+from unrender.scene.parameter import Unknown
 from unrender.scene.surfaces import Surface, crossing_triangles, folds, guarded, surface_error
-from unrender.scene.unknown import Unknown
 
 POINTS, FACES = meshes.icosphere(2)
 COPY, CUT, COORDINATES = meshes.unrolled(POINTS, FACES)
@@ -256,9 +262,9 @@ def test_remeshing_that_does_not_suit_is_one_line() -> None:
         ("3", "expected steps"),
     ):
         with pytest.raises(ur.InputError, match=message):
-            remeshing.of(wrong)
+            remeshing_of(wrong)
     with pytest.raises(ur.InputError, match=r"would make \d+ faces"):
-        Remeshing((5,), edge=1e-5).apply(POINTS, FACES, None) if _has_gpytoolbox() else remeshing._check_size(1 << 22)
+        Remeshing((5,), edge=1e-5).apply(POINTS, FACES, None) if _has_gpytoolbox() else _check_size(1 << 22)
 
 
 def _has_gpytoolbox() -> bool:

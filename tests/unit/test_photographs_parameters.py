@@ -13,9 +13,9 @@ from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.camera_poses import POSES, Corrections, PosedCameras
+from unrender.rendering.exposure import VIGNETTING, VignettedRenderer, falloff, powers
 from unrender.rendering.photographs import scene_renderer, scene_values, sensors_with_rows, with_photographs
 from unrender.rendering.renderer import Camera, Renderer, SampleRequest
-from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer, falloff, powers
 
 PLACES = np.array([[4.0, 0, 0], [0, 4, 1], [-4, 0, 0.5], [0, -4, 0], [1, 2, 4]])
 

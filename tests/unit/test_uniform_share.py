@@ -10,7 +10,7 @@ from unrender.app.distributed.messages import Batch
 from unrender.pixels import tiles as tiles_module
 from unrender.pixels import uniform_share
 from unrender.pixels.base import DrawStatistics
-from unrender.pixels.map_denoising import pool
+from unrender.pixels.pixel_statistics import pool
 from unrender.pixels.uniform_share import MOST, SHARES, ShareEvidence
 
 

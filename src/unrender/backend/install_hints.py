@@ -40,17 +40,13 @@ def command(needs: Sequence[str], by: str | None = None) -> str:
     sudo = "" if is_root() else "sudo "
     if by == "apt-get":
         return _apt_command(needs, sudo)
-    tables = {"dnf": _DNF, "pacman": _PACMAN, "brew": _BREW, "conda": _CONDA}
-    if by not in tables:
-        return "conda install -c conda-forge " + _names(needs, _CONDA)
-    names = _names(needs, tables[by])
-    prefixes = {
-        "dnf": f"{sudo}dnf install ",
-        "pacman": f"{sudo}pacman -S ",
-        "brew": "brew install ",
-        "conda": "conda install -c conda-forge ",
+    managers = {
+        "dnf": (f"{sudo}dnf install ", _DNF),
+        "pacman": (f"{sudo}pacman -S ", _PACMAN),
+        "brew": ("brew install ", _BREW),
     }
-    return prefixes[by] + names
+    prefix, table = managers.get(by or "", ("conda install -c conda-forge ", _CONDA))
+    return prefix + _names(needs, table)
 
 
 def apt_packages(needs: Sequence[str]) -> list[str] | None:

@@ -148,7 +148,6 @@ def unsupported(variant: str) -> str:
 
 
 def _lacking(variant: str) -> str:
-    """Return what a variant lacks, for a message."""
     parts = variant.split("_")
     if parts[0] not in ("scalar", "llvm", "cuda", "metal"):
         return f"unknown variant {variant!r}{did_you_mean(variant, VARIANTS, likeness=0.3)}: "

@@ -6,7 +6,7 @@ forms, and run unchanged on the device.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -41,34 +41,34 @@ def clip(x: Array, low: Array, high: Array) -> Array:
     return minimum(maximum(x, low), high)
 
 
-def sqrt(x: Array) -> Array:
-    """Return the elementwise square root."""
-    return dr.sqrt(x) if is_drjit(x) else np.sqrt(x)
+def _either(of_drjit: Callable[[Any], Any], of_numpy: Callable[[Any], Any]) -> Callable[[Array], Array]:
+    """Return a function of an array that calls the function of its framework."""
+    return lambda x: of_drjit(x) if is_drjit(x) else of_numpy(x)
 
 
-def log(x: Array) -> Array:
-    """Return the elementwise natural logarithm."""
-    return dr.log(x) if is_drjit(x) else np.log(x)
-
-
-def exp(x: Array) -> Array:
-    """Return the elementwise exponential."""
-    return dr.exp(x) if is_drjit(x) else np.exp(x)
-
-
-def absolute(x: Array) -> Array:
-    """Return the elementwise absolute value."""
-    return dr.abs(x) if is_drjit(x) else np.abs(x)
+sqrt = _either(dr.sqrt, np.sqrt)
+"""Return the elementwise square root."""
+log = _either(dr.log, np.log)
+"""Return the elementwise natural logarithm."""
+exp = _either(dr.exp, np.exp)
+"""Return the elementwise exponential."""
+absolute = _either(dr.abs, np.abs)
+"""Return the elementwise absolute value."""
+is_finite = _either(dr.isfinite, np.isfinite)
+"""Return a mask of the elements that are neither infinite nor NaN."""
+mean = _either(lambda x: dr.mean(x, axis=None), np.mean)
+"""Return the mean over all elements; lazy for Dr.Jit."""
+mean_over_first = _either(lambda x: dr.mean(x, axis=0), lambda x: np.mean(x, axis=0))
+"""Return the mean over the first axis, (n, ...) -> (...); lazy for Dr.Jit."""
+largest = _either(lambda x: dr.max(x, axis=None), np.max)
+"""Return the largest element; lazy for Dr.Jit."""
+total = _either(lambda x: dr.sum(x, axis=None), np.sum)
+"""Return the sum over all elements; lazy for Dr.Jit."""
 
 
 def sign(x: Array) -> Array:
     """Return -1, 0 or 1 per element. The sign of zero is zero, whereas `drjit.sign` never returns 0."""
     return dr.select(x == 0, 0.0, dr.sign(x)) if is_drjit(x) else np.sign(x)
-
-
-def is_finite(x: Array) -> Array:
-    """Return a mask of the elements that are neither infinite nor NaN."""
-    return dr.isfinite(x) if is_drjit(x) else np.isfinite(x)
 
 
 def all_finite(x: Array) -> bool:
@@ -96,16 +96,6 @@ def shape(x: Array) -> tuple[int, ...]:
     return tuple(x.shape)
 
 
-def mean(x: Array) -> Array:
-    """Return the mean over all elements; lazy for Dr.Jit."""
-    return dr.mean(x, axis=None) if is_drjit(x) else np.mean(x)
-
-
-def mean_over_first(x: Array) -> Array:
-    """Return the mean over the first axis, (n, ...) -> (...); lazy for Dr.Jit."""
-    return dr.mean(x, axis=0) if is_drjit(x) else np.mean(x, axis=0)
-
-
 def mean_over_rest(x: Array) -> Array:
     """Return the mean over all axes but the first, (n, ...) -> (n,); lazy for Dr.Jit."""
     axes = tuple(range(1, len(x.shape)))
@@ -122,16 +112,6 @@ def concatenate(parts: list[Array]) -> Array:
     if len(parts) == 1:
         return parts[0]
     return dr.concat(parts, axis=0) if is_drjit(parts[0]) else np.concatenate(parts)
-
-
-def largest(x: Array) -> Array:
-    """Return the largest element; lazy for Dr.Jit."""
-    return dr.max(x, axis=None) if is_drjit(x) else np.max(x)
-
-
-def total(x: Array) -> Array:
-    """Return the sum over all elements; lazy for Dr.Jit."""
-    return dr.sum(x, axis=None) if is_drjit(x) else np.sum(x)
 
 
 def scalar(value: float, like: Array) -> Array:

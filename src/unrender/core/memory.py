@@ -96,7 +96,6 @@ def square(x: Array) -> Array:
 
 
 def _flatten(value: Any) -> Iterator[Array]:
-    """Yield the Dr.Jit arrays of a nested structure."""
     if arrays.is_drjit(value):
         yield value
     elif isinstance(value, Mapping):

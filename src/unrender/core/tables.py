@@ -231,7 +231,6 @@ def _unknown(name: str, kind: str | None, known: Mapping[str, type]) -> str:
 
 
 def _plain(value: Any, where: str) -> Any:
-    """Return a value in types of TOML."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return table(value)
     if isinstance(value, (bool, int, float, str)):

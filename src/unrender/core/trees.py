@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,29 +20,16 @@ def map(function: Callable[..., Any], *trees: Tree) -> Tree:
     return {name: function(*(tree[name] for tree in trees)) for name in trees[0]}
 
 
-def add(a: Tree, b: Tree) -> Tree:
-    """Return a + b."""
-    return map(lambda x, y: x + y, a, b)
-
-
-def subtract(a: Tree, b: Tree) -> Tree:
-    """Return a - b."""
-    return map(lambda x, y: x - y, a, b)
-
-
-def zeros_like(a: Tree) -> Tree:
-    """Return zeros of the same shapes."""
-    return map(arrays.zeros_like, a)
-
-
-def shapes(a: Tree) -> dict[str, tuple[int, ...]]:
-    """Return the shape of each array."""
-    return map(arrays.shape, a)
-
-
-def numpy(a: Tree) -> Tree:
-    """Return NumPy copies of the arrays."""
-    return map(arrays.numpy, a)
+add = partial(map, operator.add)
+"""Return a + b."""
+subtract = partial(map, operator.sub)
+"""Return a - b."""
+zeros_like = partial(map, arrays.zeros_like)
+"""Return zeros of the same shapes."""
+shapes = partial(map, arrays.shape)
+"""Return the shape of each array."""
+numpy = partial(map, arrays.numpy)
+"""Return NumPy copies of the arrays."""
 
 
 def ravel(tree: Tree) -> np.ndarray:

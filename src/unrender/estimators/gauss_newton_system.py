@@ -204,7 +204,6 @@ class Point:
         return images
 
     def _images(self, view: int, key: Key) -> HalvedImage:
-        """Return the image and its two halves."""
         halves = [self._states(self.theta[None], view, key.fold(_IMAGE + half), self.options.spp)[0] for half in (0, 1)]
         array = self.problem.renderer.array
         mean, variance = 0.5 * (halves[0] + halves[1]), 0.25 * np.square(halves[0] - halves[1])

@@ -90,7 +90,6 @@ def _wide(x: Array) -> Array:
 
 
 def _add(total: Array, x: Array) -> None:
-    """Add x to the total in place."""
     index = dr.arange(dr.uint32_array_t(dr.array_t(x)), dr.width(total))
     dr.scatter_add(total, _wide(x), index, mode=dr.ReduceMode.NoConflicts)
     memory.evaluate_in_turn(total)

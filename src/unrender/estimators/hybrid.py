@@ -319,7 +319,6 @@ class HybridGradient:
         )
 
     def _perturbed(self, renderer: Renderer, parameters: Tree) -> tuple[str, ...]:
-        """Return the perturbed parameters, in the order of all parameters."""
         if self.keys is None:
             own = beyond_paths(renderer.parameters(), list(parameters))
             if not own:
@@ -353,7 +352,6 @@ def _averaged(perturbed: Estimate, state: HybridState) -> tuple[Estimate, Hybrid
 
 
 def _mean_square(perturbed: Estimate) -> Tree:
-    """Return variance plus squared gradient."""
     variance = perturbed.require("HybridGradient", Variance).values
     return trees.map(lambda v, g: v + g * g, variance, perturbed.gradient)
 

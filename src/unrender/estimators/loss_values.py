@@ -39,10 +39,7 @@ class LossValues:
     def __post_init__(self):
         checks.integer("LossValues", "spp", self.spp, at_least=1)
 
-    @property
-    def provides(self) -> Capabilities:
-        """The loss at any points."""
-        return Capabilities(LossFunction)
+    provides = Capabilities(LossFunction)
 
     def init(self, problem: Problem, parameters: Tree) -> LossState:
         """Return the empty state. Raise `InputError` for a parameter that cannot be perturbed."""

@@ -80,7 +80,6 @@ class MetaState:
 
 
 def _distance(a: Tree, b: Tree) -> float:
-    """Return the Euclidean distance of two trees."""
     return math.sqrt(sum(arrays.number(memory.square(a[key] - b[key])) for key in a))
 
 
@@ -200,10 +199,7 @@ class MetaEstimator:
                 f'MetaEstimator: space="{self.space}" is not that of {type(self.image).__name__}(space="{self.image.space}")'
             )
 
-    @property
-    def provides(self) -> Capabilities:
-        """A gradient, its variance, and the weight of earlier estimates in it."""
-        return Capabilities(Gradient, Variance)
+    provides = Capabilities(Gradient, Variance)
 
     def init(self, problem: Problem, parameters: Tree) -> MetaState:
         """Return the state before the first step. Raise `InputError` for a parameter whose values share no paths, with `space="path"`."""

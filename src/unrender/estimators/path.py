@@ -134,10 +134,7 @@ class PathGradient:
                 'PathGradient: differential_bsdf does not support emitters="adaptive"; leave out one of them'
             )
 
-    @property
-    def provides(self) -> Capabilities:
-        """A gradient."""
-        return Capabilities(Gradient)
+    provides = Capabilities(Gradient)
 
     @property
     def groups(self) -> int:
@@ -145,7 +142,6 @@ class PathGradient:
         return leave_one_out_groups(self.spp, self.adjoint_spp)
 
     def _has_secant(self, loss: Loss) -> bool:
-        """Return whether the derivative is linear, or has a bounded secant."""
         return loss.linear or (loss.pixelwise and self.tolerance > 0)
 
     def _in_window(self, step: int) -> bool:
@@ -156,7 +152,6 @@ class PathGradient:
         return step < start + _WINDOW
 
     def _rendered(self, problem: Problem) -> Problem:
-        """Return the problem with the renderer that the options require."""
         if not self.differential_bsdf:
             return problem
         return problem.with_parts(renderer=with_differential_bsdf(problem.renderer))

@@ -53,7 +53,6 @@ def _keys(problem: Problem) -> list[str]:
 
 
 def _terms(problem: Problem, key: str, x: Array | np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the value of the terms of one unknown and their gradient, of its shape."""
     unknown, values = problem.unknowns[key], x if isinstance(x, np.ndarray) else arrays.numpy(x)
     value, gradient = 0.0, np.zeros(values.shape)
     if unknown.regularizer is not None:

@@ -7,7 +7,7 @@ import functools
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +24,8 @@ from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
 from unrender.rendering.renderer import EmitterMoments, RenderSession, SampleRequest
-from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample, full_views
+from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample, SampleCounts, full_views
 from unrender.scene.problem import Problem
-from unrender.scene.sample_counts import SampleCounts
 
 PIXELS = 1 << 32
 """Stream of a step's key for its pixels; lower streams are for its frames."""
@@ -35,10 +34,6 @@ TREES = ("gradient", "paired", "previous", "fresh", "noise")
 """Trees of a `GradientSample` that are summed over the frames."""
 
 _MOST_GROUPS = 16
-
-
-@runtime_checkable
-class _PixelSampler(PixelSampler, Protocol): ...
 
 
 @dataclass(frozen=True)
@@ -246,7 +241,7 @@ def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, ad
         fewest: minimum number of samples per pixel of any gradient of a step.
         adjoint_spp: see `PathGradient`.
     """
-    if isinstance(pixels, type) or not isinstance(pixels, _PixelSampler):
+    if isinstance(pixels, type) or not isinstance(pixels, PixelSampler):
         raise InputError(f"{owner}: pixels must be one of unrender.pixels, such as All(), got {pixels!r}")
     if not isinstance(pixels, All) and not image.pixelwise:
         raise InputError(f"{owner}: {type(image).__name__} needs full views; use pixels=unrender.pixels.All()")
@@ -264,7 +259,6 @@ def check_pixels(owner: str, pixels: Any, image: ImageEstimator, fewest: int, ad
 def _image_state(
     problem: Problem, request: GradientRequest, sample: PixelSample | None, parts: list[FrameGradient]
 ) -> Any:
-    """Return the next state of the image estimator."""
     image, state = request.image, request.state
     if sample is not None:
         return image.learn(problem, state, sample, parts[0].image_state)
@@ -272,7 +266,6 @@ def _image_state(
 
 
 def _concatenated(draws: list[DrawStatistics]) -> DrawStatistics | None:
-    """Concatenate the statistics of all frames."""
     if len(draws) <= 1:
         return draws[0] if draws else None
     squares, moments = (np.concatenate([getattr(part, name) for part in draws]) for name in ("squares", "moments"))

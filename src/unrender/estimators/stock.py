@@ -49,10 +49,7 @@ class StockGradient:
     def __post_init__(self):
         checks.integer("StockGradient", "spp", self.spp, at_least=1)
 
-    @property
-    def provides(self) -> Capabilities:
-        """A gradient."""
-        return Capabilities(Gradient)
+    provides = Capabilities(Gradient)
 
     def init(self, problem: Problem, parameters: Tree) -> StockState:
         """Return the state before the first step. Raise `InputError` for a parameter that Mitsuba cannot differentiate."""

@@ -25,8 +25,8 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.estimators.capabilities import DerivativeImages
 from unrender.rendering.renderer import RenderSession, SampleRequest
+from unrender.scene.parameter import Unknown
 from unrender.scene.problem import Problem
-from unrender.scene.unknown import Unknown
 from unrender.scene.upsampling import Upsampler
 
 IMAGES = 3

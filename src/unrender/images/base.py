@@ -12,9 +12,8 @@ from unrender.core.arrays import Array
 from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import Space
-from unrender.scene.batches import Frame, PixelSample
+from unrender.scene.batches import Frame, PixelSample, SampleCounts
 from unrender.scene.problem import Problem
-from unrender.scene.sample_counts import SampleCounts
 
 
 @dataclass(frozen=True)
@@ -126,6 +125,20 @@ def needs_whole_views(self: ImageEstimator, parameters: Tree, state: Any, batche
     """Former name of `needs_full_views`, as a method. Version 0.2 removes it."""
     warnings.warn(_RENAMED, DeprecationWarning, stacklevel=2)
     return self.needs_full_views(parameters, state, batches)
+
+
+class WithoutSnapshot:
+    """Base of image estimators that prepare and learn nothing for pixel mini-batches."""
+
+    needs_whole_views = needs_whole_views
+
+    def prepare(self, problem: Problem, state: Any) -> Any:
+        del problem
+        return state
+
+    def learn(self, problem: Problem, state: Any, sample: PixelSample, contribution: Any) -> Any:
+        del problem, sample, contribution
+        return state
 
 
 class ImageEstimator(Protocol):

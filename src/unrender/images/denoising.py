@@ -21,10 +21,10 @@ from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
-from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, needs_whole_views
+from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, WithoutSnapshot
 from unrender.images.plain import Plain
 from unrender.rendering.renderer import Space
-from unrender.scene.batches import Frame, PixelSample
+from unrender.scene.batches import Frame
 from unrender.scene.problem import Problem
 
 Denoiser = Literal["auto", "oidn", "optix", "variation"]
@@ -68,21 +68,13 @@ def _failure_of_optix() -> str | None:
     return variant.gpu_trial(f"mi.OptixDenoiser(mi.ScalarVector2u({_SMALLEST}, {_SMALLEST}))")
 
 
-def denoise(
-    image: np.ndarray,
-    albedo: np.ndarray | None = None,
-    normals: np.ndarray | None = None,
-    by: Denoiser = "auto",
-    fast: bool = False,
-) -> np.ndarray:
+def denoise(image: np.ndarray, by: Denoiser = "auto", fast: bool = False) -> np.ndarray:
     """Remove the noise of `image`. Biased; deterministic on the CPU.
 
     The result scales with the image: `denoise(c * image)` is `c * denoise(image)` up to rounding, for c > 0.
 
     Args:
         image: (H, W) or (H, W, 3), linear, finite, at least 1 x 1. Negative values count as 0.
-        albedo: (H, W, 3) in [0, 1], albedo of the first hit of each pixel, which guides the edges. Not for "variation".
-        normals: (H, W, 3) in [-1, 1], in the sensor's frame; requires `albedo`. Not for "variation".
         by: see `Denoiser`.
         fast: whether oidn uses its smaller network, which takes half the time and suits maps for sampling. The others have one quality.
 
@@ -90,69 +82,57 @@ def denoise(
         float32 of the shape of `image`, >= 0.
 
     Raises:
-        InputError: mismatched shapes, values that are not finite, or an unavailable denoiser.
+        InputError: another shape, values that are not finite, or an unavailable denoiser.
     """
     by = choose(by)
-    picture = _checked("image", image)
-    guides = {name: _checked(name, x) for name, x in (("albedo", albedo), ("normals", normals)) if x is not None}
-    for name, guide in guides.items():
-        if guide.shape != (*picture.shape[:2], 3):
-            raise InputError(f"denoise: {name} must be of shape {(*picture.shape[:2], 3)}, got {guide.shape}")
-        if by == "variation":
-            raise InputError(f"denoise: {name} is not supported by the denoiser variation")
-    if "normals" in guides and "albedo" not in guides:
-        raise InputError("denoise: normals require albedo")
-    picture = np.maximum(picture, 0)
+    picture = np.maximum(_checked(image), 0)
     scale = float(picture.mean(dtype=np.float64))
     if scale == 0:
         return picture
-    denoised = np.maximum(_DENOISERS[by](picture / np.float32(scale), guides, fast), 0)
+    denoised = np.maximum(_DENOISERS[by](picture / np.float32(scale), fast), 0)
     return np.ascontiguousarray(denoised * np.float32(scale), np.float32)
 
 
-def _checked(name: str, image: Any) -> np.ndarray:
+def _checked(image: Any) -> np.ndarray:
     array = np.asarray(image)
     if not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
-        raise InputError(f"denoise: {name} must be an array of numbers, got {array.dtype}")
+        raise InputError(f"denoise: image must be an array of numbers, got {array.dtype}")
     if (array.ndim not in (2, 3)) or (array.ndim == 3 and array.shape[2] != 3) or array.size == 0:
-        raise InputError(f"denoise: {name} must be of shape (H, W) or (H, W, 3), got {array.shape}")
+        raise InputError(f"denoise: image must be of shape (H, W) or (H, W, 3), got {array.shape}")
     with np.errstate(over="ignore"):
         array = array.astype(np.float32)
     if not np.isfinite(array).all():
-        raise InputError(f"denoise: {name} has values that are not finite")
+        raise InputError("denoise: image has values that are not finite")
     return array
 
 
-def _oidn(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.ndarray:
+def _oidn(picture: np.ndarray, fast: bool) -> np.ndarray:
     try:
         import pyoidn  # pyright: ignore[reportMissingImports]
     except (ImportError, OSError) as error:
         raise InputError(f"denoising needs pyoidn, which cannot be loaded here: {error}") from error
-    names = {"albedo": "albedo", "normals": "normal"}
-    arguments: dict[str, Any] = {names[name]: _continued(guide) for name, guide in guides.items()}
-    return _as(pyoidn.denoise(_continued(picture), **arguments, hdr=True, quality="fast" if fast else "high"), picture)
+    return _as(pyoidn.denoise(_continued(picture), hdr=True, quality="fast" if fast else "high"), picture)
 
 
-def _optix(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.ndarray:
+def _optix(picture: np.ndarray, fast: bool) -> np.ndarray:
     import mitsuba as mi
 
     del fast
     noisy = _continued(picture)
-    denoiser = _optix_denoiser(noisy.shape[1], noisy.shape[0], "albedo" in guides, "normals" in guides)
-    tensors = {name: mi.TensorXf(_continued(guide)) for name, guide in guides.items()}
-    return _as(np.array(denoiser(mi.TensorXf(noisy), **tensors).numpy()), picture)
+    denoiser = _optix_denoiser(noisy.shape[1], noisy.shape[0])
+    return _as(np.array(denoiser(mi.TensorXf(noisy)).numpy()), picture)
 
 
 @functools.lru_cache(maxsize=8)
-def _optix_denoiser(width: int, height: int, albedo: bool, normals: bool) -> Any:
+def _optix_denoiser(width: int, height: int) -> Any:
     import mitsuba as mi
 
-    return mi.OptixDenoiser(mi.ScalarVector2u(width, height), albedo=albedo, normals=normals)
+    return mi.OptixDenoiser(mi.ScalarVector2u(width, height))
 
 
-def _variation(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -> np.ndarray:
+def _variation(picture: np.ndarray, fast: bool) -> np.ndarray:
     """Apply the model of Rudin, Osher and Fatemi, weighted by the noise that the differences between neighbours show."""
-    del guides, fast
+    del fast
     from skimage.restoration import denoise_tv_chambolle
 
     steps = np.concatenate([np.abs(np.diff(picture, axis=axis)).reshape(-1) for axis in (0, 1)])
@@ -166,7 +146,7 @@ def _variation(picture: np.ndarray, guides: dict[str, np.ndarray], fast: bool) -
     return np.asarray(denoise_tv_chambolle(picture, weight=noise, channel_axis=channels))
 
 
-_DENOISERS: dict[str, Callable[[np.ndarray, dict[str, np.ndarray], bool], np.ndarray]] = {
+_DENOISERS: dict[str, Callable[[np.ndarray, bool], np.ndarray]] = {
     "oidn": _oidn,
     "optix": _optix,
     "variation": _variation,
@@ -182,14 +162,13 @@ def _continued(picture: np.ndarray) -> np.ndarray:
 
 
 def _as(padded: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """Crop the padded result to the size and channels of `picture`."""
     part = padded[: picture.shape[0], : picture.shape[1]]
     return part.mean(axis=2) if picture.ndim == 2 else part
 
 
 @register
 @dataclass(frozen=True)
-class Denoised:
+class Denoised(WithoutSnapshot):
     """The image of another estimator, denoised before the loss is evaluated. Biased.
 
     A denoiser trades variance for a systematic error that no number of steps averages out. The optimisation converges to parameters whose
@@ -214,6 +193,7 @@ class Denoised:
     inner: ImageEstimator = field(default_factory=Plain)
     by: Denoiser = "auto"
     groups: int = 2
+    pixelwise = False  # a denoiser needs the neighbours of a pixel
 
     def __post_init__(self):
         checks.integer("Denoised", "groups", self.groups, 2)
@@ -224,11 +204,6 @@ class Denoised:
     def space(self) -> Space | None:
         """The space of `inner`."""
         return self.inner.space
-
-    @property
-    def pixelwise(self) -> bool:
-        """False, because a denoiser needs the neighbours of a pixel."""
-        return False
 
     def init(self, problem: Problem, parameters: Tree) -> Any:
         """Return the state of `inner`. Raises `InputError` if the denoiser is not available."""
@@ -251,20 +226,10 @@ class Denoised:
         )
         return replace(estimate, filter=self._filter(problem), variance=None), contribution
 
-    needs_whole_views = needs_whole_views
-
     def needs_full_views(self, parameters: Tree, state: Any, batches: int) -> bool:
         """Return True."""
         del parameters, state, batches
         return True
-
-    def prepare(self, problem: Problem, state: Any) -> Any:
-        del problem
-        return state
-
-    def learn(self, problem: Problem, state: Any, sample: PixelSample, contribution: Any) -> Any:
-        del problem, sample, contribution
-        return state
 
     def advance(self, parameters: Tree, state: Any, contributions: tuple[Any, ...]) -> Any:
         return self.inner.advance(parameters, state, contributions)

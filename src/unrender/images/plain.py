@@ -8,37 +8,23 @@ from typing import Any
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.images.base import ImageEstimate, PairRequest, needs_whole_views, variance_of_mean
-from unrender.rendering.renderer import Space
-from unrender.scene.batches import Frame, FullView, PixelSample
+from unrender.images.base import ImageEstimate, PairRequest, WithoutSnapshot, variance_of_mean
+from unrender.scene.batches import Frame, FullView
 from unrender.scene.problem import Problem
-from unrender.scene.upsampling import Upsampler
+from unrender.scene.upsampling import Unchanged
 
 
 @dataclass(frozen=True)
-class PlainState:
+class PlainState(Unchanged):
     """Empty state."""
-
-    def upsampled(self, upsampler: Upsampler) -> PlainState:
-        """Return this state, which has no array of a parameter's shape."""
-        del upsampler
-        return self
 
 
 @register
 @dataclass(frozen=True)
-class Plain:
+class Plain(WithoutSnapshot):
     """One independent rendering per step. Unbiased."""
 
-    @property
-    def space(self) -> Space | None:
-        """None, because steps share no samples."""
-        return None
-
-    @property
-    def pixelwise(self) -> bool:
-        """True."""
-        return True
+    space, pixelwise = None, True
 
     def init(self, problem: Problem, parameters: Tree) -> PlainState:
         del problem, parameters
@@ -67,20 +53,10 @@ class Plain:
         variance = variance_of_mean(rendering.images, counts)
         return ImageEstimate(rendering.images, rendering.paths, {}, rendering.previous, variance, counts=counts), None
 
-    needs_whole_views = needs_whole_views
-
     def needs_full_views(self, parameters: Tree, state: PlainState, batches: int) -> bool:
         """Return False."""
         del parameters, state, batches
         return False
-
-    def prepare(self, problem: Problem, state: PlainState) -> PlainState:
-        del problem
-        return state
-
-    def learn(self, problem: Problem, state: PlainState, sample: PixelSample, contribution: Any) -> PlainState:
-        del problem, sample, contribution
-        return state
 
     def advance(self, parameters: Tree, state: PlainState, contributions: tuple[Any, ...]) -> PlainState:
         del parameters, contributions

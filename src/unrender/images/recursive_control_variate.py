@@ -20,9 +20,8 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, needs_whole_views, variance_of_mean
 from unrender.rendering.renderer import Rendering, Space
-from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample
+from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample, SampleCounts
 from unrender.scene.problem import Problem
-from unrender.scene.sample_counts import SampleCounts
 from unrender.scene.upsampling import Upsampler
 from unrender.statistics import welford
 from unrender.statistics.recursion import advance
@@ -137,6 +136,7 @@ class RecursiveControlVariate:
     whole_views: int = 20
     learn_from_draws: bool = True
     max_weight: float = 1.0
+    pixelwise = True  # with a snapshot as control variate
 
     def __post_init__(self):
         checks.flags(self)
@@ -151,11 +151,6 @@ class RecursiveControlVariate:
     def init(self, problem: Problem, parameters: Tree) -> RecursiveControlVariateState:
         del problem, parameters
         return RecursiveControlVariateState()
-
-    @property
-    def pixelwise(self) -> bool:
-        """True, with a snapshot as control variate."""
-        return True
 
     needs_whole_views = needs_whole_views
 

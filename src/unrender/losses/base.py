@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from unrender.core.arrays import Array
 
 
+@runtime_checkable
 class Loss(Protocol):
     """Distance of an image to its reference per element. Both arrays have the same shape and contain linear radiance."""
 

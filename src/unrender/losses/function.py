@@ -37,21 +37,12 @@ class FunctionLoss:
     """
 
     function: Callable[..., Any]
+    linear, pixelwise = False, False  # nothing is known about the function
 
     def __post_init__(self):
         if isinstance(self.function, type) or not callable(self.function):
             raise InputError(f"expected one of unrender.losses, such as L2(), or a function, got {self.function!r:.80}")
         self.takes_reference  # noqa: B018 (raises for arguments that cannot be filled in)
-
-    @property
-    def linear(self) -> bool:
-        """False, because nothing is known about the function."""
-        return False
-
-    @property
-    def pixelwise(self) -> bool:
-        """False, because nothing is known about the function."""
-        return False
 
     @functools.cached_property
     def takes_reference(self) -> bool:
@@ -105,7 +96,6 @@ class FunctionLoss:
         raise InputError(f"{self!r}: expected a function from an image (H, W, 3) to a scalar; {'; '.join(failures)}")
 
     def _evaluate(self, image: Array, reference: Array, derivative: bool) -> tuple[Array, Array]:
-        """Return the loss of one image (H, W, 3) and, if requested, its derivative."""
         if "_framework" not in self.__dict__:
             self.prepare(arrays.numpy(reference))
         return _CALLS[self.__dict__["_framework"]](self, image, reference, derivative)

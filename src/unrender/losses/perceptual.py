@@ -60,6 +60,7 @@ class Perceptual:
     weights: str | Path | None = None
     layers: tuple[str, ...] = ("relu1_2", "relu2_2", "relu3_3")
     strength: float = 1.0
+    linear, pixelwise = False, False
 
     def __post_init__(self):
         checks.number("Perceptual", "strength", self.strength, above=0.0)
@@ -73,16 +74,6 @@ class Perceptual:
         if self.weights is not None and not isinstance(self.weights, (str, Path)):
             raise InputError(f"Perceptual: weights must be a file, got {self.weights!r}")
         self._network(np.dtype(np.float32))  # reports an invalid file at construction
-
-    @property
-    def linear(self) -> bool:
-        """False."""
-        return False
-
-    @property
-    def pixelwise(self) -> bool:
-        """False."""
-        return False
 
     def value(self, image: Array, reference: Array) -> Array:
         """Return the loss of each image (..., H, W, 3), repeated in all its elements."""

@@ -16,33 +16,12 @@ _CLEARLY = 4.0
 """Standard errors by which images are darker than a lower bound that they do not reach."""
 
 
-class _Pixelwise:
-    """Base of the losses in this module."""
-
-    @property
-    def pixelwise(self) -> bool:
-        """True."""
-        return True
-
-
-class _WithLinearDerivative(_Pixelwise):
-    @property
-    def linear(self) -> bool:
-        """True."""
-        return True
-
-
-class _WithNonlinearDerivative(_Pixelwise):
-    @property
-    def linear(self) -> bool:
-        """False."""
-        return False
-
-
 @register(position=1)
 @dataclass(frozen=True)
-class L1(_WithNonlinearDerivative):
+class L1:
     """|I − R|. The derivative is the sign, 0 for equal values. Noise biases it more the closer I is to R."""
+
+    linear, pixelwise = False, True
 
     def value(self, image: Array, reference: Array) -> Array:
         return arrays.absolute(image - reference)
@@ -53,8 +32,10 @@ class L1(_WithNonlinearDerivative):
 
 @register(position=2)
 @dataclass(frozen=True)
-class L2(_WithLinearDerivative):
+class L2:
     """(I − R)²."""
+
+    linear, pixelwise = True, True
 
     def value(self, image: Array, reference: Array) -> Array:
         difference = image - reference
@@ -66,7 +47,7 @@ class L2(_WithLinearDerivative):
 
 @register(position=3)
 @dataclass(frozen=True)
-class RelativeL2(_WithLinearDerivative):
+class RelativeL2:
     """(I − R)² / (R² + ε): squared relative error.
 
     The denominator contains the reference only, not the noisy image, so the derivative is linear. The estimators sample the image and the
@@ -76,6 +57,8 @@ class RelativeL2(_WithLinearDerivative):
     Args:
         epsilon: ε in squared radiance, > 0. For R well below √ε the loss is the squared error over ε.
     """
+
+    linear, pixelwise = True, True
 
     epsilon: float = 1e-2
 
@@ -92,12 +75,14 @@ class RelativeL2(_WithLinearDerivative):
 
 @register(position=4)
 @dataclass(frozen=True)
-class Huber(_WithNonlinearDerivative):
+class Huber:
     """(I − R)²/2 for |I − R| <= δ, else δ (|I − R| − δ/2). The derivative is I − R clamped to [−δ, δ].
 
     Args:
         delta: δ in radiance, > 0.
     """
+
+    linear, pixelwise = False, True
 
     delta: float = 0.1
 
@@ -133,21 +118,12 @@ class Censored:
 
     loss: Loss = field(default_factory=L1)
     white: float = 0.95
+    linear, pixelwise = False, True
 
     def __post_init__(self):
         checks.number("Censored", "white", self.white, above=0.0)
         if isinstance(self.loss, type) or not getattr(self.loss, "pixelwise", False):
             raise InputError(f"Censored: loss must be pixelwise, such as L1(), got {self.loss!r:.80}")
-
-    @property
-    def linear(self) -> bool:
-        """False."""
-        return False
-
-    @property
-    def pixelwise(self) -> bool:
-        """True."""
-        return True
 
     def value(self, image: Array, reference: Array) -> Array:
         return self.loss.value(self._censored(image, reference), reference)

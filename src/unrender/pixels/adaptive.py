@@ -12,10 +12,9 @@ from unrender.core import checks
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.pixels.base import DrawStatistics, MiniBatch
+from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
 from unrender.pixels.guided import GuidedOptions, GuidedSampler, GuidedSamplerState, ImportanceRule, Maps
-from unrender.pixels.map_denoising import MapDenoiser
-from unrender.pixels.pixel_statistics import PixelStatistics
+from unrender.pixels.pixel_statistics import MapDenoiser, PixelStatistics
 from unrender.pixels.tiles import Tiles
 from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
@@ -87,7 +86,7 @@ class Adaptive(_Guided):
             units of Adam's steps, and the means over each parameter's elements are summed. In the paper's sum of plain variances the
             parameters with the largest gradients dominate.
         denoiser: denoiser of the maps: "oidn", "optix", "variation" (see `images.denoising`), "pooling" with neighbouring tiles
-            (`map_denoising.pool`), "none", or "auto": optix on a GPU, oidn if installed, else pooling.
+            (`pixel_statistics.pool`), "none", or "auto": optix on a GPU, oidn if installed, else pooling.
         learn_from_draws: whether samples of the steps update the maps; otherwise only the updates do, as in the paper.
         by_cost: whether c_j = 1 + v / 2 with the mean number v of vertices of a path through the pixel, which minimises variance times
             cost, because paths that leave the scene are cheap. λ accounts for the cost, too. Otherwise c_j = 1.
@@ -151,7 +150,7 @@ class _GradientVariance(ImportanceRule):
 
 @register
 @dataclass(frozen=True)
-class LossProportional(_Guided):
+class LossProportional(_Guided, PixelSampler):
     """Importance sampling of pixels, p_j = λ u_j + (1 - λ) q_j with uniform u_j and q_j ∝ E|∂L/∂I_j|, summed over the channels. Unbiased.
 
     This is Eq. 5 of the paper of `Adaptive`. Unlike `Adaptive` it ignores noise and parameter derivatives.
@@ -175,11 +174,6 @@ class LossProportional(_Guided):
         del problem
         own = self.count, self.refresh, self.samples, self.uniform, self.stratified, self.denoiser
         return GuidedSampler("LossProportional", GuidedOptions(*own), _LossDerivative())
-
-    def observe(self, problem: Problem, state: GuidedSamplerState, gradient: Tree) -> GuidedSamplerState:
-        """Return the state unchanged."""
-        del problem, gradient
-        return state
 
 
 @dataclass(frozen=True)

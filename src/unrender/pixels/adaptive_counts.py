@@ -14,12 +14,11 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.base import DrawStatistics, MiniBatch
-from unrender.pixels.map_denoising import pool
+from unrender.pixels.pixel_statistics import pool
 from unrender.pixels.tiles import InverseCdfTable, Maps, Tiles, TileSamples, cut, finite
 from unrender.pixels.uniform_share import ShareEvidence
-from unrender.scene.batches import PixelSample
+from unrender.scene.batches import PixelSample, SampleShares
 from unrender.scene.problem import Problem
-from unrender.scene.sample_counts import SampleShares
 from unrender.scene.upsampling import SQUARES, Upsampler
 
 _TILES = 1 << 16
@@ -33,9 +32,6 @@ _COUNTED = 8
 
 _MEMORY = 0.8 ** (1 / 20)
 """Decay per step of the weight of earlier samples."""
-
-_PRIOR = 64.0
-"""Number of paths at which a tile's own mean weighs as much as its surroundings (`map_denoising.pool`)."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ class AdaptiveCounts:
     if the images' noise dominates.
 
     The samples of the first steps, and of every `refresh`-th step, estimate both factors, the second along random ±1 tangents
-    (`RenderSession.tangent_moment`). Tiles with few paths are pooled with neighbouring ones (`map_denoising.pool`). λ starts at 0.8 and
+    (`RenderSession.tangent_moment`). Tiles with few paths are pooled with neighbouring ones (`pixel_statistics.pool`). λ starts at 0.8 and
     decreases to 0.1 as samples confirm the maps (`uniform_share.choose`), under the assumption that the images' noise dominates. Each
     view has its own s samples per pixel.
 
@@ -197,7 +193,7 @@ class AdaptiveCounts:
         self, tiles: Tiles, state: AdaptiveCountsState, gain: Callable[[np.ndarray], np.ndarray]
     ) -> AdaptiveCountsState:
         """Return the state with a density of samples from its maps and its evidence."""
-        pooled = tuple(pool(tiles, values, state.counts, _PRIOR) for values in state.maps)
+        pooled = tuple(pool(tiles, values, state.counts) for values in state.maps)
         density = np.sqrt((pooled[0] * pooled[1]).sum(axis=1) / state.costs)
         parts = zip(tiles.split(density), tiles.split(tiles.sizes), strict=True)
         means = [np.average(part, weights=size) for part, size in parts]

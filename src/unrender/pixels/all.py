@@ -7,24 +7,19 @@ from dataclasses import dataclass
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.pixels.base import MiniBatch
+from unrender.pixels.base import MiniBatch, PixelSampler
 from unrender.scene.problem import Problem
-from unrender.scene.upsampling import Upsampler
+from unrender.scene.upsampling import Unchanged
 
 
 @dataclass(frozen=True)
-class AllState:
+class AllState(Unchanged):
     """Empty state."""
-
-    def upsampled(self, upsampler: Upsampler) -> AllState:
-        """Return this state, which has no array of a parameter's shape."""
-        del upsampler
-        return self
 
 
 @register
 @dataclass(frozen=True)
-class All:
+class All(PixelSampler):
     """All pixels of all views at every step."""
 
     def init(self, problem: Problem, parameters: Tree) -> AllState:
@@ -38,8 +33,3 @@ class All:
     def redraw(self, problem: Problem, state: AllState, key: Key) -> MiniBatch:
         del problem, state, key
         return MiniBatch(None)
-
-    def observe(self, problem: Problem, state: AllState, gradient: Tree) -> AllState:
-        """Return the state unchanged."""
-        del problem, gradient
-        return state

@@ -10,9 +10,8 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.core.trees import Tree
-from unrender.scene.batches import PixelSample
+from unrender.scene.batches import PixelSample, SampleShares
 from unrender.scene.problem import Problem
-from unrender.scene.sample_counts import SampleShares
 
 _FEWEST_REFUSED = 1 << 16
 _MOST_DRAWS = 4
@@ -56,6 +55,7 @@ class DrawStatistics:
     counts: np.ndarray | None = None
 
 
+@runtime_checkable
 class PixelSampler(Protocol):
     """Immutable pixel sampler; everything that changes is in the state.
 
@@ -72,8 +72,12 @@ class PixelSampler(Protocol):
         ...
 
     def observe(self, problem: Problem, state: Any, gradient: Tree) -> Any:
-        """Return the state after a step with this gradient with respect to u (`Problem.coordinates`), before preconditioning."""
-        ...
+        """Return the state after a step with this gradient with respect to u (`Problem.coordinates`), before preconditioning.
+
+        The same by default.
+        """
+        del problem, gradient
+        return state
 
 
 @runtime_checkable

@@ -14,7 +14,7 @@ from unrender.core.random import Key
 from unrender.core.trees import Tree
 from unrender.pixels import pixel_statistics, uniform_share
 from unrender.pixels.base import DrawStatistics, MiniBatch, check_batch
-from unrender.pixels.map_denoising import MAP_DENOISERS, MapDenoiser, denoise_map
+from unrender.pixels.pixel_statistics import MAP_DENOISERS, MapDenoiser, denoise_map
 from unrender.pixels.tiles import FACTORS, InverseCdfTable, Maps, Tiles, TileSamples, cut, finite
 from unrender.pixels.uniform_share import ShareEvidence
 from unrender.scene.batches import PixelSample
@@ -272,7 +272,6 @@ class GuidedSampler:
         return replace(state, maps=tuple(maps), counts=tuple(counts), evidence=evidence, since=0)
 
     def _with_probabilities(self, problem: Problem, tiles: Tiles, state: GuidedSamplerState) -> GuidedSamplerState:
-        """Return the state with probabilities from its maps and its evidence."""
         denoised = tuple(
             np.maximum(denoise_map(tiles, values, self.options.denoiser, counts), 0.0)
             for values, counts in zip(state.maps[:FACTORS], state.counts[:FACTORS], strict=True)

@@ -1,34 +1,33 @@
-"""Pixel mini-batches with equal probabilities."""
+"""Mini-batches in which all pixels, or all views, are equally likely."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from unrender.core import checks
+import numpy as np
+
+from unrender.core import arrays, checks
 from unrender.core.random import Key
 from unrender.core.registry import register
 from unrender.core.trees import Tree
-from unrender.pixels.base import MiniBatch, check_batch
+from unrender.pixels.base import MiniBatch, PixelSampler, check_batch
 from unrender.pixels.tiles import InverseCdfTable, cut
+from unrender.scene.batches import PixelSample
 from unrender.scene.problem import Problem
-from unrender.scene.upsampling import Upsampler
+from unrender.scene.upsampling import Unchanged
 
 
 @dataclass(frozen=True)
-class UniformState:
+class UniformState(Unchanged):
     """State between steps: the constant table that pixels are sampled from."""
 
     table: InverseCdfTable
 
-    def upsampled(self, upsampler: Upsampler) -> UniformState:
-        """Return this state, which has no array of a parameter's shape."""
-        del upsampler
-        return self
-
 
 @register
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(PixelSampler):
     """Uniform sampling of the pixels of all views. Unbiased.
 
     Args:
@@ -57,7 +56,46 @@ class Uniform:
         del problem
         return MiniBatch(state.table.draw(self.count, key, self.stratified))
 
-    def observe(self, problem: Problem, state: UniformState, gradient: Tree) -> UniformState:
-        """Return the state unchanged."""
-        del problem, gradient
-        return state
+
+@register
+@dataclass(frozen=True)
+class Views(PixelSampler):
+    """Mini-batch of full views: each set of `count` views is equally likely, and all its pixels are rendered. Unbiased.
+
+    It reduces costs that grow with the number of views, which mini-batches of pixels (`Uniform`) do not: boundary gradients of moving
+    shapes, and launches of small images. The differences between views add to the variance of the gradient.
+
+    Args:
+        count: views per step, >= 1; all views if the problem has no more.
+    """
+
+    count: int
+
+    def __post_init__(self):
+        checks.integer("Views", "count", self.count, at_least=1)
+
+    def init(self, problem: Problem, parameters: Tree) -> None:
+        """Return None, as there is no state. Raises `InputError` for a loss that is not pixelwise."""
+        del parameters
+        check_batch("Views", problem, 1)
+
+    def draw(self, problem: Problem, parameters: Tree, state: None, key: Key) -> tuple[MiniBatch, None]:
+        del parameters, state
+        return self.redraw(problem, None, key), None
+
+    def redraw(self, problem: Problem, state: None, key: Key) -> MiniBatch:
+        del state
+        total = len(problem.views)
+        count, random = min(self.count, total), np.random.default_rng(key.uint32())
+        chosen = np.sort(random.choice(total, count, replace=False))
+        return _all_pixels(problem, chosen, np.full(count, total / count))
+
+
+def _all_pixels(problem: Problem, chosen: np.ndarray, weights: np.ndarray) -> MiniBatch:
+    """Return all pixels of the chosen views, with the views' weights."""
+    known = problem.sizes
+    sizes = [math.prod(known[view]) for view in chosen]
+    like = problem.renderer.array(np.repeat(weights, sizes)[:, None].astype(np.float32))
+    views = arrays.like_integers(np.repeat(chosen, sizes), like)
+    pixels = arrays.like_integers(np.concatenate([np.arange(size) for size in sizes]), like)
+    return MiniBatch(PixelSample(views, pixels, like))

@@ -10,6 +10,7 @@ from unrender.core.arrays import Array
 from unrender.preconditioners.mesh import MeshTopology
 
 
+@runtime_checkable
 class Preconditioner(Protocol):
     """A symmetric positive definite linear map S of one parameter's gradients and steps.
 

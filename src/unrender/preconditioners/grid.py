@@ -262,7 +262,6 @@ class GridPyramid:
 
 
 def _eigenvalues(waves: np.ndarray) -> np.ndarray:
-    """Return the eigenvalues of L for waves of frequencies (..., axes)."""
     return (2.0 - 2.0 * np.cos(waves)).sum(axis=-1)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,6 +16,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import (
     Camera,
+    Derivatives,
     ParameterInfo,
     Renderer,
     Rendering,
@@ -144,9 +144,7 @@ class PosedCameras(WithParameter):
             self.corrections.shape, of.differentiable, False, "it moves sensors", perturbable=True, viewpoint=True
         )
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         differentiable, own = differentiated(keys, derivatives), [key for key in keys if key != POSES]
         if len(own) == len(keys):
             return self.inner.prepare(own, space, differentiable)

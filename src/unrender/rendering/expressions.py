@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,16 @@ from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.io import bounded_files
 from unrender.rendering.expression_texts import Function, parse
-from unrender.rendering.renderer import ParameterInfo, Renderer, RenderSession, SampleRequest, Space, differentiated
-from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
+from unrender.rendering.renderer import (
+    Derivatives,
+    ParameterInfo,
+    Renderer,
+    RenderSession,
+    SampleRequest,
+    Space,
+    differentiated,
+)
+from unrender.rendering.wrapper import RendererWrapper, SessionWrapper, combined, layers
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +117,7 @@ class ExpressionRenderer(RendererWrapper):
         own = {key: self.array(self.unknowns[key]) for key in keys if key in self.unknowns}
         return {key: own[key] if key in own else scene[key] for key in keys}
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         differentiable = differentiated(keys, derivatives)
         inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(differentiable)))
         return _ExpressionSession(self, inner, differentiable)
@@ -205,11 +210,7 @@ def with_expressions(renderer: Renderer, expressions: Mapping[str, Any], unknown
 
 def expression_layer(renderer: Any) -> ExpressionRenderer | None:
     """Return the `ExpressionRenderer` among nested wrappers; None where there is none."""
-    while isinstance(renderer, RendererWrapper):
-        if isinstance(renderer, ExpressionRenderer):
-            return renderer
-        renderer = renderer.inner
-    return None
+    return next((layer for layer in layers(renderer) if isinstance(layer, ExpressionRenderer)), None)
 
 
 def are_storable(renderer: Any) -> bool:
@@ -219,22 +220,8 @@ def are_storable(renderer: Any) -> bool:
 
 
 def _info(shape: tuple[int, ...], targets: list[ParameterInfo]) -> ParameterInfo:
-    """Return the description of an unknown on which these parameters depend."""
-    sensors = {info.sensor for info in targets}
-    formed = next((info for info in targets if info.scattering), None)
-    return ParameterInfo(
-        shape,
-        differentiable=all(info.differentiable for info in targets),
-        shares_paths=all(info.shares_paths for info in targets),
-        reason=next((info.reason for info in targets if info.reason), ""),
-        perturbable=all(info.perturbable for info in targets),
-        rigid=any(info.rigid for info in targets),
-        viewpoint=any(info.viewpoint for info in targets),
-        sensor=sensors.pop() if len(sensors) == 1 else None,
-        nonlinear=any(info.nonlinear or info.welded for info in targets),
-        scattering=formed.scattering if formed else "",
-        of_expression=True,
-    )
+    nonlinear = any(info.nonlinear or info.welded for info in targets)
+    return replace(ParameterInfo(shape, **combined(targets)), nonlinear=nonlinear, of_expression=True)
 
 
 def _shaped(one: Expression, values: _Reads, shape: tuple[int, ...]) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from collections.abc import Set as AbstractSet
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.rendering.renderer import Renderer, RenderSession, SampleRequest, Space, differentiated
+from unrender.rendering.renderer import Derivatives, Renderer, RenderSession, SampleRequest, Space, differentiated
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
 
@@ -30,9 +29,7 @@ class PartialDerivatives(RendererWrapper):
         super().__init__(inner)
         self.constant = constant
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         differentiable = differentiated(keys, derivatives) - self.constant
         return _PartialSession(self.inner.prepare(keys, space, differentiable), self.constant)
 
@@ -64,9 +61,7 @@ class HeldParameters(RendererWrapper):
         super().__init__(inner)
         self.held = held
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         everything = [*keys, *(key for key in self.held if key not in keys)]
         session = self.inner.prepare(everything, space, differentiated(keys, derivatives))
         return _HeldSession(_PartialSession(session, frozenset(self.held)), self.held)
@@ -93,9 +88,7 @@ class EliminatedParameters(HeldParameters):
         super().__init__(inner, held)
         self.origin, self.slopes, self.bounds = origin, slopes, bounds
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         if differentiated(keys, derivatives):
             raise InputError("EliminatedParameters: only images are available, no derivatives")
         everything = [*keys, *(key for key in self.held if key not in keys)]

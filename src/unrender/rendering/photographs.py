@@ -8,14 +8,14 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.rendering.camera_poses import POSES, PosedCameras
-from unrender.rendering.exposure import EXPOSURE, ExposedRenderer
+from unrender.rendering.exposure import EXPOSURE, VIGNETTING, ExposedRenderer, VignettedRenderer
 from unrender.rendering.expressions import ExpressionRenderer
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import Renderer
 from unrender.rendering.response import RESPONSE, RespondingRenderer
 from unrender.rendering.tied import TiedRenderer
-from unrender.rendering.vignetting import VIGNETTING, VignettedRenderer
 from unrender.rendering.worlds import WorldsRenderer
+from unrender.rendering.wrapper import layers, unwrapped
 
 OF_PHOTOGRAPHS = (POSES, VIGNETTING, EXPOSURE, RESPONSE)
 """Keys of the photographs' parameters, from the innermost renderer to the outermost. No scene has these keys."""
@@ -31,33 +31,22 @@ def check_response(names: Collection[str]) -> None:
 
 def scene_renderer(renderer: Renderer) -> Renderer:
     """Return the renderer of the scene alone, without ties, expressions, parameters of photographs and worlds of single views."""
-    while isinstance(renderer, (WithParameter, TiedRenderer, ExpressionRenderer, WorldsRenderer)):
-        renderer = renderer.inner
-    return renderer
+    return unwrapped(renderer, (WithParameter, TiedRenderer, ExpressionRenderer, WorldsRenderer))
 
 
 def member_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the values with each tie replaced by its members, and unknowns of expressions by the parameters that depend on them."""
-    base = _without_photographs(renderer)
+    base = unwrapped(renderer, WithParameter)
     expanded = dict(values)
     while isinstance(base, (TiedRenderer, ExpressionRenderer)):
         expanded, base = base.scene_values(expanded), base.inner
     return expanded
 
 
-def _without_photographs(renderer: Renderer) -> Renderer:
-    while isinstance(renderer, WithParameter):
-        renderer = renderer.inner
-    return renderer
-
-
 def sensors_with_rows(renderer: Renderer) -> tuple[int, ...] | None:
     """Return the indices of the sensors that have rows of exposures or poses, in the order of the rows; None if there are no such rows."""
-    while isinstance(renderer, WithParameter):
-        if isinstance(renderer, (ExposedRenderer, PosedCameras)):
-            return tuple(renderer.rows)
-        renderer = renderer.inner
-    return None
+    wrappers = (layer for layer in layers(renderer) if isinstance(layer, (ExposedRenderer, PosedCameras)))
+    return next((tuple(layer.rows) for layer in wrappers), None)
 
 
 def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequence[int]) -> Renderer:
@@ -79,7 +68,7 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
     rows = sensors_with_rows(renderer)
     if set(camera_keys) <= renderer.parameters().keys() and (rows is None or set(rows) >= set(sensors)):
         return renderer
-    wrapped = _without_photographs(renderer)
+    wrapped = unwrapped(renderer, WithParameter)
     if POSES in camera_keys:
         wrapped = PosedCameras(wrapped, list(sensors))
     if VIGNETTING in camera_keys:
@@ -92,8 +81,7 @@ def with_photographs(renderer: Renderer, keys: Collection[str], sensors: Sequenc
 def scene_values(renderer: Renderer, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the values that a scene can store: camera poses and the members of ties, without response, exposure and vignetting."""
     scene = {key: value for key, value in values.items() if key not in OF_PHOTOGRAPHS}
-    while isinstance(renderer, WithParameter):
-        if isinstance(renderer, PosedCameras) and POSES in values:
-            scene |= renderer.corrections.poses(np.asarray(values[POSES]))
-        renderer = renderer.inner
+    for layer in layers(renderer):
+        if isinstance(layer, PosedCameras) and POSES in values:
+            scene |= layer.corrections.poses(np.asarray(values[POSES]))
     return member_values(renderer, scene)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -14,6 +13,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.renderer import (
+    Derivatives,
     EmitterMoments,
     ParameterInfo,
     Rendering,
@@ -54,9 +54,7 @@ class WithParameter(RendererWrapper):
 class PictureRenderer(WithParameter):
     """A renderer whose parameter acts on each pixel of the pictures independently."""
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         own = [key for key in keys if key != self.key]
         inner = self.inner.prepare(own, space, differentiated(own, derivatives))
         return inner if len(own) == len(keys) else self.session(inner)

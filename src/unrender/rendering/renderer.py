@@ -22,6 +22,8 @@ from unrender.rendering.parameter_errors import Role
 Space = Literal["path", "primary"]
 """Sample space that two states share: "path" for one set of paths, "primary" for one set of random numbers."""
 
+Derivatives = bool | AbstractSet[str]
+"""Whether derivatives will be requested, or the keys that they will be requested for."""
 LossWeights = Callable[[Array], Array]
 """Function from an image (H, W, 3) to the derivative of the loss by each of its elements."""
 
@@ -137,7 +139,7 @@ class Rendering:
     paths: Any
 
 
-def differentiated(keys: Iterable[str], derivatives: bool | AbstractSet[str]) -> frozenset[str]:
+def differentiated(keys: Iterable[str], derivatives: Derivatives) -> frozenset[str]:
     """Return the keys among `keys` that the argument `derivatives` of `Renderer.prepare` selects."""
     known = frozenset(keys)
     return known & (derivatives if not isinstance(derivatives, bool) else known if derivatives else frozenset())
@@ -278,9 +280,7 @@ class Renderer(Protocol):
         """Return the values as an array of this renderer."""
         ...
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         """Return a session that renders the scene at other values of these parameters. Repeated calls with equal arguments are cheap.
 
         `space` is only validated: any session for the same parameters with derivatives may replay a rendering's paths.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
@@ -17,6 +16,7 @@ from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.picture_factors import WithParameter
 from unrender.rendering.renderer import (
+    Derivatives,
     ParameterInfo,
     Renderer,
     RenderSession,
@@ -25,7 +25,7 @@ from unrender.rendering.renderer import (
     Space,
     differentiated,
 )
-from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
+from unrender.rendering.wrapper import RendererWrapper, SessionWrapper, combined, unwrapped
 
 _ENCODED = ("normal", "direction")
 """Roles whose values represent vectors. Heights are numbers."""
@@ -77,29 +77,19 @@ class Tie:
                     self.key, f"{member} and {first} read their values differently; expected parameters of one kind"
                 )
         low, high = self._limits(infos)
-        sensors = {info.sensor for info in infos}
         return replace(
             infos[0],
-            differentiable=all(info.differentiable for info in infos),
-            shares_paths=all(info.shares_paths for info in infos),
-            reason=next((info.reason for info in infos if info.reason), ""),
+            **combined(infos),
             lowest=low,
             highest=high,
-            perturbable=all(info.perturbable for info in infos),
             resizable=all(info.resizable for info in infos),
-            rigid=any(info.rigid for info in infos),
             light=all(info.light for info in infos),
-            viewpoint=any(info.viewpoint for info in infos),
-            sensor=sensors.pop() if len(sensors) == 1 else None,
             brightness=infos[0].brightness if len({info.brightness for info in infos}) == 1 else "",
-            nonlinear=any(info.nonlinear for info in infos),
-            scattering=next((info.scattering for info in infos if info.scattering), ""),
             of_expression=any(info.of_expression for info in infos),
             length=max(info.length for info in infos),
         )
 
     def _limits(self, infos: Iterable[ParameterInfo]) -> tuple[float | None, float | None]:
-        """Return the range of the unknown in which every member is within its own limits."""
         lows, highs = [], []
         for info, factor in zip(infos, self.factors.values(), strict=True):
             ends = [None if end is None else end / factor for end in (info.lowest, info.highest)]
@@ -122,9 +112,7 @@ def with_ties(renderer: Renderer, ties: Iterable[Tie]) -> Renderer:
 
     Raises `KeyedError` if the members of a tie are incompatible, or two ties share a member.
     """
-    ties, base = tuple(ties), renderer
-    while isinstance(base, WithParameter):
-        base = base.inner
+    ties, base = tuple(ties), unwrapped(renderer, WithParameter)
     held = base.ties if isinstance(base, TiedRenderer) else ()
     if held == ties:
         return renderer
@@ -166,9 +154,7 @@ class TiedRenderer(RendererWrapper):
         inner = self.inner.values([first[key][0] if key in first else key for key in keys])
         return {key: inner[first[key][0]] * (1 / first[key][1]) if key in first else inner[key] for key in keys}
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         differentiable = differentiated(keys, derivatives)
         inner = self.inner.prepare(self.expanded(keys), space, frozenset(self.expanded(differentiable)))
         return TiedSession(self, inner)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.picture_format import PictureFormat, format_of
 from unrender.rendering.renderer import (
+    Derivatives,
     EmitterMoments,
     ParameterInfo,
     Renderer,
@@ -150,9 +150,7 @@ class WorldsRenderer(RendererWrapper):
         own = [format_of(self.inner, sensor) for sensor in range(self._count)]
         return [*own, *(format_of(world.renderer, world.sensor) for world in self.worlds)]
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         differentiable, sessions = differentiated(keys, derivatives), {}
         for renderer in self.renderers:
             known = renderer.parameters()
@@ -372,7 +370,6 @@ def _of_part(images: Array, part: _Part) -> Array:
 
 
 def _joined(parts: Sequence[Any], paths: Sequence[_Part]) -> Array:
-    """Return the images of the full request from those of its parts."""
     if paths[0].chosen is None:
         return parts[0]
     if len(arrays.shape(parts[0])) < 3:  # of one group, without its axis

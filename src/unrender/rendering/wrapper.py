@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.picture_format import PictureFormat, format_of
 from unrender.rendering.renderer import (
     Camera,
+    Derivatives,
     EmitterMoments,
     ParameterInfo,
     Remeshable,
@@ -56,9 +56,7 @@ class RendererWrapper:
     def array(self, values: np.ndarray) -> Array:
         return self.inner.array(values)
 
-    def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
-    ) -> RenderSession:
+    def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         return self.inner.prepare(keys, space, derivatives)
 
     def formats(self) -> Sequence[PictureFormat]:
@@ -163,3 +161,29 @@ class SessionWrapper:
         state, inner_tangents = self._state(parameters), self._tangents(parameters, tangents)
         inner = drawing_emitters(self._inner)
         return inner.emitter_moments(state, self._paths(paths), inner_tangents, self._weights(weights), noise)
+
+
+def combined(infos: Sequence[ParameterInfo]) -> dict[str, Any]:
+    """Return the fields of a parameter that sets several others: the capabilities that all of them have, the effects that any has."""
+    sensors = {info.sensor for info in infos}
+    fields: dict[str, Any] = {
+        name: all(getattr(info, name) for info in infos) for name in ("differentiable", "shares_paths", "perturbable")
+    }
+    fields |= {name: any(getattr(info, name) for info in infos) for name in ("rigid", "viewpoint", "nonlinear")}
+    texts = {name: [getattr(info, name) for info in infos] for name in ("reason", "scattering")}
+    fields |= {name: next(filter(None, of_each), "") for name, of_each in texts.items()}
+    return fields | {"sensor": sensors.pop() if len(sensors) == 1 else None}
+
+
+def layers(renderer: Any) -> Iterator[RendererWrapper]:
+    """Yield the nested wrappers of a renderer, the outermost first."""
+    while isinstance(renderer, RendererWrapper):
+        yield renderer
+        renderer = renderer.inner
+
+
+def unwrapped(renderer: Any, kinds: type | tuple[type, ...]) -> Any:
+    """Return the renderer without the outermost wrappers of these classes."""
+    while isinstance(renderer, kinds):
+        renderer = renderer.inner
+    return renderer

@@ -25,11 +25,10 @@ from unrender.scene import notebook
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.coordinates import Coordinates
 from unrender.scene.executor import LOCAL, Executor
-from unrender.scene.mesh_checks import check_surfaces
-from unrender.scene.parameter import Parameter, ParameterSettings, members_of, scene_keys, tied, ties_of
-from unrender.scene.references import References, likelihood_scale
+from unrender.scene.meshes import check_surfaces
+from unrender.scene.parameter import Parameter, ParameterSettings, Unknown, members_of, scene_keys, tied, ties_of
+from unrender.scene.references import References, ViewLosses, likelihood_scale
 from unrender.scene.surfaces import Surface
-from unrender.scene.unknown import Unknown
 from unrender.scene.validation import (
     Bounds,
     check_loss,
@@ -47,7 +46,6 @@ from unrender.scene.validation import (
 )
 from unrender.scene.view import View
 from unrender.scene.view_checks import check_views, known_angles
-from unrender.scene.view_losses import ViewLosses
 from unrender.scene.view_worlds import check_determined, known_keys, of_views, requested_depth
 
 __all__ = ["Bounds", "Problem", "open_scene"]
@@ -354,7 +352,6 @@ def _opened(
 def _unknowns(
     parameters: Sequence[Parameter], renderer: Renderer, truth: Mapping[str, Any], surfaces: Mapping[str, Surface]
 ) -> dict[str, Unknown]:
-    """Return the unknowns with their true values and surfaces. Raises `FieldError`."""
     known = renderer.parameters()
     unknowns: dict[str, Unknown] = {}
     for index, parameter in enumerate(parameters):

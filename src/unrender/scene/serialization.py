@@ -18,8 +18,8 @@ import tomli_w
 from unrender.core import tables
 from unrender.io import files, toml_lines
 from unrender.rendering.expressions import expression_layer
+from unrender.scene.parameter import Unknown
 from unrender.scene.problem import Problem
-from unrender.scene.unknown import Unknown
 from unrender.scene.view_worlds import requested_depth
 
 FILE, ARRAYS = "problem.toml", "problem"

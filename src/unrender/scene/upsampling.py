@@ -87,6 +87,15 @@ class Upsamplable(Protocol):
         ...
 
 
+class Unchanged:
+    """Base of a state in which nothing has a parameter's shape."""
+
+    def upsampled(self, upsampler: Upsampler) -> Any:
+        """Return this state."""
+        del upsampler
+        return self
+
+
 @runtime_checkable
 class Restartable(Protocol):
     """A state with a part that continues after a restart."""

@@ -27,10 +27,9 @@ from unrender.scene import coarse_to_fine
 from unrender.scene.bounds import angle_notice, check_bounds, move_inside, open_scale, project, truth_notice
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.key_hints import instead_of, near_key
-from unrender.scene.mesh_checks import check_regularizer, check_remeshing, check_self_intersection, mesh_notices
-from unrender.scene.parameter import Parameter, ParameterSettings
+from unrender.scene.meshes import check_regularizer, check_remeshing, check_self_intersection, mesh_notices
+from unrender.scene.parameter import Parameter, ParameterSettings, Unknown
 from unrender.scene.prior import Prior
-from unrender.scene.unknown import Unknown
 
 _RATIOS = "pictures show only the ratios of its values; the result has the initial length, errors are up to a factor"
 _DEEPEST = 1 << 20
@@ -46,18 +45,6 @@ class _Renderer(Renderer, Protocol): ...
 @runtime_checkable
 class _Noticing(Protocol):
     notices: Sequence[str]
-
-
-@runtime_checkable
-class _Preconditioner(Preconditioner, Protocol): ...
-
-
-@runtime_checkable
-class _Parameterisation(Parameterisation, Protocol): ...
-
-
-@runtime_checkable
-class _Loss(Loss, Protocol): ...
 
 
 def check_max_depth(max_depth: Any) -> None:
@@ -79,7 +66,7 @@ def longest_path(renderer: Renderer) -> int:
 
 def check_loss(loss: Any) -> Loss:
     """Return a loss, made from a function if necessary. Raises `FieldError` for anything else."""
-    if isinstance(loss, _Loss) and not isinstance(loss, type):
+    if isinstance(loss, Loss) and not isinstance(loss, type):
         return loss
     try:
         return FunctionLoss(loss)
@@ -238,7 +225,7 @@ def _check_parameterisation(
         )
     except InputError as error:
         raise InputError(str(error).removeprefix("parameterisation: ")) from error
-    if isinstance(made, type) or not isinstance(made, _Parameterisation):
+    if isinstance(made, type) or not isinstance(made, Parameterisation):
         raise InputError(
             f"expected one of unrender.parameterisations, or its name, got {shorten(repr(parameterisation), 60)}"
         )
@@ -263,7 +250,7 @@ def _check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) ->
     """Return the preconditioner, bound to the parameter's mesh if there is one; None for None. Raises `InputError` if it does not suit."""
     if preconditioner is None:
         return None
-    if isinstance(preconditioner, type) or not isinstance(preconditioner, _Preconditioner):
+    if isinstance(preconditioner, type) or not isinstance(preconditioner, Preconditioner):
         raise InputError(f"expected one of unrender.preconditioners, got {preconditioner!r}")
     preconditioner = bound_to(preconditioner, mesh_topology(info), info.conversion.repeated)
     try:

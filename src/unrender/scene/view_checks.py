@@ -296,6 +296,5 @@ def _check_size(values: np.ndarray | StoredPicture, height: int, width: int, sou
 
 
 def _stored(view: View, store: PictureStore) -> View:
-    """Return a checked view with its images stored in a file."""
     stored = {name: store.add(x) for name in ("reference", "mask") if isinstance(x := getattr(view, name), np.ndarray)}
     return replace(view, **stored)

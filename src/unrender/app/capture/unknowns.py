@@ -26,10 +26,9 @@ from unrender.app.stages.stages_file import Stage, Stages
 from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.rendering.camera_poses import POSES
-from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.exposure import EXPOSURE, VIGNETTING
 from unrender.rendering.photographs import check_response
 from unrender.rendering.response import RESPONSE
-from unrender.rendering.vignetting import VIGNETTING
 
 NAMES = ("colour", "roughness", "metallic", "normal", "shape", "light", "exposure", "vignetting", "response", "poses")
 DEFAULT = ("colour", "roughness", "metallic", "light")

@@ -37,11 +37,10 @@ from unrender.io import files
 from unrender.io.images import write as write_image
 from unrender.losses import metrics
 from unrender.rendering.camera_poses import POSES
-from unrender.rendering.exposure import EXPOSURE
+from unrender.rendering.exposure import EXPOSURE, VIGNETTING, falloff
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.photographs import OF_PHOTOGRAPHS, member_values, scene_renderer
 from unrender.rendering.response import RESPONSE, curve
-from unrender.rendering.vignetting import VIGNETTING, falloff
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
 from unrender.runs.folder import schema

@@ -15,7 +15,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.film_response import FilmResponse, film_samples, with_film
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
-from unrender.rendering.mitsuba.integrators.base import ConnectionRecord, ReplayState, total
+from unrender.rendering.mitsuba.integrators.base import ConnectionRecord, PathContext, ReplayState, total
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
@@ -36,7 +36,7 @@ class CameraPaths:
 
     Args:
         kernel: kernel that traces the paths.
-        scene, tables, sampler, ray, pair, geometry: arguments of `PathKernel.sample`.
+        scene, tables, sampler, ray, pair, geometry: arguments of `PathContext` and `PathKernel.sample`.
         weight: the sensor's weight per ray and channel.
 
     Attributes:
@@ -57,6 +57,15 @@ class CameraPaths:
         self._kernel, self._pair, self._geometry = kernel, pair, geometry
         self.scene, self.tables, self.sampler, self.ray = scene, tables, sampler, ray
         self.response = FilmResponse(weight, ray.wavelengths, tables)
+
+    def context(
+        self,
+        mode: dr.ADMode = dr.ADMode.Primal,
+        replay: tuple[ReplayState, ...] = (),
+        connections: ConnectionRecord | None = None,
+    ) -> PathContext:
+        """Return the constant inputs of these paths."""
+        return PathContext(mode, self.scene, self.tables, replay, self._pair, self._geometry, connections)
 
     def primal(self) -> Callable[[], tuple[Any, Any]]:
         """Return the kernel with the arguments of these paths. `weighted` converts its result to the sensor's radiance."""
@@ -89,18 +98,18 @@ class CameraPaths:
         """
         return self._sample(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),), is_finite(radiance))
 
-    def connections(self, radiance: Any, weights: Any, noise: Any, bounces: int) -> Callable[[], ConnectionRecord]:
+    def connections(
+        self, radiance: Any, weights: Any, noise: Any, bounces: int
+    ) -> Callable[[], ConnectionRecord | None]:
         """Return the kernel with the arguments that record each lane's connections to emitters. `radiance`: as for `forward`."""
         assert isinstance(self._kernel, PathPair)
         record = ConnectionRecord(weights, noise, self.response, bounces)
-        replay = ReplayState(None, self._replayed(radiance))
-        camera = self.scene, self.tables, self.sampler, self.ray
-        return functools.partial(self._kernel.record_connections, *camera, replay, record, is_finite(radiance))
+        context = self.context(dr.ADMode.Forward, (ReplayState(None, self._replayed(radiance)),), record)
+        return functools.partial(self._kernel.record_connections, context, self.sampler, self.ray, is_finite(radiance))
 
     def vertices(self) -> Callable[[], Any]:
         """Return the kernel with the arguments that count the vertices of each lane's path."""
-        camera = self.scene, self.tables, self.sampler, self.ray
-        return functools.partial(self._kernel.vertices, *camera, self._geometry)
+        return functools.partial(self._kernel.vertices, self.context(), self.sampler, self.ray)
 
     def _replayed(self, radiance: Any) -> Any:
         """Return the unweighted radiance of the kernel, which is the remaining radiance at the start of a replay; 0 for dropped samples."""
@@ -109,8 +118,7 @@ class CameraPaths:
     def _sample(
         self, mode: dr.ADMode, replay: tuple[ReplayState, ...] = (), active: Any = True
     ) -> Callable[[], tuple[Any, Any]]:
-        camera = self.scene, self.tables, self.sampler, self.ray
-        return functools.partial(self._kernel.sample, mode, *camera, replay, self._pair, self._geometry, active)
+        return functools.partial(self._kernel.sample, self.context(mode, replay), self.sampler, self.ray, active)
 
 
 def is_finite(*states: Any) -> Any:

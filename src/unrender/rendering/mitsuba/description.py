@@ -155,13 +155,12 @@ def _check_paths(nodes: Any) -> None:
     Objects that reference each other twice double the number of paths at each level, and a traversal follows every path. There are no
     cycles.
     """
-    resolved = mi.Properties.Type.ResolvedReference
     paths: dict[int, int] = {}
     pending = [0]
     while pending:
         index = pending[-1]
         props = nodes[index].props
-        held = [props[name].index() for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118
+        held = [child for _, child in references(props)]
         if missing := [child for child in held if child not in paths]:
             pending += missing
             continue
@@ -170,6 +169,12 @@ def _check_paths(nodes: Any) -> None:
         raise InputError(
             f"its objects reference one another along {shorten(str(paths[0]), 40)} paths, expected at most {_MOST_PATHS}"
         )
+
+
+def references(props: Any) -> list[tuple[str, int]]:
+    """Return (property, index of the node) for each object that an object holds."""
+    resolved = mi.Properties.Type.ResolvedReference
+    return [(name, props[name].index()) for name in props.keys() if props.type(name) == resolved]  # noqa: SIM118
 
 
 def _is_text(props: Any, name: str) -> bool:

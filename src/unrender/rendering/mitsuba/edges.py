@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.rendering.mitsuba import gpu, mesh_layout
-from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
-from unrender.rendering.mitsuba.scene_graph import ObjectGraph
+from unrender.rendering.mitsuba.integrators.base import registry_id
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph, scene_of
 
 
 @dataclass(frozen=True)
@@ -197,12 +197,8 @@ def meshed(scene: Any, ids: AbstractSet[str]) -> tuple[Any, list[str]]:
     # The shape groups of instances are not among the scene's shapes.
     objects += groups
     objects += [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
-    described: dict[str, Any] = {"type": "scene"}
     own = [] if scene.integrator() is None else [scene.integrator()]
-    for index, item in enumerate([*objects, *scene.sensors(), *own]):
-        name = item.id()
-        described[name if name and name not in described else f"object_{index}"] = item
-    return mi.load_dict(described, parallel=False, optimize=False), replaced
+    return scene_of([*objects, *scene.sensors(), *own]), replaced
 
 
 def _is_specular(bsdf: Any) -> bool:

@@ -218,5 +218,4 @@ def _first_cause(error: BaseException) -> BaseException:
 
 @functools.cache
 def _warn(reason: str) -> None:
-    """Log the warning once for each reason."""
     _log.warning("a kernel could not be recorded and is traced at every call, which is slower: %s", reason)

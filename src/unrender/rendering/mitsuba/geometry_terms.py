@@ -14,6 +14,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.rendering.mitsuba.edges import EdgeTable
+from unrender.rendering.mitsuba.film import ViewWeights, views_of
 from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.boundary import BoundaryIntegrator
@@ -26,7 +27,6 @@ from unrender.rendering.mitsuba.pixel_filter import is_box
 from unrender.rendering.mitsuba.poses import is_bare
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
-from unrender.rendering.mitsuba.view_weights import ViewWeights, views_of
 from unrender.rendering.renderer import ParameterInfo, SampleRequest
 
 _STREAM = 3
@@ -139,7 +139,6 @@ class BoundaryTerm:
 
     @staticmethod
     def _samples(scene: LoadedScene, request: SampleRequest, view: ViewWeights) -> tuple[mi.Sensor, int, int]:
-        """Return a view's sensor, and the seed and number of its boundary samples."""
         sensor = scene.scene.sensors()[view.sensor]
         if sensor.class_name() != "PerspectiveCamera":
             raise InputError(

@@ -259,7 +259,6 @@ class LoadedScene:
             ) from error
 
     def _notify(self, keys: Iterable[str]) -> None:
-        """Update all owners of shared objects whose parameters changed."""
         for node in {self.parameters.properties[key][2] for key in keys if key in self.parameters}:
             self.graph.notify_other_owners(node)
 
@@ -387,7 +386,6 @@ def _is_array(value: Any) -> bool:
 
 
 def _copy(value: mi.TensorXf) -> mi.TensorXf:
-    """Return the same values in different memory."""
     copied = mi.TensorXf(value.array * dr.opaque(mi.Float, 1), tuple(value.shape))
     dr.eval(copied)
     return copied

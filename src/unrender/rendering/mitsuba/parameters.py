@@ -231,20 +231,25 @@ def role(parameters: mi.SceneParameters, key: str, shape: tuple[int, ...]) -> Ro
         return "direction"
     if _NORMALISED.get(node.class_name()) == names[-1] and math.prod(shape) > 1:
         return "ratios"
-    while node is not None:  # find the normal or bump map, however its texture is wrapped
-        if isinstance(node, mi.BSDF):
-            if node.class_name() == "BumpMap" and "nested_texture" in names and len(shape) > 1:
-                return "height"
-            return "normal" if vectors and node.class_name() == "NormalMap" and "normalmap" in names else "value"
+    bsdf = _holder(parameters, key, mi.BSDF)  # the normal or bump map, however its texture is wrapped
+    if bsdf is None:
+        return "value"
+    if bsdf.class_name() == "BumpMap" and "nested_texture" in names and len(shape) > 1:
+        return "height"
+    return "normal" if vectors and bsdf.class_name() == "NormalMap" and "normalmap" in names else "value"
+
+
+def _holder(parameters: mi.SceneParameters, key: str, *kinds: type) -> Any:
+    """Return the nearest object of these classes that holds a parameter, or None."""
+    node = parameters.properties[key][2]
+    while node is not None and not isinstance(node, kinds):
         node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
-    return "value"
+    return node
 
 
 def brightness(parameters: mi.SceneParameters, key: str) -> Literal["", "light", "reflectance"]:
     """Return the quantity that the image is proportional to: an emitter's light, a surface's reflectance, or neither."""
-    names, node = key.split("."), parameters.properties[key][2]
-    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter)):
-        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+    names, node = key.split("."), _holder(parameters, key, mi.BSDF, mi.Emitter)
     if isinstance(node, mi.Emitter):
         emits = names[-1] in ("scale", "data") or any(name in _LIGHT for name in names)
         return "light" if emits else ""
@@ -254,9 +259,7 @@ def brightness(parameters: mi.SceneParameters, key: str) -> Literal["", "light",
 def is_nonlinear(parameters: mi.SceneParameters, key: str, singular: float | None) -> bool:
     """Return whether a parameter changes the form of the image, not its brightness: sensors, emitters except for their light, and
     indices of refraction."""
-    node = parameters.properties[key][2]
-    while node is not None and not isinstance(node, (mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium)):
-        node = parameters.hierarchy[node][0] if node in parameters.hierarchy else None
+    node = _holder(parameters, key, mi.BSDF, mi.Emitter, mi.Sensor, mi.Medium)
     if isinstance(node, mi.Emitter):
         return brightness(parameters, key) != "light"
     return singular is not None or isinstance(node, mi.Sensor)

@@ -15,6 +15,7 @@ import mitsuba as mi
 from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.camera_paths import CameraPaths, Kernel, Tables, dropped_together
 from unrender.rendering.mitsuba.film_response import FilmResponse, response_table
+from unrender.rendering.mitsuba.integrators.base import PathContext
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.poses import Assembly, PosedScene
 from unrender.rendering.mitsuba.scene_pair import ScenePair
@@ -45,6 +46,7 @@ class Pass:
     previous: bool = False  # whether the previous scene is traced
     pair: ClassVar[bool] = False  # whether both states share the paths
     needs_tangents: ClassVar[bool] = False  # whether the scene's state has tangents, which are an input
+    needs_delta_table: ClassVar[bool] = True  # whether perfectly specular lobes are looked up
 
     def scene(self, pair: ScenePair) -> Any:
         """Return the scene argument of the kernel."""
@@ -81,7 +83,8 @@ class Pass:
         return tables
 
     def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
-        return {**pair.tables(), "delta": delta} if self.pair else {"delta": delta}
+        own = {"delta": delta} if self.needs_delta_table else {}
+        return {**pair.tables(), **own} if self.pair else own
 
     def function(
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None
@@ -119,14 +122,15 @@ class Pass:
         return launch
 
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
-        """Return the call that traces the camera rays.
+        """Return the call that traces the camera rays, by default without derivatives.
 
         Args:
             paths: paths that begin on the rays.
             size: constants that the kernel is compiled for.
             own: the pass's own arrays.
         """
-        raise NotImplementedError  # of a pass whose `function` is its own
+        del size, own
+        return paths.primal()
 
     def result(self, paths: CameraPaths, output: Any) -> Any:
         """Return the result of the launch from the output of `call`."""
@@ -138,12 +142,7 @@ class ImagePass(Pass):
     """Radiance of one state per lane."""
 
     previous: bool = False
-
-    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
-        return {}
-
-    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
-        return paths.primal()
+    needs_delta_table = False
 
     def result(self, paths: CameraPaths, output: Any) -> Any:
         return paths.weighted(*output)[0]
@@ -154,9 +153,6 @@ class ImagePairPass(Pass):
     """Radiance of both states per lane, on the current state's paths."""
 
     pair: ClassVar[bool] = True
-
-    def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
-        return paths.primal()
 
     def result(self, paths: CameraPaths, output: Any) -> Any:
         return paths.weighted(*output)
@@ -290,8 +286,7 @@ class ConnectionsPass(Pass):
 class VerticesPass(Pass):
     """Number of vertices of each lane's path."""
 
-    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
-        return {}
+    needs_delta_table = False
 
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
         return paths.vertices()
@@ -307,6 +302,7 @@ class PosesPass(Pass):
 
     posed: PosedScene
     copies: int
+    needs_delta_table = False
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PosesPass) and self.posed is other.posed and self.copies == other.copies
@@ -317,9 +313,6 @@ class PosesPass(Pass):
     def scene(self, pair: ScenePair) -> Any:
         """Return the static scene and those of the posed shapes."""
         return self.posed.scenes()
-
-    def _surface_tables(self, pair: ScenePair, delta: mi.UInt32) -> Tables:
-        return {}
 
     def numbers(self, sampler: mi.Sampler, size: LaunchSize, positions: mi.UInt32 | None) -> Any:
         """Return a sampler whose numbers are equal for every pose."""
@@ -346,7 +339,8 @@ class PosesPass(Pass):
                 ray, ray_weight = film.rays(samples) if rays is None else _repeated(rays[0], lanes, self.copies)
                 if camera.id() in assembly.poses:
                     ray = assembly.poses[camera.id()].ray_outside(ray)
-                L, _ = kernel.sample(dr.ADMode.Primal, assembly.static, {}, repeating, ray, geometry=assembly)
+                context = PathContext(dr.ADMode.Primal, assembly.static, {}, geometry=assembly)
+                L, _ = kernel.sample(context, repeating, ray)
                 return FilmResponse(ray_weight, ray.wavelengths, tables).film(L)
 
         return launch
@@ -369,7 +363,6 @@ def _samples_of_one(
 
 
 def _repeated(rays: tuple[mi.Ray3f, mi.Spectrum], lanes: int, copies: int) -> tuple[Any, Any]:
-    """Return copies of the rays of one image, concatenated."""
     lane = dr.arange(mi.UInt32, copies * lanes) % lanes
     return dr.gather(mi.Ray3f, rays[0], lane), dr.gather(mi.Spectrum, rays[1], lane)
 

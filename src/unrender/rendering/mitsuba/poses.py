@@ -28,6 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.core.errors import InputError
+from unrender.rendering.mitsuba.scene_graph import scene_of
 from unrender.rendering.renderer import ParameterInfo
 
 _AXES = ("x", "y", "z")
@@ -229,8 +230,8 @@ class PosedScene:
             sensor if shape_of_sensor[sensor.id()] is None else shape_of_sensor[sensor.id()]
             for sensor in scene.sensors()
         ]
-        self.static = _scene([*(item for item in rest if item.id() not in sensor_shapes), *sensors])
-        self.parts = {name: _scene([shape]) for name, shape in posed.items()}
+        self.static = scene_of([*(item for item in rest if item.id() not in sensor_shapes), *sensors])
+        self.parts = {name: scene_of([shape]) for name, shape in posed.items()}
         self._centres = centres(scene, targets)
 
     def scenes(self) -> list[Any]:
@@ -389,12 +390,3 @@ def numbers_of(
         if owner == target and key in values:
             numbers[first : first + size] = values[key]
     return numbers
-
-
-def _scene(objects: list[Any]) -> Any:
-    """Return a scene of existing objects. Each keeps its id, which Mitsuba would otherwise take from the dictionary."""
-    named = {"type": "scene"}
-    for index, item in enumerate(objects):
-        name = item.id()
-        named[name if name and name not in named else f"object_{index}"] = item
-    return mi.load_dict(named, parallel=False, optimize=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -10,7 +9,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.mitsuba.emissive import COEFFICIENT
-from unrender.rendering.mitsuba.scene_graph import Holders, children, class_name
+from unrender.rendering.mitsuba.scene_graph import Holders, attribute, children, class_name
 
 
 @dataclass(frozen=True)
@@ -178,7 +177,6 @@ CLASSES: dict[str, dict[str, Range]] = {
 
 _FORWARDED = ("value", "values", "data", "color0", "color1", "volume")
 """Slots of textures and volumes whose values the holding object reads."""
-_ATTRIBUTE = re.compile(r'name = "(.*)",\s+scale = "(.*)"')
 _KINDS = ("BSDF", "Emitter", "Medium", "PhaseFunction", "Sensor", "Shape")
 
 
@@ -196,7 +194,7 @@ class SlotReaders:
         self._holders = holders
         self._attributes: dict[str, list[Any]] = {}
         for node in self._holders:
-            if isinstance(node, mi.Texture) and (name := _attribute(node)[0]):
+            if isinstance(node, mi.Texture) and (name := attribute(node)[0]):
                 self._attributes.setdefault(name, []).append(node)
 
     def range_of(self, parameters: mi.SceneParameters, key: str) -> Range:
@@ -231,7 +229,7 @@ class SlotReaders:
         for texture in self._attributes.get(name, []):
             if shape not in self._shapes_of(texture):
                 continue
-            each = self._of_readers(texture).scaled(_attribute(texture)[1])
+            each = self._of_readers(texture).scaled(attribute(texture)[1])
             result = each if result is None else result.both(each)
         return result or UNKNOWN
 
@@ -246,12 +244,6 @@ class SlotReaders:
                     seen.add(holder)
                     pending.append(holder)
         return shapes
-
-
-def _attribute(texture: Any) -> tuple[str, float]:
-    """Return the mesh attribute that a texture reads and its scale; "" if it reads none."""
-    match = _ATTRIBUTE.search(str(texture)) if class_name(texture) == "MeshAttribute" else None
-    return ("", 1.0) if match is None else (match[1], float(match[2]))
 
 
 def entry(node: Any, slot: str) -> Range | None:

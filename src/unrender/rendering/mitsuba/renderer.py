@@ -17,7 +17,6 @@ from unrender.core.text import did_you_mean
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import gpu, poses
 from unrender.rendering.mitsuba.edges import moving_targets
-from unrender.rendering.mitsuba.equal_objects import merge_notices
 from unrender.rendering.mitsuba.film_response import is_spectral
 from unrender.rendering.mitsuba.geometry_terms import (
     lens_parameters,
@@ -33,12 +32,20 @@ from unrender.rendering.mitsuba.path_cache.session import CachingSession
 from unrender.rendering.mitsuba.pixel_format import LuminanceSession, formats
 from unrender.rendering.mitsuba.rigid_motions import lengths
 from unrender.rendering.mitsuba.scene_graph import has_instances
-from unrender.rendering.mitsuba.scene_loading import SceneDescription
+from unrender.rendering.mitsuba.scene_loading import SceneDescription, merge_notices
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.mitsuba.tensors import tensor
 from unrender.rendering.picture_format import PictureFormat
-from unrender.rendering.renderer import Camera, LossWeights, ParameterInfo, ReplacedMesh, Space, differentiated
+from unrender.rendering.renderer import (
+    Camera,
+    Derivatives,
+    LossWeights,
+    ParameterInfo,
+    ReplacedMesh,
+    Space,
+    differentiated,
+)
 
 
 class MitsubaRenderer:
@@ -140,7 +147,7 @@ class MitsubaRenderer:
         return tensor(values)
 
     def prepare(
-        self, keys: list[str], space: Space | None, derivatives: bool | AbstractSet[str] = True
+        self, keys: list[str], space: Space | None, derivatives: Derivatives = True
     ) -> MitsubaSession | CachingSession | LuminanceSession:
         """Return the session for these parameters. Sessions are cached, so repeated calls are free.
 

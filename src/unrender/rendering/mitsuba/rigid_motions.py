@@ -101,7 +101,6 @@ class RigidMotions:
         parameters[name] = transform
 
     def _poses(self, values: Mapping[str, Any]) -> dict[str, Pose]:
-        """Return {target: its pose}."""
         result = {}
         chosen = {key: self._keys[key] for key in values}
         slots = poses.slots(chosen)

@@ -20,6 +20,7 @@ from unrender.rendering.mitsuba import mesh_layout
 from unrender.rendering.renderer import ReplacedMesh
 
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "medium": "Medium", "shape": "Shape"}
+_ATTRIBUTE = re.compile(r'name = "(.*)",\s+scale = "(.*)"')
 
 
 class ObjectGraph:
@@ -71,7 +72,7 @@ class ObjectGraph:
         return [
             node
             for node in self.nodes
-            if _attribute(node) == name and any(shape in chain for chain in self.chains(node))
+            if attribute(node)[0] == name and any(shape in chain for chain in self.chains(node))
         ]
 
     def attributed(self, ids: Collection[str]) -> list[str]:
@@ -80,7 +81,7 @@ class ObjectGraph:
         Raises `InputError` if such a material has a volume texture too: Mitsuba evaluates both at one point, in different spaces.
         """
         chains = [(node, chain) for node in self.nodes if isinstance(node, mi.Texture) for chain in self.chains(node)]
-        readers = {shape for node, chain in chains if _attribute(node).startswith("vertex_") for shape in chain}
+        readers = {shape for node, chain in chains if attribute(node)[0].startswith("vertex_") for shape in chain}
         volumes = {shape for node, chain in chains if class_name(node) == "VolumeAdapter" for shape in chain}
         shapes = [shape for shape in self._scene.shapes() if shape.id() in ids and shape in readers]
         if both := [shape.id() for shape in shapes if shape in volumes]:
@@ -94,7 +95,7 @@ class ObjectGraph:
         """Return one notice for each attribute that a texture reads from a shape without it. Mitsuba reads 0 there, in silence."""
         lines = []
         for node in self.nodes:
-            if not (name := _attribute(node)):
+            if not (name := attribute(node)[0]):
                 continue
             holders = (next((x for x in chain if isinstance(x, mi.Shape)), None) for chain in self.chains(node))
             missing = {x.id() for x in holders if x is not None and not dr.any(x.has_attribute(name))}
@@ -148,10 +149,10 @@ class ObjectGraph:
                     )
 
 
-def _attribute(node: Any) -> str:
-    """Return the attribute of shapes that a texture reads; "" for other objects."""
-    match = re.search(r'name = "(.*)"', str(node)) if node.class_name() == "MeshAttribute" else None
-    return "" if match is None else match[1]
+def attribute(node: Any) -> tuple[str, float]:
+    """Return the attribute of shapes that a texture reads and its scale; "" for other objects."""
+    match = _ATTRIBUTE.search(str(node)) if class_name(node) == "MeshAttribute" else None
+    return ("", 1.0) if match is None else (match[1], float(match[2]))
 
 
 def _held(owner: Any) -> list[tuple[str, Any]]:
@@ -344,3 +345,12 @@ def replace_meshes(scene: Any, meshes: Mapping[str, ReplacedMesh]) -> None:
         if mesh.uv is not None:
             parameters[f"{name}.{mesh_layout.TEXCOORDS}"] = mi.Float(mesh.uv.ravel().astype(np.float32))
     parameters.update()
+
+
+def scene_of(objects: Iterable[Any]) -> Any:
+    """Return a scene of existing objects. Each keeps its id, which Mitsuba would otherwise take from the dictionary."""
+    named: dict[str, Any] = {"type": "scene"}
+    for index, item in enumerate(objects):
+        name = item.id()
+        named[name if name and name not in named else f"object_{index}"] = item
+    return mi.load_dict(named, parallel=False, optimize=False)

@@ -20,10 +20,10 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.rendering.mitsuba import emissive, film, mesh_layout, scene_loading
 from unrender.rendering.mitsuba.camera_media import camera_media, medium_id
-from unrender.rendering.mitsuba.emitter_tables import emitter_tables
-from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import bounding_ellipsoids
+from unrender.rendering.mitsuba.integrators.base import pointer_table
+from unrender.rendering.mitsuba.integrators.emitters import emitter_tables
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import MajorantSupergrids
-from unrender.rendering.mitsuba.integrators.pointer_tables import pointer_table
+from unrender.rendering.mitsuba.integrators.moved_vertices import bounding_ellipsoids
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK
 from unrender.rendering.mitsuba.loaded_scene import LoadedScene
 from unrender.rendering.mitsuba.parameters import (

@@ -16,7 +16,6 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.rendering.mitsuba import gpu
 from unrender.rendering.mitsuba.camera_paths import DroppedSamples, Kernel, Paths
-from unrender.rendering.mitsuba.emitter_tables import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.frozen import FrozenFunction, are_recordable, for_every_sensor, shapes_are_recordable
 from unrender.rendering.mitsuba.geometry_terms import (
     BoundaryTerm,
@@ -27,6 +26,8 @@ from unrender.rendering.mitsuba.geometry_terms import (
     no_tangents,
 )
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
+from unrender.rendering.mitsuba.integrators.differential_bsdf import RoughLobes
+from unrender.rendering.mitsuba.integrators.emitters import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
 from unrender.rendering.mitsuba.integrators.path import PathPair
 from unrender.rendering.mitsuba.integrators.prb import PrbKernel
@@ -47,7 +48,6 @@ from unrender.rendering.mitsuba.passes import (
     VerticesPass,
 )
 from unrender.rendering.mitsuba.poses import PosedScene, PoseKey
-from unrender.rendering.mitsuba.rough_lobes import RoughLobes
 from unrender.rendering.mitsuba.scene_graph import has_instances
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.tensors import is_broadcast, tensor
@@ -139,7 +139,6 @@ class MitsubaSession:
 
     @cached_property
     def _path_kernel(self) -> Kernel:
-        """Path tracer for the derivatives of these parameters."""
         if self._light.aov:
             return AovKernel(self._light.aov)
         delta = any(traits.changes_delta for traits in self._traits)
@@ -338,14 +337,12 @@ class MitsubaSession:
         self._set_poses(parameters, previous)
 
     def _set_poses(self, parameters: Tree, previous: bool = False) -> None:
-        """Set the poses of the following passes in one of the two scenes."""
         if self._posed is None:
             return
         current = {key: parameters[key].numpy()[None] for key in self._poses if key in parameters}
         self._at[previous] = tensor(self._posed.numbers(current, 1)).array
 
     def _posed_scene(self, previous: bool) -> PosedScene | None:
-        """Return one of the two scenes with posed shapes; None without poses."""
         if self._posed is None or not previous:
             return self._posed
         if self._posed_previous is None:

@@ -66,7 +66,7 @@ def refusal(scene: Any, holders: Holders) -> str:
         if name in _OTHER_PLUGINS:
             return f"spectral variants do not support {_OTHER_PLUGINS[name]}; {instead}"
         used = next((slot for _, slot in slots if slot not in _NUMBERS), "")
-        if used and _is_raw(node) and channels(mi.traverse(node)["data"]) != 1:
+        if used and is_raw(node) and channels(mi.traverse(node)["data"]) != 1:
             return f"the bitmap of {used} is raw, and spectral variants do not upsample raw colours; set raw to false"
         if used and _holds_colours(node):
             return f"the data of the bitmap of {used} are colours, which Mitsuba takes for coefficients; give bitmap = mitsuba.Bitmap(...)"
@@ -99,7 +99,7 @@ class SpectralColours:
     def _is_reflectance(self, key: str) -> bool:
         """Return whether a parameter holds coefficients of reflectances in [0, 1]."""
         node, value = self._parameters.properties[key][2], self._parameters[key]
-        if _RGB_TEXTURES.get(class_name(node)) != key.rpartition(".")[2] or _is_raw(node) or channels(value) != 3:
+        if _RGB_TEXTURES.get(class_name(node)) != key.rpartition(".")[2] or is_raw(node) or channels(value) != 3:
             return False
         limits = self._readers.range_of(self._parameters, key)
         return (limits.low, limits.high) == (0, 1)
@@ -118,7 +118,7 @@ class SpectralColours:
         if isinstance(node, mi.Emitter):
             moved = leaf in ("scale", "position", "to_world")
             return "" if moved else f"spectral variants do not support the {leaf} of a light ({name})"
-        if _RGB_TEXTURES.get(name) == leaf and (channels(value) == 1 or _is_raw(node)):
+        if _RGB_TEXTURES.get(name) == leaf and (channels(value) == 1 or is_raw(node)):
             return ""
         return f"spectral variants store the colour as coefficients of a spectrum ({name}); {_INSTEAD}"
 
@@ -239,18 +239,18 @@ class _Cell:
 
 def _holds_colours(node: Any) -> bool:
     """Return whether a bitmap that is not raw holds values that are no coefficients of a spectrum."""
-    if class_name(node) != "BitmapTextureImpl" or _is_raw(node):
+    if class_name(node) != "BitmapTextureImpl" or is_raw(node):
         return False
     data: Any = mi.traverse(node)["data"]
     return channels(data) == 3 and bool(np.abs(data.numpy()[..., 0]).max(initial=0.0) > _LARGEST_FIRST)
 
 
-def _is_raw(node: Any) -> bool:
+def is_raw(node: Any) -> bool:
+    """Return whether an object is a bitmap of raw values, which are no colours."""
     return class_name(node) == "BitmapTextureImpl" and _RAW.search(str(node)) is not None
 
 
 def _split(value: mi.TensorXf) -> list[Any]:
-    """Return the three channels of (..., 3)."""
     return list(dr.unravel(mi.Vector3f, value.array))
 
 

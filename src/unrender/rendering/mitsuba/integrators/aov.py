@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
-from unrender.rendering.mitsuba.integrators.base import PathContext, ReplayState
+from unrender.rendering.mitsuba.integrators.base import Bool, Float, PathContext, Spectrum
 
 
 class AovKernel:
@@ -26,22 +24,12 @@ class AovKernel:
         self.name = name
 
     def sample(
-        self,
-        mode: dr.ADMode,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        replay: tuple[ReplayState, ...] = (),
-        pair: bool = False,
-        geometry: Any = None,
-        active: Bool | bool = True,
+        self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f, active: Bool | bool = True
     ) -> tuple[Spectrum, None]:
         """Trace one ray per lane, see `PathKernel.sample`. Raise `ValueError` for pairs."""
         del sampler
-        if pair:
+        if context.pair:
             raise ValueError("aov: expected one state")
-        context = PathContext(mode, scene, tables, replay, pair, geometry)
         with context.resume_grad():
             lanes: Any = mi.Bool(active)
             si = context.geometry.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=lanes, active=lanes)
@@ -64,10 +52,8 @@ class AovKernel:
         vector = si.p if self.name == "position" else si.sh_frame.n
         return dr.select(hit, mi.Spectrum(vector.x, vector.y, vector.z), 0)
 
-    def vertices(
-        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
-    ) -> Float:
+    def vertices(self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f) -> Float:
         """Return the number of vertices per lane, see `PathKernel.vertices`: 1 where the ray hits a surface, else 0."""
-        del tables, sampler
-        target: Any = scene if geometry is None else geometry
-        return dr.select(target.ray_test(mi.Ray3f(ray), mi.Bool(True)), mi.Float(1), 0)
+        del sampler
+        geometry: Any = context.geometry
+        return dr.select(geometry.ray_test(mi.Ray3f(ray), mi.Bool(True)), mi.Float(1), 0)

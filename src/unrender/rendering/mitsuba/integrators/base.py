@@ -1,4 +1,5 @@
-"""Common parts of the path-replay kernels: their interface, the adjoint of each state, and the constant inputs of a path.
+"""Common parts of the path-replay kernels: their interface, the adjoint of each state, the constant inputs of a path, and pointers to
+the objects of both states.
 
 A kernel traces one state or, for a pair, the current and the previous state on the same paths (Nicolet et al. 2023, section 5 and
 appendix B). Quantities that differ between the states are lists with one entry per state, the current one first.
@@ -10,13 +11,87 @@ import functools
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
-from unrender.rendering.mitsuba.integrators.pointer_tables import StatePointers
+from unrender.core.errors import InputError
+
+# Annotations of per-lane arrays. Mitsuba's stubs treat `mitsuba.Float` and the `drjit.auto.ad.Float` of its methods as different types,
+# likewise the others, and do not declare the product of a spectrum and a number. A type checker therefore sees any type.
+Float: TypeAlias = Any
+Bool: TypeAlias = Any
+UInt32: TypeAlias = Any
+Spectrum: TypeAlias = Any
+
+while_loop: Any = dr.while_loop
+"""`drjit.while_loop`, whose stub only accepts loops of one variable."""
+
+
+Pointer = TypeVar("Pointer", "mi.BSDFPtr", "mi.EmitterPtr", "mi.ShapePtr", "mi.MediumPtr")
+
+
+def registry_id(pointer: Any) -> UInt32:
+    """Return the registry id of each lane's object, 0 for none."""
+    return dr.reinterpret_array(mi.UInt32, pointer)
+
+
+def remap(table: UInt32, pointer: Pointer) -> Pointer:
+    """Return the previous scene's object for the current scene's `pointer`. `table` is one of `ScenePair.tables()`."""
+    return dr.reinterpret_array(type(pointer), dr.gather(mi.UInt32, table, registry_id(pointer)))  # pyright: ignore[reportReturnType]
+
+
+class StatePointers:
+    """Objects of each traced state: of the current scene or, for a pair, of the current and of the previous one.
+
+    Args:
+        tables: `ScenePair.tables()`; used for a pair only.
+        pair: whether the previous state is traced too.
+    """
+
+    def __init__(self, tables: Mapping[str, Any], pair: bool):
+        self._tables = tables
+        self.pair = pair
+
+    def _of(self, kind: str, pointer: Pointer) -> list[Pointer]:
+        return [pointer, remap(self._tables[kind], pointer)] if self.pair else [pointer]
+
+    def bsdfs(self, bsdf: mi.BSDFPtr) -> list[mi.BSDFPtr]:
+        """Return the BSDF of each state."""
+        return self._of("bsdf", bsdf)
+
+    def emitters(self, emitter: mi.EmitterPtr) -> list[mi.EmitterPtr]:
+        """Return the emitter of each state."""
+        return self._of("emitter", emitter)
+
+    def media(self, medium: mi.MediumPtr) -> list[mi.MediumPtr]:
+        """Return the medium of each state."""
+        return self._of("medium", medium)
+
+    def interactions(self, si: mi.SurfaceInteraction3f) -> list[mi.SurfaceInteraction3f]:
+        """Return `si` on the shape of each state."""
+        if not self.pair:
+            return [si]
+        siₚ = mi.SurfaceInteraction3f(si)
+        siₚ.shape = remap(self._tables["shape"], si.shape)
+        return [si, siₚ]
+
+
+def pointer_table(current: Any, previous: Any) -> mi.UInt32:
+    """Return the table from the registry ids of one load's pointers to those of another load.
+
+    Raises `InputError` if the two loads differ in their number.
+    """
+    source = dr.reinterpret_array(mi.UInt32, current).numpy()  # pyright: ignore[reportAttributeAccessIssue]
+    target = dr.reinterpret_array(mi.UInt32, previous).numpy()  # pyright: ignore[reportAttributeAccessIssue]
+    if source.shape != target.shape:
+        raise InputError("scene: two loads of the description differ in their shapes or emitters")
+    table = np.zeros(int(source.max(initial=0)) + 1, np.uint32)
+    table[source] = target
+    return mi.UInt32(table)
+
 
 KEEP = dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior
 """Flags that keep the graph's edges: two passes traverse those from derived values, such as padded texels, to the parameters."""
@@ -39,41 +114,23 @@ class PathKernel(Protocol):
     """A light transport integrator that renders one state or two, and replays its paths for derivatives."""
 
     def sample(
-        self,
-        mode: dr.ADMode,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        replay: tuple[ReplayState, ...] = (),
-        pair: bool = False,
-        geometry: Any = None,
-        active: Bool | bool = True,
+        self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f, active: Bool | bool = True
     ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane. Call under `dr.suspend_grad()`.
 
         Args:
-            mode: `Primal`; `Backward` to replay the paths of a primal pass and back-propagate each state's `δL` into the parameters of
-                its scene (path replay, Vicini et al. 2021); `Forward` to replay them and propagate the tangents of the parameters of
-                `scene` forward (the current state only).
-            scene: the current scene.
-            tables: `ScenePair.tables()`, used with `pair`, and additional tables of the kernel.
+            context: constant inputs of the paths.
             sampler: seeded; the same seed replays the same paths.
             ray: camera rays.
-            replay: the current state and, with `pair`, the previous state; () with `Primal`.
-            pair: whether the previous state is traced too.
-            geometry: object that rays are intersected with instead of `scene` (`poses.Assembly`), or None.
             active: lanes that are traced. A replay omits the samples that the primal pass dropped.
 
         Returns:
-            radiance per lane of the current and, with `pair`, of the previous state, both unbiased; with `Forward` the derivative of the
-            radiance along the tangents, and None.
+            radiance per lane of the current and, for a pair, of the previous state, both unbiased; in `Forward` mode the derivative of
+            the radiance along the tangents, and None.
         """
         ...
 
-    def vertices(
-        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
-    ) -> Float:
+    def vertices(self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f) -> Float:
         """Return the number of vertices of each lane's path, without the camera's. For the arguments, see `sample`."""
         ...
 
@@ -82,7 +139,14 @@ class PathContext:
     """Constant inputs of a path. This is not a dataclass, since Dr.Jit would treat a dataclass as loop state.
 
     Args:
-        mode, scene, tables, replay, pair, geometry: arguments of `PathKernel.sample`.
+        mode: `Primal`; `Backward` to replay the paths of a primal pass and back-propagate each state's `δL` into the parameters of its
+            scene (path replay, Vicini et al. 2021); `Forward` to replay them and propagate the tangents of the parameters of `scene`
+            forward (the current state only).
+        scene: the current scene.
+        tables: `ScenePair.tables()`, used with `pair`, and additional tables of the kernel.
+        replay: the current state and, with `pair`, the previous state; () with `Primal`.
+        pair: whether the previous state is traced too.
+        geometry: object that rays are intersected with instead of `scene` (`poses.Assembly`), or None.
         connections: record of emitter-sampling connections in a forward replay, or None.
 
     Attributes:
@@ -96,8 +160,8 @@ class PathContext:
         mode: dr.ADMode,
         scene: mi.Scene,
         tables: Mapping[str, Any],
-        replay: tuple[ReplayState, ...],
-        pair: bool,
+        replay: tuple[ReplayState, ...] = (),
+        pair: bool = False,
         geometry: Any = None,
         connections: ConnectionRecord | None = None,
     ):

@@ -28,6 +28,7 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.edges import EdgeTable
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
+from unrender.rendering.mitsuba.integrators.base import registry_id
 from unrender.rendering.mitsuba.integrators.boundary_paths import (
     OFFSET,
     BoundarySegment,
@@ -43,7 +44,6 @@ from unrender.rendering.mitsuba.integrators.boundary_sampling import (
     coplanar,
     lane_sampler,
 )
-from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 
 _NEAR = 1e-3
 """Relative margin at the end of a shadow ray within which occluders are ignored."""
@@ -88,7 +88,6 @@ class BoundaryIntegrator:
         return picture.image()
 
     def _collected(self, picture: Picture, seed: int) -> Any:
-        """Collect all parts in a picture, and return its sum."""
         scene = picture.scene
         with dr.resume_grad():
             positions = self._table.positions(scene)

@@ -23,11 +23,11 @@ import mitsuba as mi
 import numpy as np
 
 from unrender.rendering.mitsuba.edges import EdgeTable
+from unrender.rendering.mitsuba.film import ViewWeights
 from unrender.rendering.mitsuba.integrators.boundary_paths import OFFSET, WeightedPicture
 from unrender.rendering.mitsuba.integrators.boundary_sampling import WeightedChoice, lane_sampler
 from unrender.rendering.mitsuba.integrators.flat_mirrors import FlatMirrors, MirroredView, glossy_radiance, is_glossy
 from unrender.rendering.mitsuba.pixel_filter import FilterSlopes, PixelFilters, is_box
-from unrender.rendering.mitsuba.view_weights import ViewWeights
 
 _ARCS = 16
 """Number of pieces of a curve, which are sampled by their lengths in the image."""
@@ -312,7 +312,6 @@ class CameraMotion:
             return dr.sum(dr.dot(weight, lit)) * dr.opaque(mi.Float, 1 / view.spp)
 
     def _trace_on(self, scene: Any, ray: Any, si: Any, sampler: Any, active: Any) -> Any:
-        """Return the radiance along a path's second segment."""
         return self._radiance.sample(
             dr.ADMode.Primal, scene, sampler, ray, mi.UInt32(1), None, None, active, False, si
         )[0]

@@ -18,11 +18,18 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32, while_loop
-from unrender.rendering.mitsuba.integrators.base import ScatteringVertex
-from unrender.rendering.mitsuba.integrators.bounding_ellipsoids import BoundingEllipsoids
+from unrender.rendering.mitsuba.integrators.base import (
+    Bool,
+    Float,
+    ScatteringVertex,
+    Spectrum,
+    UInt32,
+    remap,
+    while_loop,
+)
 from unrender.rendering.mitsuba.integrators.emitters import mis_weight
 from unrender.rendering.mitsuba.integrators.moved_vertices import (
+    BoundingEllipsoids,
     Continuation,
     Direction,
     Link,
@@ -36,7 +43,6 @@ from unrender.rendering.mitsuba.integrators.moved_vertices import (
     may_contribute,
     moves,
 )
-from unrender.rendering.mitsuba.integrators.pointer_tables import remap
 
 CARRIED_SHARE = 0.75
 """Probability of a reconnection where it is possible. With 1, points that the current state's path cannot see would be missing."""
@@ -211,7 +217,6 @@ class MovedPair:
         path.previous.L += before.Le + dr.select(dr.select(known, hidden, hiddenₚ), 0, before.Ld)
 
     def _scatter(self, vertex: Vertex, numbers: tuple[Any, Any]) -> Direction:
-        """Sample a direction at a vertex."""
         si, active = vertex.si, vertex.active
         bs, weight = vertex.bsdf.sample(mi.BSDFContext(), si, *numbers, active)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -278,7 +283,6 @@ class MovedPair:
 
     @property
     def _reconnects(self) -> bool:
-        """True if there are any reconnections."""
         return self.max_depth > 2 and self.share > 0
 
     def _may_add(self, tables: Mapping[str, Any], path: PairState, ray: Any) -> Bool:

@@ -7,7 +7,7 @@ quantities that differ between the states are lists, the current state first. Th
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,16 +16,19 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.film import independent
 from unrender.rendering.mitsuba.integrators import emitters, specular
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32, while_loop
 from unrender.rendering.mitsuba.integrators.base import (
     KEEP,
+    Bool,
     ConnectionRecord,
+    Float,
     PathContext,
-    ReplayState,
     ScatteringVertex,
+    Spectrum,
+    UInt32,
     carries_light,
     relative,
     total,
+    while_loop,
 )
 from unrender.rendering.mitsuba.integrators.differential_bsdf import BranchVertex, DifferentialBsdf, RoughLobe
 
@@ -110,45 +113,24 @@ class PathPair:
         self.turning_emitters = turning_emitters
 
     def sample(
-        self,
-        mode: dr.ADMode,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        replay: tuple[ReplayState, ...] = (),
-        pair: bool = False,
-        geometry: Any = None,
-        active: Bool | bool = True,
+        self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f, active: Bool | bool = True
     ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane, see `PathKernel.sample`. The "delta" entry of `tables` is used with `changing_delta`."""
-        context = PathContext(mode, scene, tables, replay, pair, geometry)
         path, _ = while_loop(**self._loop(context, self._begin(context, ray, active), sampler))
         if path.branches:
             self._follow_branches(context, path, sampler)
-        return path.δL if context.forward else path.L[0], path.L[1] if pair else None
+        return path.δL if context.forward else path.L[0], path.L[1] if context.pair else None
 
-    def vertices(
-        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
-    ) -> Float:
-        context = PathContext(dr.ADMode.Primal, scene, tables, (), False, geometry)
+    def vertices(self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f) -> Float:
         path, _ = while_loop(**self._loop(context, self._begin(context, ray), sampler))
         return mi.Float(path.depth)
 
     def record_connections(
-        self,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        replay: ReplayState,
-        connections: ConnectionRecord,
-        active: Bool | bool = True,
-    ) -> ConnectionRecord:
+        self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f, active: Bool | bool = True
+    ) -> ConnectionRecord | None:
         """Replay the paths in forward mode, and return the contributions of emitter-sampling connections."""
-        context = PathContext(dr.ADMode.Forward, scene, tables, (replay,), False, None, connections)
         while_loop(**self._loop(context, self._begin(context, ray, active), sampler))
-        return connections
+        return context.connections
 
     def _begin(self, context: PathContext, ray: mi.RayDifferential3f, active: Bool | bool = True) -> PathState:
         return PathState(
@@ -175,7 +157,6 @@ class PathPair:
         }
 
     def _bounce(self, context: PathContext, path: PathState, sampler: Any) -> tuple[PathState, Any]:
-        """Trace one segment and process the vertex at its end."""
         si = context.geometry.ray_intersect(
             path.ray, ray_flags=mi.RayFlags.All, coherent=path.depth == 0, active=path.active
         )
@@ -348,7 +329,7 @@ class PathPair:
 
     def _incident(self, context: PathContext) -> Callable[..., Spectrum]:
         """Return the `incident` argument of `DifferentialBsdf.contribution`, which traces standard paths."""
-        primal = PathContext(dr.ADMode.Primal, context.scene, context.tables, (), False, context.posed)
+        primal = PathContext(dr.ADMode.Primal, context.scene, context.tables, geometry=context.posed)
 
         def trace(branch: BranchVertex, vertex: ScatteringVertex, ray: Any, numbers: Any, active: Bool) -> Spectrum:
             path = self._begin(primal, ray)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
-from unrender.rendering.mitsuba.integrators.base import ReplayState
+from unrender.rendering.mitsuba.integrators.base import Bool, Float, PathContext, Spectrum
 from unrender.rendering.mitsuba.integrators.path import PathPair
 
 
@@ -22,27 +19,16 @@ class PrbKernel:
         self._depths = max_depth, rr_depth
 
     def sample(
-        self,
-        mode: dr.ADMode,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        replay: tuple[ReplayState, ...] = (),
-        pair: bool = False,
-        geometry: Any = None,
-        active: Bool | bool = True,
+        self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f, active: Bool | bool = True
     ) -> tuple[Spectrum, None]:
         """Trace one path per lane, see `PathKernel.sample`. Raise `ValueError` for pairs and for `geometry`, which `prb` does not
         support."""
-        del tables
-        if pair or geometry is not None:
+        if context.pair or context.posed is not None:
             raise ValueError("prb: expected one state and the scene's own geometry")
-        δL, state_in = (replay[0].δL, replay[0].radiance) if replay else (None, None)
-        return self._integrator.sample(mode, scene, sampler, ray, δL, state_in, mi.Bool(active))[0], None
+        δL, state_in = (context.replay[0].δL, context.replay[0].radiance) if context.replay else (None, None)
+        radiance = self._integrator.sample(context.mode, context.scene, sampler, ray, δL, state_in, mi.Bool(active))[0]
+        return radiance, None
 
-    def vertices(
-        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
-    ) -> Float:
+    def vertices(self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f) -> Float:
         """Return the number of vertices per lane of paths with the same distribution, see `PathKernel.vertices`."""
-        return PathPair(*self._depths).vertices(scene, tables, sampler, ray, geometry)
+        return PathPair(*self._depths).vertices(context, sampler, ray)

@@ -9,9 +9,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum
-from unrender.rendering.mitsuba.integrators.base import PathContext
-from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
+from unrender.rendering.mitsuba.integrators.base import Bool, Float, PathContext, Spectrum, registry_id
 
 _SAME_DENSITY = 1e-3
 """Relative difference up to which two densities of one direction are the same, for rounding."""

@@ -13,8 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
-from unrender.rendering.mitsuba.integrators.base import largest, total
+from unrender.rendering.mitsuba.integrators.base import Bool, Float, Spectrum, UInt32, largest, total
 from unrender.rendering.mitsuba.integrators.majorant_supergrid import DdaState, HomogeneousMajorant, SupergridTraversal
 
 _FAINT = 0.1

@@ -7,7 +7,7 @@ medium. Index-matched boundaries are not vertices.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
@@ -15,16 +15,19 @@ import mitsuba as mi
 
 from unrender.rendering.mitsuba.film import independent
 from unrender.rendering.mitsuba.integrators import emitters, specular, tracking
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, while_loop
 from unrender.rendering.mitsuba.integrators.base import (
     KEEP,
-    ReplayState,
+    Bool,
+    Float,
+    PathContext,
     ScatteringVertex,
+    Spectrum,
     carries_light,
     largest,
+    registry_id,
     relative,
+    while_loop,
 )
-from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 from unrender.rendering.mitsuba.integrators.tracking import MediumSegment, Reservoir
 from unrender.rendering.mitsuba.integrators.volume_path import (
     ConnectionSample,
@@ -82,44 +85,28 @@ class VolumePair:
         self.radiance_field = radiance_field
 
     def sample(
-        self,
-        mode: dr.ADMode,
-        scene: mi.Scene,
-        tables: Mapping[str, Any],
-        sampler: Any,
-        ray: mi.RayDifferential3f,
-        replay: tuple[ReplayState, ...] = (),
-        pair: bool = False,
-        geometry: Any = None,
-        active: Bool | bool = True,
+        self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f, active: Bool | bool = True
     ) -> tuple[Spectrum, Spectrum | None]:
         """Trace one path per lane, see `PathKernel.sample`. `tables` also has the entries of `ScenePair.media()` and `.majorants()`.
 
         Raises `ValueError` for `geometry`, since posed shapes are not supported with media.
         """
-        if geometry is not None:
+        if context.posed is not None:
             raise ValueError("media: expected the scene's own geometry")
-        camera_medium: Any = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
-        start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(active))
-        context = VolumeContext(start, mode, scene, tables, replay, pair)
+        volume = VolumeContext.of_camera(context, ray, active)
         noise = None if context.primal else independent(sampler, dr.width(ray))
-        path, _, noise = while_loop(**self._loop(context, self._begin(context), sampler, noise))
+        path, _, noise = while_loop(**self._loop(volume, self._begin(volume), sampler, noise))
         if context.primal:
-            return path.L[0], path.L[1] if pair else None
+            return path.L[0], path.L[1] if context.pair else None
         if self.differentiate_media:
             dr.eval(path.reservoir)  # Two backward passes in one kernel would race for the same gradients.
-            path.δL += self._in_scattering(context, path.reservoir, noise)
-        return path.δL if context.forward else path.L[0], path.L[1] if pair else None
+            path.δL += self._in_scattering(volume, path.reservoir, noise)
+        return path.δL if context.forward else path.L[0], path.L[1] if context.pair else None
 
-    def vertices(
-        self, scene: mi.Scene, tables: Mapping[str, Any], sampler: Any, ray: mi.RayDifferential3f, geometry: Any = None
-    ) -> Float:
+    def vertices(self, context: PathContext, sampler: Any, ray: mi.RayDifferential3f) -> Float:
         """Return the number of vertices of each lane's path. Index-matched boundaries do not count."""
-        del geometry
-        camera_medium: Any = dr.reinterpret_array(mi.MediumPtr, tables["camera"])
-        start = PathStart(mi.Ray3f(dr.detach(ray)), camera_medium, mi.UInt32(0), mi.Bool(True))
-        context = VolumeContext(start, dr.ADMode.Primal, scene, tables, (), False)
-        path, *_ = while_loop(**self._loop(context, self._begin(context), sampler, None))
+        volume = VolumeContext.of_camera(context, ray, True)
+        path, *_ = while_loop(**self._loop(volume, self._begin(volume), sampler, None))
         return mi.Float(path.depth)
 
     def _begin(self, context: VolumeContext) -> VolumePathState:
@@ -311,7 +298,7 @@ class VolumePair:
         `Forward` mode return the derivative along the tangents, else 0."""
         active = point.total > 0
         start = PathStart(point.ray, point.medium, point.depth, active, point.t)
-        primal = VolumeContext(start, dr.ADMode.Primal, context.scene, context.tables, (), context.pair)
+        primal = VolumeContext(start, dr.ADMode.Primal, context.scene, context.tables, pair=context.pair)
         path = self._begin(primal)
         if self.radiance_field:
             path.L = [mi.Spectrum(1) for _ in path.L]  # The coefficient below is the emission, so no path is needed.

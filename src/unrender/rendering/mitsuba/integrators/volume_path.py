@@ -10,8 +10,15 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.integrators import tracking
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32
-from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex, carries_light
+from unrender.rendering.mitsuba.integrators.base import (
+    Bool,
+    Float,
+    PathContext,
+    ScatteringVertex,
+    Spectrum,
+    UInt32,
+    carries_light,
+)
 from unrender.rendering.mitsuba.integrators.tracking import MediumSegment, Reservoir
 
 
@@ -64,9 +71,16 @@ class VolumePathState:
 class VolumeContext(PathContext):
     """A `PathContext` with the start of its paths."""
 
-    def __init__(self, start: PathStart, *others: Any):
-        super().__init__(*others)
+    def __init__(self, start: PathStart, *others: Any, pair: bool = False):
+        super().__init__(*others, pair=pair)
         self.start = start
+
+    @staticmethod
+    def of_camera(context: PathContext, ray: mi.RayDifferential3f, active: Bool | bool) -> VolumeContext:
+        """Return the context of paths that begin on camera rays, in the medium that the table "camera" has."""
+        medium: Any = dr.reinterpret_array(mi.MediumPtr, context.tables["camera"])
+        start = PathStart(mi.Ray3f(dr.detach(ray)), medium, mi.UInt32(0), mi.Bool(active))
+        return VolumeContext(start, context.mode, context.scene, context.tables, context.replay, pair=context.pair)
 
 
 class Flight:

@@ -18,8 +18,7 @@ from unrender.rendering.mitsuba.frozen import FrozenFunction
 from unrender.rendering.mitsuba.gpu import lookup_mask
 from unrender.rendering.mitsuba.integrators.base import total
 from unrender.rendering.mitsuba.light_paths import LightPaths
-from unrender.rendering.mitsuba.path_cache.lookups import Lookups
-from unrender.rendering.mitsuba.path_cache.tracing import SOURCES, TracePass
+from unrender.rendering.mitsuba.path_cache.tracing import SOURCES, Lookups, TracePass
 from unrender.rendering.mitsuba.scene_pair import ScenePair
 from unrender.rendering.mitsuba.session import MitsubaSession
 from unrender.rendering.renderer import Rendering, SampleRequest, Space
@@ -162,7 +161,6 @@ class CachingSession(SessionWrapper):
         return self._task.bytes_per_row * self._depth * self._inner.count(request) * request.spp
 
     def _fits(self, request: SampleRequest) -> bool:
-        """Return whether the memory limits allow caching a rendering's paths."""
         alive = [paths for reference in self._alive if (paths := reference()) is not None]
         self._alive = [weakref.ref(paths) for paths in alive]
         size = self.path_bytes(request)

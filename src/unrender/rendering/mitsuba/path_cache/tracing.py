@@ -1,4 +1,4 @@
-"""Tracing of cached paths: contribution of each vertex without the factors that depend on the parameters.
+"""Tracing of cached paths: the lookups that depend on parameters, and the contribution of each vertex without them.
 
 With the lookup t_j at vertex j (1 if it depends on no parameter), the lookup l_r at the emitter and fixed factors e_r, a path has the
 radiance
@@ -6,28 +6,178 @@ radiance
     L = Σ_r e_r l_r Π_{j < r} t_j.
 
 Row r contains the emission that segment r hits and the emitter-sampling connection at vertex r - 1. Row 0 is directly visible emission.
+The lookups are the reflectances of diffuse surfaces and the radiance of emitters; parameters of others are not supported, with a reason.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from unrender.core.errors import InputError
 from unrender.rendering.mitsuba.camera_paths import CameraPaths
 from unrender.rendering.mitsuba.integrators import emitters
-from unrender.rendering.mitsuba.integrators.array_types import Bool, Float, Spectrum, UInt32, while_loop
-from unrender.rendering.mitsuba.integrators.base import PathContext, ScatteringVertex, carries_light
+from unrender.rendering.mitsuba.integrators.base import (
+    Bool,
+    Float,
+    PathContext,
+    ScatteringVertex,
+    Spectrum,
+    UInt32,
+    carries_light,
+    registry_id,
+    while_loop,
+)
 from unrender.rendering.mitsuba.integrators.path import ROULETTE_FLOOR
-from unrender.rendering.mitsuba.integrators.pointer_tables import registry_id
 from unrender.rendering.mitsuba.integrators.specular import on_its_side, sampling_weights
 from unrender.rendering.mitsuba.passes import LaunchSize, Pass
-from unrender.rendering.mitsuba.path_cache.lookups import Lookups
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph, object_ids
 from unrender.rendering.mitsuba.scene_pair import ScenePair
+
+_TEXTURES = ("BitmapTextureImpl", "UniformSpectrum", "SRGBReflectanceSpectrum", "Checkerboard")
+"""Prefixes of the class names of textures that only read texture coordinates."""
+_ENVIRONMENTS = ("EnvironmentMapEmitter", "ConstantBackgroundEmitter")
+_TRAVERSED = ("mitsuba", "unrender")
+"""Packages whose plugins declare all their objects to `mitsuba.traverse`."""
+_FIXED = ("sampling_weight", "to_world", "to_uv")
+
+
+class Lookups:
+    """Textures and emitters that depend on a set of parameters.
+
+    Args:
+        pair: both loads of the scene.
+        previous: whether to use the second load.
+
+    Attributes:
+        textures: reflectances of diffuse BSDFs.
+        emitters: area lights first, then environments.
+        areas: number of area lights.
+
+    Raises `InputError` with the reason for a parameter that is not supported.
+    """
+
+    def __init__(self, pair: ScenePair, keys: Sequence[str], previous: bool = False):
+        if pair.volumetric:
+            raise InputError("paths through participating media are not cached")
+        self._graph = pair.loaded(previous).graph
+        self._graph.check_complete()
+        _check_plugins(self._graph)
+        properties = pair.loaded(previous).parameters.properties
+        surfaces: dict[Any, list[Any]] = {}
+        emitters: dict[Any, None] = {}
+        for key in keys:
+            if key not in properties:
+                raise InputError(f"paths are not cached for parameter {key}: it is a pose")
+            try:
+                for slot, owner in _slots(self._graph, properties[key][2], key.rpartition(".")[2]):
+                    if isinstance(slot, mi.Emitter):
+                        emitters[slot] = None
+                    else:
+                        surfaces.setdefault(slot, []).append(owner)
+            except ValueError as error:
+                raise InputError(f"paths are not cached for parameter {key}: {error}") from error
+        self.textures = list(surfaces)
+        self._bsdfs = list(surfaces.values())
+        ordered = sorted(emitters, key=lambda emitter: emitter.class_name() in _ENVIRONMENTS)
+        self.emitters = ordered
+        self.areas = sum(emitter.class_name() not in _ENVIRONMENTS for emitter in ordered)
+
+    @cached_property
+    def tables(self) -> dict[str, mi.UInt32]:
+        """Tables {"cached_bsdf" | "cached_emitter"} from registry ids to the index of the lookup, starting at 1; 0 for none."""
+        numbers = {bsdf: index for index, owners in enumerate(self._bsdfs, 1) for bsdf in owners}
+        lights = {emitter: index for index, emitter in enumerate(self.emitters, 1)}
+        return {
+            "cached_bsdf": _table("bsdf", self._graph.of("bsdf"), numbers),
+            "cached_emitter": _table("emitter", self._graph.of("emitter"), lights),
+        }
+
+
+def _slots(graph: ObjectGraph, node: Any, leaf: str) -> Iterator[tuple[Any, Any]]:
+    """Yield the lookup of a parameter's object for each chain of its owners: (texture, outermost BSDF) or (emitter, None).
+
+    Raises `ValueError` with the reason if one of them is not supported.
+    """
+    if leaf in _FIXED:
+        raise ValueError("the directions of paths depend on it")
+    chains, checked = list(graph.chains(node)), set()
+    for chain in [chain for chain in chains if len(chain) > 2] or chains:
+        position = next((i for i, item in enumerate(chain) if isinstance(item, (mi.BSDF, mi.Emitter))), None)
+        if position is None:
+            raise ValueError("it belongs to neither a material nor an emitter, so paths depend on it")
+        owner = chain[position]
+        holders = tuple(item for item in chain if not isinstance(item, (mi.Shape, mi.Scene)))
+        if holders in checked:  # already checked for another shape
+            continue
+        checked.add(holders)
+        # A texture may hold others than the parameter's.
+        for texture in (
+            *chain[:position],
+            *_below(graph, owner if isinstance(owner, mi.Emitter) else chain[position - 1]),
+        ):
+            if not texture.class_name().startswith(_TEXTURES):
+                raise ValueError(f"{texture.class_name()} depends on more than texture coordinates")
+        _check_around(owner, holders[position + 1 :])
+        if isinstance(owner, mi.Emitter):
+            if owner.class_name() not in ("AreaLight", *_ENVIRONMENTS):
+                raise ValueError(f"the light of {owner.class_name()} is not supported")
+            yield owner, None
+            continue
+        _check_bsdfs(graph, holders[position:])
+        yield chain[position - 1], holders[-1]
+
+
+def _below(graph: ObjectGraph, node: Any) -> Iterator[Any]:
+    """Yield all objects that an object holds, recursively."""
+    for other, owners in graph.owners.items():
+        if node in owners:
+            yield other
+            yield from _below(graph, other)
+
+
+def _check_around(owner: Any, around: Sequence[Any]) -> None:
+    """Raise `ValueError` for a holder that is neither a BSDF around a BSDF nor a shape or scene."""
+    for item in around:
+        if isinstance(owner, mi.Emitter) or not isinstance(item, mi.BSDF):
+            raise ValueError(f"it is inside a {item.class_name()}")
+
+
+def _check_plugins(graph: ObjectGraph) -> None:
+    """Raise `InputError` for a Python plugin, which may hold a supported texture without showing it to `mitsuba.traverse`."""
+    for node in graph.nodes:
+        if type(node).__module__.partition(".")[0] not in _TRAVERSED:
+            raise InputError(f"paths are not cached with the Python plugin {type(node).__name__}")
+
+
+def _check_bsdfs(graph: ObjectGraph, bsdfs: Sequence[Any]) -> None:
+    inner, *around = bsdfs
+    if inner.class_name() != "SmoothDiffuse":
+        raise ValueError(
+            f"it belongs to a {inner.class_name()}, and only the reflectance of diffuse surfaces is cached"
+        )
+    for bsdf in around:
+        if bsdf.class_name() != "TwoSidedBRDF":
+            raise ValueError(f"it is inside a {bsdf.class_name()}")
+        nested = {node for node in graph.nodes if isinstance(node, mi.BSDF) and bsdf in graph.owners[node]}
+        if len(nested) > 1:
+            raise ValueError("its two sides have different materials")
+
+
+def _table(kind: str, items: Sequence[Any], numbers: Mapping[Any, int]) -> mi.UInt32:
+    ids = object_ids(kind, items)
+    table = np.zeros(int(ids.max(initial=0)) + 1, np.uint32)
+    for number, item in zip(ids, items, strict=True):
+        table[number] = numbers.get(item, 0)
+    return mi.UInt32(table)
+
 
 SOURCES = ("met", "connected")
 """Kinds of emission in a row, stored separately if emitters are looked up."""
@@ -83,7 +233,7 @@ class TracePass(Pass):
         return self.lookups.tables
 
     def call(self, paths: CameraPaths, size: LaunchSize, *own: Any) -> Callable[[], Any]:
-        context = PathContext(dr.ADMode.Primal, paths.scene, paths.tables, (), False)
+        context = paths.context()
         lanes = paths.sampler.wavefront_size()  # a sensor's rays may all be equal, of width 1
         record = _Record(self._empty(lanes), lanes, mi.Color3f(paths.response.weight))
         return functools.partial(self._trace, context, record, paths.ray, paths.sampler)
