@@ -165,13 +165,13 @@ def _print_plan(
     problem: str, name: str, settings: dict[str, str], problem_settings: list[str] | None, variant: str
 ) -> None:
     from unrender.methods import method
-    from unrender.methods.plan_file import text
+    from unrender.methods.plan import plan_text
 
     chosen, options = method(name), arguments.settings(problem_settings, "--problem-set")
     chosen.start(settings)
     arguments.check_problem(problem, options)
     arguments.use_variant(variant)
-    print(text(chosen.plan(arguments.open_problem(problem, options), settings)), end="")
+    print(plan_text(chosen.plan(arguments.open_problem(problem, options), settings)), end="")
 
 
 def _method_options(one: Method) -> Table:

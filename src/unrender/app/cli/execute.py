@@ -14,7 +14,7 @@ from rich.markup import escape
 from unrender.display import formatting
 from unrender.display.terminal import Console, columns
 from unrender.methods import Method
-from unrender.methods.plan_file import PlanFile
+from unrender.methods.plan import PlanFile
 from unrender.runs import watches
 from unrender.runs.callbacks import RUN_PHASES, Callback
 from unrender.runs.final_checks import image_name

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from unrender.app.distributed.cluster import Workers
     from unrender.display.terminal import Console
     from unrender.methods import Method
-    from unrender.methods.plan_file import PlanFile
+    from unrender.methods.plan import PlanFile
     from unrender.runs.folder.schema import RunRecord
     from unrender.runs.progress import Progress
     from unrender.runs.result import Result
@@ -153,7 +153,7 @@ def run(
 def _method(name: str) -> Method | PlanFile:
     """Return the method of a name, or the plan of a TOML file. Raises `InputError`."""
     from unrender.methods import method
-    from unrender.methods.plan_file import SUFFIX, PlanFile
+    from unrender.methods.plan import SUFFIX, PlanFile
 
     return PlanFile(Path(name)) if name.endswith(SUFFIX) else method(name)
 
