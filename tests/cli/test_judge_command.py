@@ -116,9 +116,8 @@ def test_a_turntable_turns(unrender, run: Path, mitsuba_variant: str) -> None:
     assert frames[0][8, 8].min() > 0.2
     assert frames[2][8, 8].max() == 0
     with Image.open(run.parent / "video.gif") as video:
-        assert (
-            getattr(video, "n_frames", 1) == 2
-        )  # from the side and from behind nothing is seen: one frame, that stays
+        # From the side and from behind nothing is seen: one frame, that stays.
+        assert getattr(video, "n_frames", 1) == 2
     pytest.importorskip("imageio_ffmpeg")
     assert unrender("turntable", "result", *words, "--variant", mitsuba_variant).status == 0
     assert (run / "turntable.mp4").stat().st_size > 500

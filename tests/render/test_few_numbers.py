@@ -165,6 +165,5 @@ def test_environment_maps_alone_are_pulled_to_their_start(tmp_path: Path) -> Non
     whole = ur.optimize(problem, steps=4, progress=False)
     ur.optimize(problem, steps=2, run_directory=tmp_path / "run", progress=False)
     resumed = ur.resume(tmp_path / "run", problem, steps=4)
-    np.testing.assert_allclose(
-        resumed.last["sky.data"], whole.last["sky.data"], rtol=1e-5
-    )  # two threads add in any order
+    # Two threads add in any order.
+    np.testing.assert_allclose(resumed.last["sky.data"], whole.last["sky.data"], rtol=1e-5)

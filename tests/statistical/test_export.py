@@ -198,9 +198,8 @@ KEYS = [
 def still() -> tuple[Problem, dict[str, np.ndarray]]:
     problem = ur.Problem(still_life, [ur.Parameter(key) for key in KEYS], [ur.View(np.zeros((8, 8, 3)))], max_depth=4)
     parameters = elsewhere(problem)
-    sky = parameters[
-        "sky.data"
-    ]  # Mitsuba keeps the first column once more behind the last, and the last before the first
+    # Mitsuba keeps the first column once more behind the last, and the last before the first.
+    sky = parameters["sky.data"]
     sky[:, 0], sky[:, -1] = sky[:, -2], sky[:, 1]
     return problem, parameters
 

@@ -169,9 +169,8 @@ def test_standard_errors_are_honest(order: str, options: dict[str, bool]) -> Non
     rows = []
     for seed in range(400):
         value, error, truth = estimate(case, order, 256, seed, **{**options, "low_discrepancy": False})
-        if (
-            order == "hvp"
-        ):  # its target is the central difference itself, which a tenth of σ leaves within a part in a hundred
+        # Its target is the central difference itself, which a tenth of σ leaves within a part in a hundred.
+        if order == "hvp":
             truth = truth * 0.998
         rows.append(((value - truth) / error).ravel()[0])
     z = np.array(rows)

@@ -185,9 +185,8 @@ def test_a_share_that_is_lost_changes_nothing(name: str) -> None:
 def test_a_worker_that_dies_between_the_replies_of_its_shares_changes_nothing(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "unrender.app.distributed.worker_state._MOST_STEPS", 4
-    )  # so that memories are collected and stored, too
+    # So that memories are collected and stored, too.
+    monkeypatch.setattr("unrender.app.distributed.worker_state._MOST_STEPS", 4)
     problem = analytic.problem(ur.losses.L1(), views=VIEWS)
     shares = assign([16] * VIEWS, 3)
     whole = descend(dealt(problem, 3, compress=True), name)

@@ -42,9 +42,8 @@ def test_distance_between_surfaces_is_that_of_spheres() -> None:
     fine = Surface(*meshes.icosphere(4))
     grown = Surface(1.25 * fine.vertices + [0, 0, 3.0], fine.faces)
     assert surface_error(fine, fine) < 1e-7
-    assert (
-        surface_error(Surface(POINTS[COPY], CUT), Surface(POINTS, FACES)) < 1e-7
-    )  # other triangles' numbers, the same surface
+    # Other triangles' numbers, the same surface.
+    assert surface_error(Surface(POINTS[COPY], CUT), Surface(POINTS, FACES)) < 1e-7
     assert surface_error(fine, Surface(1.25 * fine.vertices, fine.faces)) == pytest.approx(0.25, rel=0.02)
     assert surface_error(fine, grown) == pytest.approx(surface_error(grown, fine))
     square = Surface(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]]), np.array([[0, 1, 2], [1, 3, 2]]))
@@ -112,9 +111,8 @@ def test_no_triangle_turns_over_in_a_step() -> None:
     start = POINTS[COPY].reshape(-1).astype(np.float32)
     small = start * np.float32(0.5)
     assert guarded(start, small, CUT) is small
-    inward = (
-        POINTS[COPY] * np.where(np.arange(len(POINTS)) == 40, -1.0, 1.0)[COPY][:, None]
-    )  # one vertex through the middle
+    # One vertex through the middle.
+    inward = POINTS[COPY] * np.where(np.arange(len(POINTS)) == 40, -1.0, 1.0)[COPY][:, None]
     torn = POINTS[COPY] + np.random.default_rng(0).normal(size=POINTS.shape)[COPY]
     for wanted in (inward, torn, -POINTS[COPY]):
         found = guarded(start, wanted.reshape(-1).astype(np.float32), CUT).reshape(-1, 3)

@@ -77,9 +77,8 @@ def test_pictures_are_accessible(tmp_path):
     sliders = [a for a in page.all("input") if a["type"] == "range" and "aria-label" in a]
     assert len(sliders) == 2  # the view and the map
     assert all("on the left" in slider["aria-label"] for slider in sliders)
-    assert all(
-        "hidden" in label for label in page.all("label") if label.get("class") == "exposure"
-    )  # until its script runs
+    # Until its script runs.
+    assert all("hidden" in label for label in page.all("label") if label.get("class") == "exposure")
     radios = {a["id"] for a in page.all("input") if a["type"] == "radio"}
     assert radios == {label["for"] for label in page.all("label") if "for" in label}
 

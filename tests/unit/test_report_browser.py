@@ -49,14 +49,12 @@ def test_the_report_lets_one_choose_pictures_views_and_exposure(tmp_path):
         page.locator(".exposure input").fill("-1")
         assert page.locator(".exposure output").inner_text() == "-1 EV"
         left = slider.locator("img.left")
-        assert (
-            left.evaluate(PIXEL) == [round(255 * float(tone_mapping.srgb(np.array(0.7))))] * 3
-        )  # as it is in the file
+        # As it is in the file.
+        assert left.evaluate(PIXEL) == [round(255 * float(tone_mapping.srgb(np.array(0.7))))] * 3
         box = left.bounding_box()
         request = page.screenshot(clip={"x": box["x"] + 5, "y": box["y"] + box["height"] / 2, "width": 1, "height": 1})
-        assert (
-            np.abs(_pixel(request) - 255 * tone_mapping.srgb(np.array(0.35))).max() <= 2
-        )  # and half as bright on the screen
+        # And half as bright on the screen.
+        assert np.abs(_pixel(request) - 255 * tone_mapping.srgb(np.array(0.35))).max() <= 2
         assert slider.locator("img.right").evaluate("i => i.style.filter") == ""  # colours of numbers stay
         page.locator("label[for=over-samples]").click()
         assert page.locator(".charts.samples").is_visible()

@@ -115,9 +115,8 @@ def test_textures_of_a_wide_range_are_rendered_within_their_bounds(monkeypatch: 
     assert state.response is not None
     texture = asked.renderer.matrix[:, :TEXELS]
     ratio = state.response.curvature["map"].ravel() / np.sum(texture.T @ texture, axis=1)
-    assert (
-        ratio.max() < 2.01 * ratio.min()
-    )  # s is the change within the bounds, from 0.05 to 0.1 of the root mean square
+    # s is the change within the bounds, from 0.05 to 0.1 of the root mean square.
+    assert ratio.max() < 2.01 * ratio.min()
     assert min(darkest) >= 0.0
 
 

@@ -122,7 +122,7 @@ def chart(title: str, lines: Sequence[Line], axis: str, end: float) -> Chart | N
     if not shown:
         return None
     end = min(end, _LARGEST) if end > _SMALLEST else 1.0
-    x_axis = Axis(0.0, end, False, _even_ticks(0.0, end, 5, format_value))
+    x_axis = Axis(0.0, end, False, _even_ticks(0.0, end, format_value))
     y_axis = _vertical(shown)
     return Chart(
         title,
@@ -153,7 +153,7 @@ def _vertical(lines: Sequence[Line]) -> Axis:
     low, high = min(values.min(), 0.0) if values.min() < 0.5 * values.max() else values.min(), values.max()
     span = (high - low) or abs(high) or 1.0
     low, high = (low if low == 0 else low - 0.05 * span), high + 0.05 * span
-    return Axis(low, high, False, _even_ticks(low, high, 5, formatting.number))
+    return Axis(low, high, False, _even_ticks(low, high, formatting.number))
 
 
 def _drawable(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -162,10 +162,8 @@ def _drawable(parts: Sequence[np.ndarray]) -> np.ndarray:
     return np.where(np.abs(values) < _SMALLEST, 0.0, values)
 
 
-def _even_ticks(
-    low: float, high: float, count: int, format_value: Callable[[float], str]
-) -> tuple[tuple[float, str], ...]:
-    rough = (high - low) / count
+def _even_ticks(low: float, high: float, format_value: Callable[[float], str]) -> tuple[tuple[float, str], ...]:
+    rough = (high - low) / 5
     size = 10.0 ** math.floor(math.log10(rough))
     step = next(size * factor for factor in (1, 2, 2.5, 5, 10) if size * factor >= rough * 0.999)
     first = math.ceil(low / step - 1e-9)

@@ -114,9 +114,8 @@ def open_regular(path: Path, folder: Path | None = None) -> IO[bytes]:
         real = path.resolve(strict=True)
         if folder is not None and not real.is_relative_to(folder.resolve(strict=True)):
             raise InputError(f"{path}: leads out of the folder, expected a file within it")
-        if not stat.S_ISREG(
-            mode := real.stat().st_mode
-        ):  # checked before opening, because opening may trigger a device
+        # Checked before opening, because opening may trigger a device.
+        if not stat.S_ISREG(mode := real.stat().st_mode):
             raise InputError(f"{path}: {_not_regular(mode)}")
         # O_NONBLOCK avoids blocking on a pipe; O_NOFOLLOW rejects a link that has replaced the file since the check.
         descriptor = os.open(real, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOFOLLOW", 0))

@@ -198,9 +198,8 @@ def _words(file: IO[bytes]) -> Iterator[list[bytes]]:
 
 
 def _check_words(words: list[bytes], element: _Element, vertices: int, start: int, path: Path) -> None:
-    table = np.array(words, dtype="S12").reshape(
-        -1, len(element.names)
-    )  # longer words are cut, and out of range either way
+    # Longer words are cut, and out of range either way.
+    table = np.array(words, dtype="S12").reshape(-1, len(element.names))
     names = [name for name in element.names if name.endswith(".count")] + ["i0", "i1", "i2"]
     columns = table[:, [element.names.index(name) for name in names]]
     if not np.char.isdigit(columns).all():

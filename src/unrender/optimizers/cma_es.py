@@ -185,9 +185,8 @@ class _Search:
         """Return the next generation, (population, n), or other points of this one if all of its ranks were equal."""
         self._random, strategy = random, self._strategy
         with _quiet():
-            if len(
-                self._points
-            ):  # the first two may be a mirrored pair along the last step, which is sampled only once
+            # The first two may be a mirrored pair along the last step, which is sampled only once.
+            if len(self._points):
                 points = [*self._points[:2], *(strategy.ask(1)[0] for _ in self._points[2:])]
             else:
                 points = strategy.ask()

@@ -57,19 +57,12 @@ class Live(Callback):
     Args:
         folder: the run folder. If it is not writable, the run continues with a warning, still executes commands, and tries to write every
             few seconds. If the folder disappears, or `live` is a link, observation ends with a warning.
-        name, method, command, settings: as in `Result`, for display.
+        name, method, command: as in `Result`, for display.
     """
 
-    def __init__(
-        self,
-        folder: str | Path,
-        name: str = "",
-        method: str = "",
-        command: str = "",
-        settings: Mapping[str, Any] | None = None,
-    ):
+    def __init__(self, folder: str | Path, name: str = "", method: str = "", command: str = ""):
         self._folder = Path(folder)
-        self._description = {"name": name, "method": method, "command": command, "settings": dict(settings or {})}
+        self._name, self._method, self._command_line = name, method, command
         self._history = _LiveHistory(self._folder)
         self._disabled = False
         self._start: dict[str, np.ndarray] | None = None
@@ -187,14 +180,12 @@ class Live(Callback):
         self._write_arrays(schema.PARAMETERS, _reduced_parameters(initial))
         if run.problem.truth:
             self._write_arrays(schema.TRUTH, _reduced_parameters(run.problem.truth))
-        description = self._description
-        components = {"estimator": repr(run.estimator), "optimizer": repr(run.optimizer)}
         record = schema.RunRecord.model_construct(
-            name=description["name"] or run.problem.name,
-            method=description["method"] or type(run.estimator).__name__,
-            settings={**description["settings"], **components},
+            name=self._name or run.problem.name,
+            method=self._method or type(run.estimator).__name__,
+            settings={"estimator": repr(run.estimator), "optimizer": repr(run.optimizer)},
             seed=run.seed,
-            command=description["command"],
+            command=self._command_line,
             versions=versions(),
             hardware=hardware(),
             variant=current() or "",

@@ -201,9 +201,8 @@ class Verify(Callback):
         first, last = ends
         if _is_worse(pictures, first, last) or _is_worse(pictures, last, first):
             return ends
-        waiting = (
-            0 if self._small is None or self._small is pictures else len(ends) * self._small.paths
-        )  # of `_residual`
+        # Paths of the images of `_residual`.
+        waiting = 0 if self._small is None or self._small is pictures else len(ends) * self._small.paths
         least = _LEAST_DOUBTFUL if last.loss[0] > first.loss[0] else _LEAST_LARGER
         larger = self._larger_pictures(run, pictures, len(ends), waiting, seconds, least)
         if larger is None or larger.sampled:

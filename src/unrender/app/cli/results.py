@@ -254,9 +254,8 @@ def watch(
         echo(f"watching at {address.url}")
         echo("Ctrl-C stops this page; the runs continue")
         with contextlib.ExitStack() as stack, contextlib.suppress(KeyboardInterrupt):
-            on_admission = (
-                None if no_browser else _open(address, stack)
-            )  # the socket is listening already, so the browser can connect
+            # The socket is listening already, so the browser can connect.
+            on_admission = None if no_browser else _open(address, stack)
             with contextlib.suppress(OSError):
                 os.nice(_NICE)  # give the watched runs priority; not earlier, since the browser would inherit it
             server.serve([directory.absolute() for directory in directories], address, opened, on_admission)

@@ -160,7 +160,9 @@ class RayHosts:
             return
         old, lag = self._of[share], self._lags[share]
         lagged = lag.behind >= _IN_A_ROW
-        new = min((w for w in self._workers if w is not old), key=lambda w: (self._is_behind(w), len(w.shares)))
+        behind = {share for share, each in enumerate(self._lags) if each.behind >= _IN_A_ROW}
+        others = (worker for worker in self._workers if worker is not old)
+        new = min(others, key=lambda worker: (not behind.isdisjoint(worker.shares), len(worker.shares)))
         if lagged:
             self._tell(
                 f"{self._named(share)}: {lag.seconds:.2g} s a step, far above the others: moved to {_where(new)}"
@@ -178,9 +180,6 @@ class RayHosts:
         if self._successors < _SUCCESSORS:
             self._successors += 1
             self._starting.append(self._start())
-
-    def _is_behind(self, worker: _Worker) -> bool:
-        return any(self._lags[share].behind >= _IN_A_ROW for share in worker.shares)
 
     # ------------------------------------------------------------------ replies and lost workers
 
@@ -242,7 +241,6 @@ class RayHosts:
         return _LONGEST if usual is None else 60.0 + _MANY_TIMES * usual
 
     def _silent(self, shares: Mapping[int, Any]) -> list[int]:
-        """Return the shares whose worker does not answer a ping."""
         calls = {share: self._of[share].handle.alive.options(concurrency_group="answers").remote() for share in shares}
         done = self._cluster.wait(list(calls.values()), len(calls), _ANSWER)
         return [share for share, reference in calls.items() if reference not in done]
@@ -280,11 +278,6 @@ class RayHosts:
                 raise InputError(f"workers: {_reason(error)}") from error
         return True
 
-    def _await(self, worker: _Worker) -> None:
-        """Wait until a worker is ready; stop it if this takes too long."""
-        if not self._is_done(worker, _START) or worker.place is None:
-            self._kill(worker)
-
     def _await_all(self) -> None:
         """Wait for all workers at once; those that are not ready by then may come later, and get shares from those that are."""
         self._cluster.wait([worker.first for worker in self._workers], len(self._workers), _START)
@@ -316,9 +309,10 @@ class RayHosts:
         self._starting.append(self._start())
         if not self._workers:
             first = self._starting[-1]
-            self._await(first)
+            ready = self._is_done(first, _START) and first.place is not None
             self._starting.remove(first)
-            if first.place is None:
+            if not ready:
+                self._kill(first)
                 raise InputError(
                     "workers: all were lost, and no other could be started; run unrender resume to continue from the last checkpoint"
                 )

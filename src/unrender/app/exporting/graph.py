@@ -152,9 +152,8 @@ class SceneGraph:
                 break
             owner, depth = above, depth + 1
         node, path = int(label[1]) if label else 0, tuple(parts[-depth:])
-        while len(path) > 1 and path[0] in (
-            children := self.children(node)
-        ):  # the object of a texture does not have its id
+        # The object of a texture does not have its id.
+        while len(path) > 1 and path[0] in (children := self.children(node)):
             node, path = children[path[0]], path[1:]
         return Place(node, path, owner, key)
 

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 _ALWAYS = (schema.PARAMETERS, schema.INITIAL)
 """Archives that exist even without arrays."""
+_COPIED = (
+    *("name", "method", "choices", "seed", "command", "steps", "seconds", "warmup_seconds", "skipped", "resumed"),
+    *("undetermined", "without_errors"),
+)
+"""Fields of run.json that are those of the result."""
 
 
 def check_writable(folder: Path, result: Result, status: str) -> None:
@@ -87,27 +92,16 @@ def record(result: Result, status: str, error: str = "") -> dict[str, Any]:
         error = "stopped: the last gradients were not finite"
     fields: dict[str, Any] = {
         "status": status,
-        "name": result.name,
-        "method": result.method,
+        **{name: getattr(result, name) for name in _COPIED},
         "settings": dict(result.settings),
-        "choices": list(result.choices),
         "adapted": [plain(line) for line in result.adapted],
-        "seed": result.seed,
-        "command": result.command,
         "versions": versions(),
         "hardware": hardware(),
         "variant": current() or "",
         "stopped": plain(result.stopped),
-        "steps": result.steps,
-        "seconds": result.seconds,
-        "warmup_seconds": result.warmup_seconds,
-        "skipped": result.skipped,
         "warnings": [plain(line) for line in result.warnings],
         "problem": dict(result.problem),
-        "resumed": list(result.resumed),
         "image_errors": {name: list(error) for name, error in result.image_errors.items() if np.isfinite(error).all()},
-        "undetermined": list(result.undetermined),
-        "without_errors": list(result.without_errors),
         "standard_error": {
             key: [float(f"{value:.6g}") if np.isfinite(value) else None for value in np.ravel(error)]
             for key, error in result.standard_error.items()

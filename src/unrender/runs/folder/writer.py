@@ -290,9 +290,8 @@ class RunWriter(Callback):
 
     def _thin(self, records: list[dict[str, Any]]) -> None:
         thinned_records = thinned(records)
-        self._thin_from = (
-            self._history.size + THINNED_FROM // 8
-        )  # avoids an attempt at every step if thinning has no effect
+        # Avoids an attempt at every step if thinning has no effect.
+        self._thin_from = self._history.size + THINNED_FROM // 8
         if len(thinned_records) < len(records):
             records[:] = thinned_records
             self._history.rewrite(records)
