@@ -15,6 +15,7 @@ from unrender.core.trees import Tree
 from unrender.optimizers.base import averaged_by
 from unrender.runs.callbacks import Callback
 from unrender.runs.result import Result
+from unrender.runs.verification import control_variates
 from unrender.scene.problem import Problem
 from unrender.statistics.stationary import stationary_mean
 
@@ -77,6 +78,9 @@ class NumberTrace:
 
 _MOST_OF_ONE, _MOST_ELEMENTS = 4, 256
 """Elements of one number, and of all numbers, up to which they are averaged."""
+_FEWEST_WITH_MEMORY = 100
+"""Fewest steps of a mean with a standard error where control variates keep noise for about 20 steps, which shorter means do not show.
+Source: a roughness, eight seeds: over 51 steps the errors were 3.0 times the stated ones, over 120 to 228 steps 1.7 times."""
 
 
 class NumberMeans(Callback):
@@ -105,6 +109,7 @@ def averaged(run: Run, result: Result) -> Result:
     """Return the result with the mean of each number over its last steps, where these are stationary, and its standard error.
 
     There are no standard errors if other parameters are unknown, such as textures: numbers may follow these slowly, with little noise.
+    Neither are there any of a few steps with control variates.
     """
     trace = run.state.numbers
     shapes = numbers_of(run.problem, run.optimizer)
@@ -114,6 +119,8 @@ def averaged(run: Run, result: Result) -> Result:
     means, errors, steps = _means(np.array(trace.rows), trace.size, last)
     if not steps:
         return result
+    if next(control_variates(run.state.estimator), None) is not None:
+        errors = {key: error for key, error in errors.items() if int(steps[key]) >= _FEWEST_WITH_MEMORY}
     return replace(
         result,
         parameters={**result.parameters, **means},
