@@ -102,12 +102,7 @@ class Point:
         return step, float(np.max(np.abs(step) / widths, initial=0.0))
 
     def system(
-        self,
-        state: GaussNewtonState,
-        key: Key,
-        step: np.ndarray | None = None,
-        moved: float = 0.0,
-        fresh: bool = True,
+        self, state: GaussNewtonState, key: Key, step: np.ndarray | None = None, moved: float = 0.0, fresh: bool = True
     ) -> System:
         """Return gradient and Hessian for the state's widths, after a step (n,) of length `moved` in units of the widths. Without a step,
         only compute the quantities that the next widths need.

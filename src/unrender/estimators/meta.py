@@ -48,6 +48,10 @@ class MetaState:
     step: int = 0
     batches: int = 0
 
+    def starts_anew(self, parameters: Tree) -> bool:
+        """Return whether no step preceded with parameters of these shapes."""
+        return self.parameters is None or trees.shapes(self.parameters) != trees.shapes(parameters)
+
     def upsampled(self, upsampler: Upsampler) -> MetaState:
         """Return the state with interpolated gradients, moments and previous parameters."""
         image, pixels = upsampled(self.image, upsampler), upsampled(self.pixels, upsampler)
@@ -209,8 +213,7 @@ class MetaEstimator:
     def estimate(self, problem: Problem, parameters: Tree, state: MetaState, key: Key) -> tuple[Estimate, MetaState]:
         """Return an estimate and the next state. `info`: "samples" (paths traced for images and adjoints), "images" per view, "space"
         and "alpha" (the weight of the past) per parameter, and the info of the image estimator, per view."""
-        fresh = state.parameters is None or trees.shapes(state.parameters) != trees.shapes(parameters)
-        if fresh or state.parameters is None:
+        if state.parameters is None or state.starts_anew(parameters):
             elements, previous = {name: meta.init(x) for name, x in parameters.items()}, parameters
             step_norm: Array = 0.0
         else:
@@ -220,14 +223,14 @@ class MetaEstimator:
             step_norm = arrays.sqrt(sum(memory.square(x) for x in moved.values()))
             del moved
         space = self._space(problem, parameters)
-        pair_request = PairRequest(previous, space, state.step, state.batches)
+        pair = PairRequest(previous, space, state.step, state.batches)
         take = self._coupled if self.coupled else self._independent
-        first, second, step, pixels = take(problem, parameters, state, pair_request, fresh, key)
+        first, second, step, pixels = take(problem, parameters, state, pair, key)
         observed, samples = None, step.samples
         if self.statistics == "independent":
             again = replace(state, pixels=pixels)
             further = key.fold(_OBSERVED)
-            *observed, more, pixels = take(problem, parameters, again, pair_request, fresh, further, first=False)
+            *observed, more, pixels = take(problem, parameters, again, pair, further, first=False)
             samples += more.samples
         rule = meta.update_coupled if self.coupled else meta.update
         results = {
@@ -271,56 +274,40 @@ class MetaEstimator:
         return "path" if all(known[key].shares_paths for key in parameters) else "primary"
 
     def _independent(
-        self,
-        problem: Problem,
-        parameters: Tree,
-        state: MetaState,
-        pair_request: PairRequest,
-        fresh: bool,
-        key: Key,
-        first: bool = True,
+        self, problem: Problem, parameters: Tree, state: MetaState, pair: PairRequest, key: Key, first: bool = True
     ) -> tuple[Tree, Tree, GradientSample, Any]:
         """Return F, ΔF from independent samples, the sample of F with the cost of both, and the pixel sampler's next state. `first`:
         see `_sample`."""
         spp, difference_spp = self.proportional_spp or _PROPORTIONAL_SPP, self.difference_spp or _DIFFERENCE_SPP
+        fresh = state.starts_anew(parameters)
         at_once = self.difference_images == "proportional" and not fresh
-        difference_request = replace(pair_request, difference_spp=difference_spp) if at_once else None
-        step, pixels = self._sample(
-            problem, parameters, state, spp, key.fold(_PROPORTIONAL), difference_request, first=first
-        )
+        difference = replace(pair, difference_spp=difference_spp) if at_once else None
+        step, pixels = self._sample(problem, parameters, state, spp, key.fold(_PROPORTIONAL), difference, first=first)
         coordinates = problem.coordinates
-        slopes, before = coordinates.slopes(parameters), coordinates.slopes(pair_request.previous)
+        slopes, before = coordinates.slopes(parameters), coordinates.slopes(pair.previous)
         F = coordinates.pull_back(step.gradient, slopes)
         if fresh:  # the first step has no difference
             return F, trees.zeros_like(F), step, pixels
         current, previous, samples = step.paired, step.previous, step.samples
         if not at_once:
             again, further = replace(state, pixels=pixels), key.fold(_DIFFERENCE)
-            pair, pixels = self._sample(problem, parameters, again, difference_spp, further, pair_request, first=False)
-            current, previous, samples = pair.gradient, pair.previous, samples + pair.samples
+            both, pixels = self._sample(problem, parameters, again, difference_spp, further, pair, first=False)
+            current, previous, samples = both.gradient, both.previous, samples + both.samples
         now, then = coordinates.pull_back(current, slopes), coordinates.pull_back(previous, before)
-        difference = trees.subtract(now, then)
-        memory.evaluate_in_turn(difference)
-        return F, difference, replace(step, samples=samples), pixels
+        change = trees.subtract(now, then)
+        memory.evaluate_in_turn(change)
+        return F, change, replace(step, samples=samples), pixels
 
     def _coupled(
-        self,
-        problem: Problem,
-        parameters: Tree,
-        state: MetaState,
-        pair_request: PairRequest,
-        fresh: bool,
-        key: Key,
-        first: bool = True,
+        self, problem: Problem, parameters: Tree, state: MetaState, pair: PairRequest, key: Key, first: bool = True
     ) -> tuple[Tree, Tree, GradientSample, Any]:
         """Return F, H of the previous state from the same samples, their sample, and the pixel sampler's next state. `first`: see
         `_sample`."""
-        del fresh
         spp = self.spp or _COUPLED_SPP
-        step, pixels = self._sample(problem, parameters, state, spp, key, pair_request, first=first)
+        step, pixels = self._sample(problem, parameters, state, spp, key, pair, first=first)
         coordinates = problem.coordinates
         F = coordinates.pull_back(step.gradient, coordinates.slopes(parameters))
-        H = coordinates.pull_back(step.previous, coordinates.slopes(pair_request.previous))
+        H = coordinates.pull_back(step.previous, coordinates.slopes(pair.previous))
         return F, H, step, pixels
 
     def _sample(
@@ -330,7 +317,7 @@ class MetaEstimator:
         state: MetaState,
         spp: int,
         key: Key,
-        pair_request: PairRequest | None = None,
+        pair: PairRequest | None = None,
         first: bool = True,
     ) -> tuple[GradientSample, Any]:
         """Return a gradient with its own pixel sample, and the pixel sampler's next state. That state only advances for the `first`
@@ -343,7 +330,7 @@ class MetaEstimator:
             batch, pixels = self.pixels.draw(problem, parameters, state.pixels, draw_key)
         else:
             batch, pixels = self.pixels.redraw(problem, state.pixels, draw_key), state.pixels
-        request = GradientRequest(parameters, self.image, state.image, spp, key, pair_request=pair_request, batch=batch)
+        request = GradientRequest(parameters, self.image, state.image, spp, key, pair_request=pair, batch=batch)
         step = problem.executor.estimate_gradient(problem, request)
         if first:
             pixels = self.pixels.observe(problem, pixels, problem.coordinates.wrt_u(step.gradient, parameters))

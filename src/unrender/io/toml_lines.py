@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -266,3 +267,12 @@ class FieldError(InputError):
         super().__init__(f"{owner or dotted(place)}: {what}")
         self.place = place
         self.what = what
+
+    @classmethod
+    @contextmanager
+    def at(cls, place: Place, owner: str | None = None) -> Iterator[None]:
+        """Raise the `InputError` of a block as the error of a field."""
+        try:
+            yield
+        except InputError as error:
+            raise cls(place, str(error), owner) from error

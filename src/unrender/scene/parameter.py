@@ -129,10 +129,8 @@ def ties_of(parameters: Sequence[Parameter]) -> tuple[Tie, ...]:
             raise FieldError(place, f"{other} is an unknown of its own; remove it here or there")
         if len(factors) < len(keys):
             raise FieldError(place, "a key is given twice")
-        try:
+        with FieldError.at(place):
             ties.append(Tie(parameter.key, factors))
-        except InputError as error:
-            raise FieldError(place, str(error)) from error
     return tuple(ties)
 
 

@@ -39,7 +39,6 @@ from typing import Any, Literal
 from pydantic import Field, StrictFloat, StrictInt, StrictStr
 
 from unrender.core import tables
-from unrender.core.errors import InputError
 from unrender.io import bounded_files, confinement, toml_lines
 from unrender.io.toml_lines import FieldError, Table
 from unrender.rendering.picture_format import AOVS
@@ -154,10 +153,8 @@ def _read_model(file: Path) -> tuple[_Problem, str]:
 
 def _build(model: _Problem, file: Path, partial: bool) -> Problem:
     folder = file.parent
-    try:
+    with FieldError.at(("loss",)):
         loss = tables.component(model.loss, "loss", folder=folder)
-    except InputError as error:
-        raise FieldError(("loss",), str(error)) from error
     parameters = [_parameter(index, parameter, folder) for index, parameter in enumerate(model.parameters)]
     truths = zip(parameters, [parameter.truth for parameter in model.parameters], strict=True)
     return Problem(
@@ -186,16 +183,12 @@ def _parameter(index: int, model: _Parameter, folder: Path) -> Parameter:
         )
     preconditioner = None
     if model.preconditioner is not None:
-        try:
+        with FieldError.at(("parameters", index, "preconditioner")):
             preconditioner = tables.component(model.preconditioner, "preconditioner", folder=folder)
-        except InputError as error:
-            raise FieldError(("parameters", index, "preconditioner"), str(error)) from error
     resolutions = None
     if model.coarse_to_fine is not None:
-        try:
+        with FieldError.at(("parameters", index, "coarse_to_fine")):
             resolutions = coarse_to_fine.of(model.coarse_to_fine)
-        except InputError as error:
-            raise FieldError(("parameters", index, "coarse_to_fine"), str(error)) from error
     start = _value(model.initial, folder)
     fields = {
         "parameterisation": model.parameterisation,

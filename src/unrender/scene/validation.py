@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -68,19 +68,15 @@ def check_loss(loss: Any) -> Loss:
     """Return a loss, made from a function if necessary. Raises `FieldError` for anything else."""
     if isinstance(loss, Loss) and not isinstance(loss, type):
         return loss
-    try:
+    with FieldError.at(("loss",)):
         return FunctionLoss(loss)
-    except InputError as error:
-        raise FieldError(("loss",), str(error)) from error
 
 
 def check_loss_function(loss: Loss, reference: np.ndarray) -> None:
     """Raise `FieldError` for a function that is not a loss of images with the shape of `reference` (H, W, 3)."""
     if isinstance(loss, FunctionLoss):
-        try:
+        with FieldError.at(("loss",)):
             loss.prepare(reference)
-        except InputError as error:
-            raise FieldError(("loss",), str(error)) from error
 
 
 def check_parameter(
@@ -89,12 +85,8 @@ def check_parameter(
     """Return the `index`-th parameter with its defaults filled in. Raises `FieldError` that names the invalid field."""
     key, info = parameter.key, _known(index, parameter.key, known)
 
-    @contextmanager
-    def checking(field: str) -> Iterator[None]:
-        try:
-            yield
-        except InputError as error:
-            raise FieldError(("parameters", index, field), str(error), f"parameter {key}: {field}") from error
+    def checking(field: str) -> AbstractContextManager[None]:
+        return FieldError.at(("parameters", index, field), f"parameter {key}: {field}")
 
     with checking("initial"):
         start, notice = _initial(parameter, info, renderer)
@@ -314,10 +306,8 @@ def check_truth(
     """
     if key not in unknowns:
         raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, unknowns)}")
-    try:
+    with FieldError.at(("truth", key)):
         truth, converted = parameter_values.fill(value, known[key].shape, known[key].conversion)
-    except InputError as error:
-        raise FieldError(("truth", key), str(error)) from error
     notices = filter(None, (converted, truth_notice(truth, unknowns[key].bounds)))
     return truth, tuple(f"parameter {key}: truth {notice}" for notice in notices)
 

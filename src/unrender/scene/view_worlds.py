@@ -115,11 +115,9 @@ def _with_aov(index: int, name: Any, own: Renderer) -> Renderer:
     place, owner = ("views", index, "aov"), f"view {index}: aov"
     if name not in AOVS:
         raise FieldError(place, f"expected one of {', '.join(AOVS)}, got {name!r:.60}", owner)
-    try:
-        if isinstance(own, AovRenderer):
+    if isinstance(own, AovRenderer):
+        with FieldError.at(place, owner):
             return own.with_aov(name)
-    except InputError as error:
-        raise FieldError(place, str(error), owner) from error
     raise FieldError(place, "this renderer has radiance only; leave it out", owner)
 
 

@@ -16,8 +16,7 @@ from unrender.rendering.mitsuba import film
 from unrender.rendering.mitsuba.film_response import FilmResponse, film_samples, with_film
 from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.base import ConnectionRecord, PathContext, ReplayState, total
-from unrender.rendering.mitsuba.integrators.path import PathPair
-from unrender.rendering.mitsuba.integrators.prb import PrbKernel
+from unrender.rendering.mitsuba.integrators.path import PathPair, PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
 from unrender.rendering.renderer import SampleRequest, Space
 

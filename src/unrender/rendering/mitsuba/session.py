@@ -29,8 +29,7 @@ from unrender.rendering.mitsuba.integrators.aov import AovKernel
 from unrender.rendering.mitsuba.integrators.differential_bsdf import RoughLobes
 from unrender.rendering.mitsuba.integrators.emitters import connection_moments, own_probabilities
 from unrender.rendering.mitsuba.integrators.moved_pair import MovedPair
-from unrender.rendering.mitsuba.integrators.path import PathPair
-from unrender.rendering.mitsuba.integrators.prb import PrbKernel
+from unrender.rendering.mitsuba.integrators.path import PathPair, PrbKernel
 from unrender.rendering.mitsuba.integrators.volpath import VolumePair
 from unrender.rendering.mitsuba.light_paths import LightPaths
 from unrender.rendering.mitsuba.loaded_scene import detach_all, loaded_scenes, share_addresses

@@ -59,12 +59,9 @@ class SilhouetteCurves:
         rows, kinds = [], []
         for shape in scene.shapes():
             for kind in _CURVES.get(shape.class_name(), ()):
+                matrix: Any = mi.traverse(shape)["to_world"]
                 kinds.append(kind)
-                rows.append(
-                    np.array(mi.traverse(shape)["to_world"].matrix).reshape(4, 4)[  # pyright: ignore[reportAttributeAccessIssue]
-                        :3
-                    ]
-                )
+                rows.append(np.array(matrix.matrix).reshape(4, 4)[:3])
         self._kinds = mi.UInt32(kinds or [0])
         self._matrices = mi.Float(np.array(rows or np.zeros((1, 3, 4)), np.float32).reshape(-1))
         self.count = table.count + _ARCS * len(kinds)
@@ -129,10 +126,10 @@ class _ViewSample:
 
 
 class _Points:
-    """Positions relative to a pixel's corner, and the derivatives and the value of the pixel's filter there, over their densities."""
+    """Film coordinates, and the derivatives and the value of the pixel's filter there, over their densities."""
 
-    def __init__(self, at: Any, slope: Any, within: Any):
-        self.at, self.slope, self.within = at, slope, within
+    def __init__(self, uv: Any, slope: Any, within: Any):
+        self.uv, self.slope, self.within = uv, slope, within
 
 
 class _FilmMap:
@@ -225,12 +222,8 @@ class CameraMotion:
             number = dr.arange(mi.UInt32, _POINTS * count)
             kind, lane = number // count, number % count
             index = lane // view.spp
-            pixel = dr.gather(mi.UInt32, view.pixels, index)
-            row = pixel // picture.width
-            corner = mi.Point2u(pixel - row * picture.width, row)
-            points = self._points(picture, corner, kind, lane_sampler(seed, count, _POINTS * count).next_2d())
-            uv = (mi.Vector2f(corner) + points.at) / picture.size
-            sample = self._sample_view(picture, film, uv, mi.Bool(True), seed ^ 0x9E3779B9, count)
+            points = self._points(picture, view, index, kind, lane_sampler(seed, count, _POINTS * count).next_2d())
+            sample = self._sample_view(picture, film, points.uv, mi.Bool(True), seed ^ 0x9E3779B9, count)
             weighted = mi.Float(0)
             for c in range(3):
                 weighted += sample.L[c] * dr.gather(mi.Float, view.values, index * 3 + c)
@@ -241,13 +234,16 @@ class CameraMotion:
             total = dr.sum(dr.dot(border, film.place(sample.point)) + within * film.stretch(sample))
             return total * dr.opaque(mi.Float, 1 / view.spp)
 
-    def _points(self, picture: WeightedPicture, pixel: Any, kind: Any, u: Any) -> _Points:
+    def _points(self, picture: WeightedPicture, view: ViewWeights, index: Any, kind: Any, u: Any) -> _Points:
         """Return the five points of a sample: where its pixel's filter increases and decreases along x, along y, and one inside."""
+        number = dr.gather(mi.UInt32, view.pixels, index)
+        row = number // picture.width
+        pixel = mi.Point2u(number - row * picture.width, row)
         one = dr.select(kind == _POINTS - 1, 1.0, 0.0)
         signs = [dr.select(kind == axis * 2, 1.0, dr.select(kind == axis * 2 + 1, -1.0, 0.0)) for axis in range(2)]
         if is_box(picture.sensor.film()):
             places = [dr.select(signs[axis] == 0, u[axis], 0.5 - 0.5 * signs[axis]) for axis in range(2)]
-            return _Points(mi.Vector2f(*places), mi.Vector2f(*signs), one)
+            return _Points((mi.Vector2f(pixel) + mi.Vector2f(*places)) / picture.size, mi.Vector2f(*signs), one)
         if self._filters is None:
             self._filters = PixelFilters.of([picture.sensor]), FilterSlopes(picture.sensor.film())
         filters, slopes = self._filters
@@ -259,7 +255,8 @@ class CameraMotion:
             weights.append(weight)
             masses.append(mass)
         slope = [signs[axis] * masses[axis] * weights[1 - axis] for axis in range(2)]
-        return _Points(mi.Vector2f(*places), mi.Vector2f(*slope), one * weights[0] * weights[1])
+        uv = (mi.Vector2f(pixel) + mi.Vector2f(*places)) / picture.size
+        return _Points(uv, mi.Vector2f(*slope), one * weights[0] * weights[1])
 
     def _sample_view(
         self, picture: WeightedPicture, film: _FilmMap, uv: Any, active: Any, seed: int, period: int
@@ -295,12 +292,8 @@ class CameraMotion:
         with dr.suspend_grad():
             sampler = lane_sampler(seed, count, count)
             index = dr.arange(mi.UInt32, count) // view.spp
-            pixel = dr.gather(mi.UInt32, view.pixels, index)
-            row = pixel // picture.width
-            corner = mi.Point2u(pixel - row * picture.width, row)
-            within = self._points(picture, corner, mi.UInt32(_POINTS - 1), sampler.next_2d())
-            uv = (mi.Vector2f(corner) + within.at) / picture.size
-            ray, weight = sensor.sample_ray(picture.time, 0.5, mi.Point2f(uv), mi.Point2f(0.5), True)
+            within = self._points(picture, view, index, mi.UInt32(_POINTS - 1), sampler.next_2d())
+            ray, weight = sensor.sample_ray(picture.time, 0.5, mi.Point2f(within.uv), mi.Point2f(0.5), True)
             si = scene.ray_intersect(ray)
             weight *= within.within * mi.Spectrum(*(dr.gather(mi.Float, view.values, index * 3 + c) for c in range(3)))
             active = si.is_valid() & mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Glossy)
