@@ -59,8 +59,7 @@ class AutoMethod(Options):
         description="samples per pixel; none for about 32768 paths per step, 131072 in mini-batches, 2 to 16 per pixel",
     )
     pixels: PositiveInt | None = Field(
-        None,
-        description="pixels per step, sampled from all views; none for all pixels, or 32768 of more than 524288",
+        None, description="pixels per step, sampled from all views; none for all pixels, or 32768 of more than 524288"
     )
     tolerance: NonNegativeFloat = Field(
         CONSTANTS.tolerance,

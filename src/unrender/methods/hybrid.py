@@ -18,8 +18,8 @@ from unrender.estimators.smoothed import SmoothedDerivatives
 from unrender.images.base import ImageEstimator
 from unrender.images.plain import Plain
 from unrender.images.recursive_control_variate import RecursiveControlVariate
-from unrender.methods.adam_options import AdamOptions
 from unrender.methods.base import parse_schedule
+from unrender.methods.paths import AdamOptions
 from unrender.methods.plan import Plan
 from unrender.methods.smoothed import SIGMA_HELP, WIDTH, parse_widths, widths_of
 from unrender.optimizers.base import Optimizer

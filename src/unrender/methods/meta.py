@@ -21,8 +21,7 @@ class MetaCommonOptions(Options):
     """Options of `meta` and `coupled`."""
 
     optimizer: Literal["meta-adam", "adam"] = Field(
-        "meta-adam",
-        description="optimizer; adam, which assumes independent gradients, is for comparison",
+        "meta-adam", description="optimizer; adam, which assumes independent gradients, is for comparison"
     )
     learning_rate: PositiveFloat = Field(0.002, description="learning rate of parameters without their own")
     schedule: str | None = Field(None, description=SCHEDULE_HELP)

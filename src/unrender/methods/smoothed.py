@@ -41,8 +41,7 @@ class SmoothedMethod(Options):
         description="factor of sigma by step, such as cosine(300); with adam, also of its learning rate; unused by cma-es",
     )
     step: PositiveFloat = Field(
-        0.5,
-        description="relative to sigma: longest step; learning rate of adam; first standard deviation of cma-es",
+        0.5, description="relative to sigma: longest step; learning rate of adam; first standard deviation of cma-es"
     )
     samples: int = Field(16, ge=4, description="renders per view and step, for each separately estimated derivative")
     spp: PositiveInt = Field(2, description="samples per pixel of a render")
