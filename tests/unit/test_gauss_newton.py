@@ -233,18 +233,20 @@ def test_the_first_step_is_newtons_and_long_ones_end_at_the_trust_region() -> No
     assert abs(steps["x"][2]) == pytest.approx(0.2)
 
 
-def test_noise_falls_as_the_root_of_the_steps() -> None:
+@pytest.mark.parametrize("settled", [None, 1.0])
+def test_noise_falls_as_the_root_of_the_steps(settled: float | None) -> None:
     """Near the minimum, where steps are short: the error after n steps is that of the weighted mean of n gradients, H⁻¹ Σ w e.
 
-    Later weights grow as the number of steps, and the variance is 4 / 3 of the least one. The first step has hardly any weight.
+    Later weights may grow as the number of steps; the variance is then 4 / 3 of the least one. The first step has hardly any weight.
     """
-    optimizer, n = AveragedNewton(averaging=2.0), 60
+    optimizer, n = AveragedNewton(averaging=2.0, settled_averaging=settled), 60
     weights = np.ones(n)
     for step in range(n):
-        share = 3.0 / (step + 3.0) if step < 8 else 2.0 / (step + 2.0)
+        growth = 2.0 if step < 8 or settled is None else settled
+        share = (1.0 + growth) / (step + 1.0 + growth)
         weights[step] = share
         weights[:step] *= 1.0 - share
-    assert n * np.square(weights).sum() < 1.4
+    assert n * np.square(weights).sum() == pytest.approx(9.0 / 5.0 if settled is None else 4.0 / 3.0, rel=0.06)
     assert weights[0] < 1e-3
     rng = np.random.default_rng(0)
     x, state = MINIMUM.copy(), optimizer.init({"x": MINIMUM})

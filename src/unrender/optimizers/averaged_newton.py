@@ -30,9 +30,8 @@ from unrender.statistics.scores import positive_part, scaled_eigh
 
 _FEWEST_MODELS = 8.0
 """Number of models from which their scatter gives a standard error."""
-_FIRST_MODELS, _LATER = 8.0, 1.0
-"""Number of models from which weights grow as this power of their number at most. The variance after n steps is 1.33 / n of that of one;
-1.8 / n for a power of 2. Source: 0.81 of the error after 32 steps on five rows of `suite.numbers` (geometric mean)."""
+_FIRST_MODELS = 8.0
+"""Number of models from which `settled_averaging` applies."""
 _USED, _SHRINK, _GROW = 0.5, 0.7, 1 / 0.7
 """Share of the radius from which a step counts as one that used the region, and the factors of the radius after such steps. Their product
 is 1, so noise alone neither closes the region nor opens it."""
@@ -91,7 +90,7 @@ class AveragedNewton:
     """Minimum of the weighted mean of the quadratic models g_tᵀ (x − x_t) + (x − x_t)ᵀ H_t (x − x_t) / 2 of all steps t.
 
     With the means A of H_t and b of H_t x_t − g_t, the minimum solves A x = b. After k models, the next one has the weight (1 + r) / (k +
-    1 + r), so that weights grow as k^r; from 8 models on r is at most 1. Near the solution the noise of n steps then decreases as 1 / √n,
+    1 + r), so that weights grow as k^r; from 8 models on with another r. Near the solution the noise of n steps then decreases as 1 / √n,
     without a learning rate or a known length of the run. After a step of length m the weight is at least m² / (1 + m²), and k is reduced
     to match, because models are valid where they were made. With exact models of a quadratic loss, the first step is Newton's.
 
@@ -117,7 +116,9 @@ class AveragedNewton:
 
     Args:
         learning_rate: η, in units of the parameter, > 0, for the parameters without their own.
-        averaging: r of the first models, >= 0.
+        averaging: r, >= 0. Larger ones forget more of the first models.
+        settled_averaging: r from 8 models on, >= 0; None for `averaging`. After n steps the variance is 1.33 / n of that of one for 1, and
+            1.8 / n for 2.
         trust_radius: Δ of the first step and upper limit of the later ones, > 0; None for no limit.
         damping: smallest eigenvalue relative to the largest, in (0, 1).
         linear: keys of parameters in which images are linear, such as radiances.
@@ -125,6 +126,7 @@ class AveragedNewton:
 
     learning_rate: float = 1.0
     averaging: float = 2.0
+    settled_averaging: float | None = None
     trust_radius: float | None = 2.0
     damping: float = 1e-3
     linear: tuple[str, ...] = ()
@@ -133,6 +135,7 @@ class AveragedNewton:
         object.__setattr__(self, "linear", checked_keys("AveragedNewton: linear", self.linear))
         rates.check("AveragedNewton", self.learning_rate, None)
         checks.number("AveragedNewton", "averaging", self.averaging, above=0.0, inclusive=True)
+        checks.number("AveragedNewton", "settled_averaging", self._growth(math.inf), above=0.0, inclusive=True)
         checks.number("AveragedNewton", "damping", self.damping, above=0.0, below=1.0)
         if self.trust_radius is not None:
             checks.number("AveragedNewton", "trust_radius", self.trust_radius, above=0.0)
@@ -241,7 +244,8 @@ class AveragedNewton:
 
     def _growth(self, count: float) -> float:
         """Return the power of their number with which the weights of models grow."""
-        return self.averaging if count < _FIRST_MODELS else min(self.averaging, _LATER)
+        settled = self.settled_averaging
+        return self.averaging if settled is None or count < _FIRST_MODELS else settled
 
     def _radius(self, radius: float, step: np.ndarray, gradient: np.ndarray) -> float:
         """Return the next radius of a block's trust region, from the gradient at the end of its last step.

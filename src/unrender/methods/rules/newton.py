@@ -247,8 +247,9 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
 
 def _optimizer(traits: Traits, keys: tuple[str, ...]) -> AveragedNewton:
     linear = tuple(key for key in traits.lights if key in keys)
-    averaging = traits.constants.pose_averaging if _moves_shapes(traits, keys) else AveragedNewton.averaging
-    return AveragedNewton(averaging=averaging, linear=linear)
+    if _moves_shapes(traits, keys):
+        return AveragedNewton(averaging=traits.constants.pose_averaging, linear=linear)
+    return AveragedNewton(settled_averaging=traits.constants.number_averaging, linear=linear)
 
 
 def _moves_shapes(traits: Traits, keys: tuple[str, ...]) -> bool:
