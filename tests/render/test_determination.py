@@ -12,7 +12,10 @@ import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.app import report
 from unrender.runs.determination import common_factor, undetermined, undetermined_cells
+from unrender.runs.final_images import render_final_images
 from unrender.runs.least_squares import checked_keys
+from unrender.runs.result import Result
+from unrender.runs.verification import LOST, fit_status
 
 SIZE = 8
 LIGHT, COLOUR = "lamp.intensity.value", "wall.bsdf.reflectance.value"
@@ -214,3 +217,33 @@ def test_values_that_start_beside_the_solution_are_determined(bounds: tuple[floa
     lines = undetermined(made, moved, 16)
     assert [line.partition(":")[0] for line in lines] == ["x5"]
     assert undetermined(made, moved, 16, errors=dict.fromkeys(names, np.ones(()))) == []
+
+
+@pytest.mark.parametrize(
+    ("end", "is_lost"), [([40.0, 0.0, 0.0], True), ([0.0, 0.0, 0.3], False), ([0.0, 0.0, 0.0], False)]
+)
+def test_a_ball_that_ends_outside_of_the_picture_does_not_fit(end: list[float], is_lost: bool):
+    """It may cover so few pixels that the pictures hardly differ."""
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    look = mi.ScalarTransform4f().look_at([0, 1.2, 3], [0, 0.4, 0], [0, 1, 0])
+    ball = {"type": "sphere", "center": [0.3, 0.2, 0.3], "radius": 0.2, "bsdf": {"type": "dielectric"}}
+    described = {
+        "type": "scene",
+        "camera": {"type": "perspective", "fov": 35, "to_world": look, "film": film},
+        "sky": {"type": "constant"},
+        "floor": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(2.0),
+            "bsdf": GREY,
+        },
+        "ball": ball,
+    }
+    reference = np.array(mi.render(mi.load_dict(described | {"path": {"type": "path", "max_depth": 6}}), spp=1024))
+    unknown = ur.Parameter("ball.translation", initial=[-0.3, 0.0, 0.0])
+    made = ur.Problem(described, [unknown], [ur.View(reference)], max_depth=6)
+    values = {"ball.translation": np.asarray(end, np.float32)}
+    result = Result(values, made.initial_values(), [{}] * 60, 1.0, 0.0, "steps", verification={"best": "end"})
+    found = render_final_images(made, result, 256)
+    assert (found.misfit is not None and found.misfit.causes == (LOST,)) is is_lost
+    assert fit_status(made, "finished", found.misfit, few=False) == ("does not fit" if is_lost else "finished")
+    assert (found.misfit is not None) is any(end)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -24,8 +25,9 @@ from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 from unrender.runs.run import Run
-from unrender.runs.verification import DIFFERS
+from unrender.runs.verification import PRIOR, Misfit, fit_status
 from unrender.scene.parameter import Parameter
+from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 
@@ -78,11 +80,11 @@ def test_few_numbers_whose_picture_does_not_fit_are_warned_of(what: str, said: b
     result = Result(truth, {"wall": np.full(3, 0.4, np.float32)}, [{"step": 1, "loss": 0.1}], 1.0, 0.0, "steps")
     result = replace(result, standard_error={"wall": np.full(3, 0.01)})
     found = final_images.render_final_images(made, result, 64)
-    assert any("differs from the references" in line for line in found.warnings) == said
+    assert (found.misfit is not None) == said
     assert bool(found.standard_error) == (not said)
-    told = replace(result, warnings=["the final picture differs from the references by 0.1, ..."])
+    told = replace(result, misfit=Misfit(0.1, 1.0, 0.1))
     found = final_images.render_final_images(made, told, 64, tested=False)
-    assert not found.warnings
+    assert found.misfit is told.misfit
     assert not found.standard_error
 
 
@@ -99,7 +101,7 @@ def test_pixels_outside_the_mask_do_not_count_for_a_misfit(outside: float) -> No
     made = Problem(renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(reference, mask=mask)])
     result = Result(truth, {"wall": np.full(3, 0.4, np.float32)}, [{"step": 1, "loss": 0.1}], 1.0, 0.0, "steps")
     found = final_images.render_final_images(made, result, 64, tested=False)
-    assert any("differs from the references" in line for line in found.warnings)
+    assert found.misfit is not None
 
 
 def test_black_references_make_no_error() -> None:
@@ -107,8 +109,10 @@ def test_black_references_make_no_error() -> None:
     black = Problem(made.renderer, [Parameter("wall", initial=0.4, bounds=(0, 1))], [View(np.zeros((*SHAPE, 3)))])
     values = {"wall": np.full(3, 0.5, np.float32)}
     result = Result(values, values, [{"step": 1, "loss": 0.1}], 1.0, 0.0, "steps")
-    (line,) = final_images.render_final_images(black, result, 64, tested=False).warnings
-    assert "%" not in line
+    differs = final_images.render_final_images(black, result, 64, tested=False).misfit
+    assert differs is not None
+    assert "%" not in differs.line
+    assert differs.record()["share"] is None
 
 
 def test_one_sample_has_no_halves() -> None:
@@ -148,7 +152,7 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
     """A wrong number is told however late it is."""
     made, allowed = problem(), []
     monkeypatch.setattr(final_images, "slowdown", lambda: 1.0)
-    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: None)
     none = Curvature()
     monkeypatch.setattr(final_images, "curvature", lambda *_, seconds, **__: allowed.append(seconds) or none)
     monkeypatch.setattr(
@@ -166,7 +170,7 @@ def test_a_machine_without_time_left_makes_the_least_pictures_and_tests_numbers_
 def test_numbers_that_there_was_no_time_to_test_are_named(tested: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that ends without its test of numbers says so; one that was tested does not."""
     made = problem()
-    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: None)
     values = {"wall": np.full(3, 0.4, np.float32)}
     result = replace(Result(values, values, [{}], 30.0, 0.0, "steps"), standard_error={"wall": np.full(3, 1e-3)})
     line = "whether wall converged: the run is too short for this test; use more steps or seconds, or fewer pixels"
@@ -188,8 +192,9 @@ def test_numbers_of_a_picture_that_differs_have_no_standard_error(monkeypatch: p
     assert not found.standard_error
     assert not found.undetermined
     assert "it moves" in found.warnings
-    assert "hence no standard errors" in " ".join(found.warnings)
-    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
+    assert found.misfit is not None
+    assert "hence no standard errors" in found.misfit.line
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: None)
     assert "the references leave it open" in final_images.render_final_images(made, result).undetermined
 
 
@@ -253,6 +258,12 @@ def test_a_wrong_model_is_told_by_the_final_pictures_where_others_have_too_few_p
     result = optimize(made, estimator, adam, steps, run_directory=tmp_path, annotations=pictures)
     assert any("no longer improves" in line or UNCHANGED in line for line in result.warnings) is told, result.warnings
     assert result.status == ("does not fit" if told else "finished")
+    stored = json.loads((tmp_path / "run.json").read_text())["misfit"]
+    assert (result.misfit is not None) is bool(stored) is told
+    if result.misfit:
+        assert result.misfit.line in result.warnings
+        assert stored == {"error": ANY, "share": pytest.approx(result.misfit.share, rel=1e-5), "causes": []}
+        assert 0.05 < stored["share"] < 0.3
     alone = optimize(made, estimator, adam, steps)
     assert any("no longer improves" in line for line in alone.warnings) is told  # by the paths left for verification
 
@@ -304,26 +315,27 @@ def test_a_run_that_the_final_pictures_find_worse_returns_its_start(
 def test_a_loss_that_falls_or_has_an_uncertain_change_is_judged_by_large_differences_alone(
     step: int, change: float, error: float, stays: bool, shift: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(final_images, "unexplained_pixels", lambda *_: "")
+    monkeypatch.setattr(final_images, "unexplained_pixels", lambda *_: None)
     made = textured(shift, 0.1)
     values = {"map": np.linalg.lstsq(made.renderer.matrix, np.ravel(made.views[0].reference))[0].astype(np.float32)}  # type: ignore
     result = Result(values, values, [{}] * 150, 1.0, 0.0, "steps")
     result = replace(result, verification={"best": "end", "change": {"step": step, "loss": [change, error]}})
-    warnings = final_images.render_final_images(made, result, 16, tested=False).warnings
-    assert any(DIFFERS in line for line in warnings) is (stays or shift == 0.25)
-    assert any("may still improve" in line for line in warnings) is (not stays and shift == 0.25)
+    differs = final_images.render_final_images(made, result, 16, tested=False).misfit
+    assert (differs is not None) is (stays or shift == 0.25)
+    assert (differs is not None and "may still improve" in differs.line) is (not stays and shift == 0.25)
     for other in (
-        replace(result, warnings=[f"{DIFFERS} by 0.1"]),
+        replace(result, misfit=Misfit(0.1, 1.0, 0.1)),
         replace(result, verification={"best": "start"}),
     ):
-        assert not final_images.render_final_images(made, other, 16, tested=False).warnings
+        assert final_images.render_final_images(made, other, 16, tested=False).misfit is None
     for change_of in ({}, {"change": {"step": step, "loss": [None, None]}}):  # no earlier image
         other = replace(result, verification={"best": "end", **change_of})
-        warnings = final_images.render_final_images(made, other, 16, tested=False).warnings
-        assert any("may still improve" in line for line in warnings) is (shift == 0.25)
+        differs = final_images.render_final_images(made, other, 16, tested=False).misfit
+        assert (differs is not None and "may still improve" in differs.line) is (shift == 0.25)
 
 
 UNCHANGED, WIDE = "of its pixels that the unknowns hardly change", 40
+SPOT = np.exp(-((np.arange(WIDE)[:, None, None] - 20) ** 2 + (np.arange(WIDE)[:, None] - 30) ** 2) / 60.0)
 
 
 def half_textured(reference: np.ndarray | None = None, start: float = 0.5) -> Problem:
@@ -341,8 +353,8 @@ def half_textured(reference: np.ndarray | None = None, start: float = 0.5) -> Pr
 def told_of(made: Problem, values: np.ndarray) -> str:
     """The line of a run that ended at these values."""
     result = Result({"map": values}, made.initial_values(), [{}] * 20, 1.0, 0.0, "steps", verification={"best": "end"})
-    lines = final_images.render_final_images(made, result, 64, tested=False).warnings
-    return next((line for line in lines if UNCHANGED in line), "")
+    differs = final_images.render_final_images(made, result, 64, tested=False).misfit
+    return differs.line if differs and UNCHANGED in differs.line else ""
 
 
 @pytest.mark.parametrize(
@@ -350,11 +362,16 @@ def told_of(made: Problem, values: np.ndarray) -> str:
     [
         (lambda image: np.roll(image, 1, axis=1), "were shifted by"),
         (lambda image: (image + np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1)) / 3.0, "were blurred"),
-        (lambda image: 0.8 * image, ""),
+        (
+            lambda image: image - 0.25 * (np.roll(image, 1, axis=1) + np.roll(image, -1, axis=1) - 2.0 * image),
+            "were sharper",
+        ),
+        (lambda image: 0.8 * image, "times as bright"),
+        (lambda image: image * (1.0 - 0.3 * SPOT), ""),
         (lambda image: image + 0.05 * np.random.default_rng(0).standard_normal(image.shape), None),
         (lambda image: image, None),
     ],
-    ids=["shifted", "blurred", "darker", "noisy", "right"],
+    ids=["shifted", "blurred", "sharper", "darker", "unlit spot", "noisy", "right"],
 )
 @pytest.mark.parametrize("progress", [0.2, 0.7, 1.0])
 def test_pixels_that_the_unknowns_hardly_change_tell_of_wrong_references_at_any_progress(
@@ -366,6 +383,7 @@ def test_pixels_that_the_unknowns_hardly_change_tell_of_wrong_references_at_any_
     line = told_of(half_textured(distort(exact)), 0.5 + progress * (truth - 0.5))
     assert bool(line) is (words is not None), line
     assert (words or "") in line
+    assert ("as if" in line) is bool(words)
     if words == "were shifted by":
         along, down = (
             float(x.split(" pixels")[0])
@@ -373,6 +391,76 @@ def test_pixels_that_the_unknowns_hardly_change_tell_of_wrong_references_at_any_
         )
         assert abs(along - 1.0) < 0.3
         assert abs(down) < 0.1
+
+
+@pytest.mark.parametrize("column", [3, WIDE - 4])
+def test_a_pixel_that_is_not_finite_leaves_the_others_judged(column: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = final_images.render
+
+    def render(*given: Any, **options: Any) -> np.ndarray:
+        image = np.array(own(*given, **options))
+        image[7, column, 1] = np.nan
+        return image
+
+    monkeypatch.setattr(final_images, "render", render)
+    truth = np.random.default_rng(0).uniform(0.1, 0.9, 50).astype(np.float32)
+    exact = np.asarray(half_textured().views[0].reference)
+    assert "times as bright" in told_of(half_textured(0.8 * exact), truth)
+    assert not told_of(half_textured(exact), truth)
+
+
+@pytest.mark.parametrize("count", [4, 10])
+@pytest.mark.parametrize("darker", [0.0, 0.2])
+def test_pixels_that_many_unknowns_hardly_change_tell_of_wrong_references(count: int, darker: float) -> None:
+    """Such as the colours of ten objects."""
+    made, parts = half_textured(), np.array_split(np.random.default_rng(0).uniform(0.1, 0.9, 50), count)
+    renderer, values = made.renderer, {f"colour{index}": x.astype(np.float32) for index, x in enumerate(parts)}
+    assert isinstance(renderer, AnalyticRenderer)
+    pattern = renderer.offset.reshape(WIDE, WIDE, 3)
+    renderer = AnalyticRenderer(values, renderer.matrix, pattern, noise=0.3, grain=0.1, shape=(WIDE, WIDE))
+    view = View((1.0 - darker) * renderer.exact(values))
+    made = Problem(renderer, [Parameter(key, initial=0.5, bounds=(0, 1)) for key in values], [view])
+    result = Result(values, made.initial_values(), [{}] * 20, 1.0, 0.0, "steps", verification={"best": "end"})
+    differs = final_images.render_final_images(made, result, 64, tested=False).misfit
+    assert (differs is not None and UNCHANGED in differs.line) is (darker > 0.0)
+
+
+@pytest.mark.parametrize("rigid", [False, True])
+@pytest.mark.parametrize(("wrong", "told"), [("darker", True), ("object", False), ("", False)])
+def test_beside_a_pose_a_difference_of_a_few_blocks_may_be_the_object(
+    wrong: str, told: bool, rigid: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exact = np.asarray(half_textured().views[0].reference)
+    reference = 0.8 * exact if wrong == "darker" else exact.copy()
+    if wrong == "object":
+        reference[10:18, 26:32] += 0.3
+    made = half_textured(reference)
+    known = {key: replace(info, rigid=rigid) for key, info in made.renderer.parameters().items()}
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda _: known)
+    truth = np.random.default_rng(0).uniform(0.1, 0.9, 50).astype(np.float32)
+    assert bool(told_of(made, truth)) is (told or (wrong == "object" and not rigid))
+
+
+@pytest.mark.parametrize(("shift", "std", "is_cause"), [(0.5, 0.2, False), (0.0, 1e-3, True)])
+def test_a_prior_is_the_cause_of_a_difference_only_where_it_pulls(shift: float, std: float, is_cause: bool) -> None:
+    """Two references that contradict each other, and a prior that holds the values far from right ones."""
+    made = textured(shift, 0.1)
+    matrix = np.asarray(made.renderer.matrix)  # type: ignore[attr-defined]
+    means = np.mean([np.ravel(np.asarray(view.reference)) for view in made.views], axis=0)
+    pull = matrix.T @ (means - matrix @ np.full(32, 0.45))
+    held = 0.45 + 0.01 * pull / np.abs(pull).max()
+    values = {"map": np.asarray(held if is_cause else np.linalg.lstsq(matrix, means)[0], np.float32)}
+    prior = Prior(near=0.45, std=std)
+    made = Problem(made.renderer, [Parameter("map", initial=0.5, bounds=(0, 1), prior=prior)], made.views)
+    result = Result(values, made.initial_values(), [{}] * 150, 1.0, 0.0, "steps")
+    change = {"step": 64, "loss": [0.0, 1e-4]}
+    result = replace(result, verification={"best": "end", "change": change})
+    differs = final_images.render_final_images(made, result, 16, tested=False).misfit
+    assert differs is not None
+    assert (PRIOR in differs.causes) is ("prior" in differs.line) is is_cause
+    assert fit_status(made, "finished", replace(differs, size=1e-9), few=False) == (
+        "finished" if is_cause else "does not fit"
+    )
 
 
 @pytest.mark.parametrize("count", [1, 4])
@@ -392,11 +480,11 @@ def test_the_check_of_unchanged_pixels_fits_into_the_time_that_is_left(
         spent[0] += 1e-3 * samples
         return own(problem, values, view, samples, *rest, **options)
 
-    def check(*given: Any) -> str:
+    def check(*given: Any) -> Misfit | None:
         before = spent[0]
-        line = final_checks.unexplained_pixels(*given)
+        differs = final_checks.unexplained_pixels(*given)
         checks[0] = spent[0] - before
-        return line
+        return differs
 
     monkeypatch.setattr(final_images, "render", render)
     monkeypatch.setattr(final_images, "unexplained_pixels", check)
@@ -415,8 +503,8 @@ def test_neither_coarse_grids_nor_few_samples_are_another_cause(
 
     Of one sample per pixel in each half, most pixels are too dark in both.
     """
-    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: "")
-    monkeypatch.setattr(final_images, "unexplained_pixels", lambda *_: "told")
+    monkeypatch.setattr(final_images, "misfit_of_views", lambda *_: None)
+    monkeypatch.setattr(final_images, "unexplained_pixels", lambda *_: Misfit(0.1, 1.0, 0.1))
     problem: Any = SimpleNamespace(coarse_to_fine={"grid": SimpleNamespace(steps=(0, 5, 20))})
     result = Result({}, {}, [{}] * steps, 1.0, 0.0, "steps", verification={"best": "end"})
     halves = {"initial": [], "result": []}

@@ -270,12 +270,13 @@ def test_a_number_that_trades_off_against_an_open_one_is_open_with_it(share: flo
 
 
 @pytest.mark.parametrize("entry", [0.0, np.nan])
-def test_pictures_that_no_number_changes_or_that_are_not_finite_have_no_check(entry: float):
+def test_numbers_that_no_picture_shows_are_named_and_pictures_that_are_not_finite_have_no_check(entry: float):
     made = problem(np.full_like(MATRIX, 0.0))
     made.renderer.matrix = np.full_like(MATRIX, entry)  # type: ignore
     found = check_numbers(made, made.initial_values(), made.initial_values(), FAR)
-    assert not found.undetermined
     assert not found.unfinished
+    assert set(found.undetermined) == (set() if np.isnan(entry) else {"a", "b"})
+    assert all(np.isinf(error).all() for error in found.standard_errors(made.initial_values()).values())
 
 
 def test_fewer_values_than_numbers_leave_all_open():

@@ -229,7 +229,7 @@ def test_texels_that_share_each_pixel_with_a_neighbour_have_no_standard_error(mo
     made.renderer.matrix = mixed  # type: ignore[attr-defined]
     values = estimate(problem())
     assert curvature(made, values).overlap["wall"] == pytest.approx(products.sum() / products.trace(), rel=0.1)
-    monkeypatch.setattr(module, "misfit_of_views", lambda *given: "")
+    monkeypatch.setattr(module, "misfit_of_views", lambda *given: None)
     assert not uncertainty(made, values).standard_error
     monkeypatch.setattr(module, "_MOST_OVERLAP", 2.0)
     assert "wall" in uncertainty(made, values).standard_error

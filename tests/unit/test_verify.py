@@ -526,8 +526,9 @@ def test_averages_over_steps_are_no_progress(last: float, told: str) -> None:
         return fresh_pictures.Picture((1.0 + pictures.references + np.zeros((4, 1, 1)),), loss * spread)
 
     check._small, check._earlier = pictures, [verify.EarlierImage(64, picture(1.0), pictures)]
-    (line,), _ = check._residual(problem, averages, pictures, picture(0.5), picture(last))
-    assert told in line
+    differs, _ = check._residual(problem, averages, pictures, picture(0.5), picture(last))
+    assert differs is not None
+    assert told in differs.line
 
 
 @pytest.mark.parametrize(("ratio", "still"), [(0.95, True), (0.5, False), (0.3, False)])
@@ -728,7 +729,8 @@ def test_a_difference_in_few_pixels_counts(improved: bool) -> None:
     residuals[:, 7:512:32] += 0.15 * generator.choice((-1.0, 1.0), (16, 3))
     for images in (residuals, residuals[:2]):  # the two halves of a final picture
         found = verification.misfit_of_numbers(problem, images, *arguments[2:], improved=improved)
-        assert "the final picture differs" in found
+        assert found is not None
+        assert found.line.startswith(verification.DIFFERS)
 
 
 @pytest.mark.parametrize("light", [True, False])
@@ -742,7 +744,7 @@ def test_many_poses_of_lights_must_fit_as_few_numbers_do(light: bool, monkeypatc
     noise = generator.normal(0.0, 0.01, (4, 512, 3))
     assert not verification.misfit_of_numbers(problem, noise, *arguments)
     found = verification.misfit_of_numbers(problem, 0.1 + noise, *arguments)
-    assert ("two lights are in each other's place" in found) is light
+    assert (found is not None and "two lights are in each other's place" in found.line) is light
 
 
 def test_saturated_pixels_are_no_difference_for_a_loss_that_takes_them_as_bounds() -> None:
@@ -834,14 +836,17 @@ def test_noise_of_the_references_is_no_fault_where_the_true_values_leave_as_much
     residuals = 0.05 * generator.normal(size=(512, 3)) + generator.normal(0.0, 0.002, (4, 512, 3))
     arguments = problem, residuals, np.full((512, 3), 0.1), np.ones(512), [(16, 32)]
     found = verification.misfit_of_numbers(*arguments, improved=False)
-    assert "this picture's noise does not explain: the references are noisy, or" in found
+    assert found is not None
+    assert "this picture's noise does not explain: the references are noisy, or" in found.line
+    assert verification.NOISE in found.causes
     assert not verification.misfit_of_numbers(*arguments, improved=False, at_truth=lambda: 0.05**2)
     assert verification.misfit_of_numbers(*arguments, improved=False, at_truth=lambda: 0.01**2)
 
 
 def test_a_run_that_starts_at_the_truth_has_not_improved(monkeypatch: pytest.MonkeyPatch) -> None:
     noted: list[bool] = []
-    monkeypatch.setattr(verify, "misfit_of_numbers", lambda *_, improved, **__: noted.append(improved) or "wrong")
+    differs = verification.Misfit(0.1, 1.0, 0.1)
+    monkeypatch.setattr(verify, "misfit_of_numbers", lambda *_, improved, **__: noted.append(improved) or differs)
     result = ur.optimize(made(start=None, noise=0.1), ur.GaussNewton(), ur.optimizers.AveragedNewton(), steps=12)
     assert noted == [False]
     assert not result.standard_error
@@ -870,7 +875,8 @@ def test_a_difference_that_changes_its_sign_within_tiles_is_told(axis: int, samp
     noise = generator.normal(0.0, 0.02, (1, len(places), 3)) + generator.normal(0.0, 0.01, (4, len(places), 3))
     same = np.full((len(places), 3), 0.2), np.ones(len(places)), sizes
     found = verification.misfit_of_numbers(problem, edges + noise, *same)
-    assert "the final picture differs from the references by 0.0" in found
+    assert found is not None
+    assert found.line.startswith(f"{verification.DIFFERS} by 0.0")
     assert not verification.misfit_of_numbers(problem, noise, *same)
 
 
@@ -903,30 +909,30 @@ def test_a_difference_along_edges_is_told_beside_filtered_noise_of_references() 
     edges = np.where(np.arange(side * side) // 6 % 2 < 1, 0.08, -0.08)[:, None]
     residuals = edges + 0.2 * seen_through_a_filter(generator, side) + generator.normal(0.0, 0.01, (4, side * side, 3))
     assert paired_losses.systematic(residuals.mean(axis=0), layout=(3, 1)).score < paired_losses.SIGNIFICANT
-    assert "differs" in verification.misfit_of_numbers(
+    assert verification.misfit_of_numbers(
         problem, residuals, np.ones((side * side, 3)), np.ones(side * side), [(side, side)]
     )
 
 
 def test_a_difference_that_more_steps_may_answer_is_no_other_status() -> None:
-    differs, status, problem = f"{verification.DIFFERS} by 0.1", verification.fit_status, made()
+    differs, status, problem = verification.Misfit(0.1, 1.0, 0.01), verification.fit_status, made()
     for few in (False, True):
-        assert status(problem, "finished", ["another", f"{differs}, and no longer improves"], few) == "does not fit"
-        assert status(problem, "worse than start", [f"{differs}, and no longer improves"], few) == "worse than start"
-        for words in (verification.MAY_IMPROVE, verification.NOT_CONVERGED, verification.PRIOR, verification.NOISY):
-            assert status(problem, "finished", [f"{differs}, and {words}"], few) == "finished"
-        assert status(problem, "finished", [f"{differs}: the run needs more steps"], few) == (
+        assert status(problem, "finished", differs, few) == "does not fit"
+        assert status(problem, "worse than start", differs, few) == "worse than start"
+        for cause in (verification.STEPS, verification.PRIOR, verification.NOISE):
+            assert status(problem, "finished", replace(differs, causes=(cause,)), few) == "finished"
+        assert status(problem, "finished", replace(differs, causes=(verification.STEPS_OF_FEW,)), few) == (
             "finished" if few else "does not fit"
         )
-        assert status(problem, "finished", [], few) == "finished"
+        assert status(problem, "finished", None, few) == "finished"
 
 
 @pytest.mark.parametrize(("error", "status"), [(0.2, "finished"), (0.25, "does not fit"), (3.0, "does not fit")])
 def test_the_status_reads_the_size_of_a_difference(error: float, status: str) -> None:
     for size, noise in ((1.0, 0.01), (1.0, 10.0), (1e5, 1e3), (1e-6, 1e-8)):
-        lines = [f"{verification.Misfit(error * size, size, noise).describe()}, and no longer improves"]
-        assert verification.fit_status(smooth(0.0, 0, known=False), "finished", lines, few=False) == status
-        assert verification.fit_status(made(), "finished", lines, few=False) == "does not fit"
+        differs = verification.Misfit(error * size, size, noise)
+        assert verification.fit_status(smooth(0.0, 0, known=False), "finished", differs, few=False) == status
+        assert verification.fit_status(made(), "finished", differs, few=False) == "does not fit"
 
 
 @pytest.mark.parametrize("steps", [20, 60, 150])
@@ -943,7 +949,7 @@ def test_few_numbers_with_a_strong_prior_end_as_finished_after_any_number_of_ste
     ):
         result = ur.optimize(problem, *parts, steps=steps, run_directory=tmp_path / type(parts[1]).__name__)
         assert result.status == "finished", result.warnings
-        assert all(verification.PRIOR in line for line in result.warnings if verification.DIFFERS in line)
+        assert result.misfit is None or verification.PRIOR in result.misfit.causes
 
 
 @pytest.mark.parametrize("outliers", [0, 3, 5])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -14,9 +15,12 @@ from unrender.core.text import listed
 from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements
 from unrender.runs.numbers import MOST_ELEMENTS
+from unrender.runs.result import Result
+from unrender.runs.verification import LOST, Misfit, residuals_of_views
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
+from unrender.statistics.paired_losses import mean_square
 
 _LEAST = 0.005
 """Relative change of the images below which a parameter counts as undetermined over its range."""
@@ -34,6 +38,11 @@ _SCALE = "scale"
 """Last part of the keys of factors, such as that of an environment map."""
 _ROLES = ("value", "height")
 """Roles of the tested parameters; equal normals or directions are no range."""
+_STEP = 0.1
+"""Change of the parameters, relative to the range between their bounds, or to the root mean square of their values."""
+_GONE, _OF_LOST = 0.1, 0.25
+"""Change of the images up to which an unknown is no longer seen, and least difference from the references if it is lost, both relative to
+the change from its start to its end."""
 _SEEDS, _RENDERINGS = (3, 4), 8
 """Seeds of the two independent halves, and number of renderings per view for two changes."""
 
@@ -111,10 +120,10 @@ def undetermined(
         details = np.where(np.indices(own.shape).sum(axis=0) % 2, *ends) if bounded else own
         first, last, detailed = ({**values, key: array} for array in (*ends, details))
         try:
-            change = _change(problem, first, last, spp, per_pass)
+            change = change_of_images(problem, first, last, spp, per_pass)
             hidden = change.is_below(_LEAST)
             if hidden and is_map and ranged:
-                change = _change(problem, first, detailed, spp, per_pass)
+                change = change_of_images(problem, first, detailed, spp, per_pass)
         except InputError:  # the renderer rejects a value at the end of the range
             continue
         longest = max(longest, time.perf_counter() - started)
@@ -201,8 +210,8 @@ def _is_shared(
     """Return whether the images change by `up` times a factor, but not if `down` is divided by it."""
     larger = {key: x * np.float32(_FACTOR) if key in up else x for key, x in values.items()}
     smaller = {key: x / np.float32(_FACTOR) if key in down else x for key, x in larger.items()}
-    alone = _change(problem, values, larger, spp, per_pass)
-    together = _change(problem, values, smaller, spp, per_pass)
+    alone = change_of_images(problem, values, larger, spp, per_pass)
+    together = change_of_images(problem, values, smaller, spp, per_pass)
     return alone.square > 0.0 and together.is_below(_LEAST_OF_FACTOR, alone.square)
 
 
@@ -253,7 +262,7 @@ def _factor(problem: Problem, key: str, values: np.ndarray) -> float | None:
     return float(np.mean(values) / np.mean(truth))
 
 
-def _change(
+def change_of_images(
     problem: Problem, before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], spp: int, per_pass: int | None
 ) -> Change:
     """Return the change between two states.
@@ -270,3 +279,53 @@ def _change(
         products.append(np.mean(differences[0] * differences[1], axis=-1).reshape(-1))
     flat = np.concatenate(products)
     return Change(float(flat.mean()), float(flat.std() / np.sqrt(flat.size)), float(np.mean(squares)))
+
+
+def with_lost(
+    problem: Problem,
+    result: Result,
+    difference: Misfit | None,
+    keys: Sequence[str],
+    ends: Sequence[Sequence[np.ndarray]],
+    spp: int,
+    per_pass: int | None,
+) -> Misfit | None:
+    """Return the difference of the final pictures from the references with the cause that unknowns are lost, if so.
+
+    The pictures show these unknowns at the start, but no longer at the end, such as a shape outside of the picture. They then differ from
+    the references by a notable part of what the unknown changes.
+
+    Args:
+        difference: difference that is known.
+        keys: unknowns that the pictures of the end do not determine.
+        ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
+        spp, per_pass: see `change_of_images`.
+    """
+    if not keys or len(ends[0]) < 2 or result.verification.get("best") != "end":
+        return difference
+    residuals, references, weights, _ = residuals_of_views(problem, range(len(ends)), ends)
+    products = (residuals[0::2].mean(axis=0) * residuals[1::2].mean(axis=0)).sum(axis=1)
+    left = max(float(products @ weights) / max(3.0 * float(weights.sum()), 1e-300), 0.0)
+    start, end, lost = result.initial, result.parameters, []
+    for key in keys:
+        seen = change_of_images(problem, start, {**start, key: end[key]}, spp, per_pass)
+        near = {**end, key: changed(problem, key, end[key], np.ones(end[key].shape))}
+        hidden = change_of_images(problem, end, near, spp, per_pass).is_below(_GONE, seen.square)
+        lost += [key] * (hidden and seen.is_above(_LEAST) and left > _OF_LOST**2 * seen.square)
+    if not lost:
+        return difference
+    explanation = (
+        f", and the pictures no longer depend on {listed(lost)} as they did at the start: try narrower bounds, a lower learning_rate, or a "
+        "start closer to the references"
+    )
+    difference = difference or Misfit(math.sqrt(left), math.sqrt(mean_square(references, weights)), 0.0)
+    return replace(difference, explanation=explanation, causes=(LOST,))
+
+
+def changed(problem: Problem, key: str, values: np.ndarray, signs: np.ndarray) -> np.ndarray:
+    """Return values changed by a step times numbers in [-1, 1], whose signs turn where the step would leave the bounds."""
+    low, high = problem.unknowns[key].bounds
+    size = float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))) or 1.0
+    step = _STEP * (size if low is None or high is None else high - low) * signs
+    outside = values + step != np.asarray(problem.unknowns[key].project(values + step))
+    return np.asarray(problem.unknowns[key].project(values + np.where(outside, -step, step)), np.float32)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
-from unrender.runs.verification import MAY_IMPROVE, NOT_CONVERGED, Misfit, misfit, prior_cause
+from unrender.runs.verification import STEPS, STEPS_OF_FEW, Misfit, misfit, prior_cause
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import difference
 
@@ -57,10 +57,11 @@ class EarlierImage:
         return self.step <= (_EARLIER_SHORT if self.is_short else _EARLIER) * steps
 
     def change(self, earlier: EarlierImage, factor: float) -> tuple[float, float]:
-        """Return the loss minus `factor` times that of an earlier step, and its standard error; infinite for images that are not finite."""
+        """Return the loss minus `factor` times that of an earlier step, and its standard error; infinite if no part of both is finite."""
         first, second = factor * earlier.picture.losses, self.picture.losses
-        of = difference(first, second, self.pictures.sampled)
-        return (of.value, of.standard_error) if math.isfinite(of.value) else (math.inf, math.inf)
+        finite = np.isfinite(first).all(axis=0) & np.isfinite(second).all(axis=0)
+        of = difference(first[:, finite], second[:, finite], self.pictures.sampled)
+        return (of.value, of.standard_error) if finite.any() and math.isfinite(of.value) else (math.inf, math.inf)
 
     def is_still(self, earlier: EarlierImage) -> bool:
         """Return whether the loss has hardly fallen since an earlier step: surely for a short run, as far as noise tells for others."""
@@ -98,8 +99,8 @@ def no_improvement(
     references: np.ndarray,
     weights: np.ndarray,
     sizes: Sequence[tuple[int, int]],
-) -> list[str]:
-    """Return a warning if images of the end of a run differ from the references, by a tenth where the loss may still fall.
+) -> Misfit | None:
+    """Return a difference of images of the end of a run from the references, of a tenth or more where the loss may still fall.
 
     Images of `runs.verify` have few paths. Their paired difference tells the change of the loss, but their noise may hide its value.
 
@@ -114,11 +115,11 @@ def no_improvement(
     still = None not in fall and stays(loss, step, *fall)
     of = residuals[0::2], residuals[1::2], references, weights, sizes
     differs = misfit(*of, least_difference(step) if still else _OF_PICTURE_FALLING)
-    return [unexplained(problem, differs, step, steps, still)] if differs else []
+    return unexplained(problem, differs, step, steps, still) if differs else None
 
 
-def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays: bool = True) -> str:
-    """Return the warning about a difference at the end of a run of `steps` steps whose loss has hardly fallen since `step`.
+def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays: bool = True) -> Misfit:
+    """Return a difference at the end of a run of `steps` steps whose loss has hardly fallen since `step`, with its explanation.
 
     Args:
         differs: the difference.
@@ -128,16 +129,17 @@ def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays:
     cause = (
         "light, depth or something else that is not among the unknowns may be wrong, or the run is in a local minimum"
     )
-    cause = f"{prior_cause(problem)}{cause}"
+    words, causes = prior_cause(problem)
+    cause = f"{words}{cause}"
     still = "no longer improves"
     if step < FIRST_CANDIDATE or not stays:
-        still = f"has hardly improved since step {step} of {steps}" if stays else MAY_IMPROVE
-        cause = f"it may need more steps, or {cause}"
-    return f"{differs.describe()}, and {still}: {cause}"
+        still = f"has hardly improved since step {step} of {steps}" if stays else "may still improve"
+        cause, causes = f"it may need more steps, or {cause}", (*causes, STEPS_OF_FEW if stays else STEPS)
+    return replace(differs, explanation=f", and {still}: {cause}", causes=causes)
 
 
-def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -> list[str]:
-    """Return a warning if the image differs from the references by a tenth beyond noise, and the loss still falls, or may do so.
+def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -> Misfit | None:
+    """Return a difference of the image from the references of a tenth or more beyond noise if the loss still falls, or may do so.
 
     Args:
         last, earlier: images of the last and of an earlier step, with the same random numbers. Averages over steps would lower the loss
@@ -148,9 +150,10 @@ def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -
     of = residuals, residuals, pictures.references, weights, pictures.sizes
     differs = misfit(*of, _OF_PICTURE_FALLING)
     if differs is None:
-        return []
+        return None
     value, error = last.change(earlier, _FALLS)
     if not value + _SURE * error < 0.0:
-        return [unexplained(problem, differs, earlier.step, last.step, stays=False)]
+        return unexplained(problem, differs, earlier.step, last.step, stays=False)
     fallen = f"its loss has fallen by {1 - last.picture.loss[0] / earlier.picture.loss[0]:.0%} since step {earlier.step} of {last.step}"
-    return [f"{differs.describe()}, and {NOT_CONVERGED}: {fallen}; give it more steps or seconds"]
+    explanation = f", and the run has not converged: {fallen}; give it more steps or seconds"
+    return replace(differs, explanation=explanation, causes=(STEPS,))

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from unrender.core import arrays
 from unrender.display import formatting
 from unrender.estimators.penalties import penalty
+from unrender.runs.determination import changed
 from unrender.runs.earlier_image import no_improvement
 from unrender.runs.folder.schema import MISFIT
 from unrender.runs.result import Result
-from unrender.runs.verification import DIFFERS, Misfit, misfit, residuals_of_views
+from unrender.runs.verification import PRIOR, Misfit, misfit, residuals_of_views, without_prior
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import mean_square
 
@@ -24,19 +26,20 @@ and by how much of the initial mean square error and of the mean square of the r
 _OF_BIAS = 0.25
 """Share of the bias from noise that counts as its standard error, since two halves may agree by chance."""
 
-_STEP = 0.1
-"""Change of the parameters, relative to the range between their bounds, or to the root mean square of their values."""
 _LITTLE, _OF_PIXEL = 0.1, 0.02
 """Changes of a pixel by random changes of all elements up to which the unknowns hardly change it: relative to the usual one, and relative
 to the pixel."""
-_FEWEST, _MOST_KEYS = 64, 4
+_FEWEST, _MOST_KEYS = 64, 12
 """Fewest pixels that are judged, and most unknowns that change as a whole."""
+_BLOCK, _ELSEWHERE = 8, 0.25
+"""Side of the blocks of pixels, and share of them that does not count beside unknown poses: the object may belong there."""
 _LEAST = 0.02
 """Smallest difference relative to these pixels of the references."""
 _SEED = 7
-_SURE, _OF_FILTER, _OF_NOISE, _MOSTLY = 4.5, 1.8, 1.2, 0.8
-"""Standard errors from which a residual looks like a distorted reference; factor of these for noise that neighbouring pixels share; and
-smallest size relative to the noise of half of the samples, and to the difference whose cause it is."""
+_SURE, _OF_FILTER, _OF_NOISE, _MOSTLY, _DISTINCT = 4.5, 1.8, 1.2, 0.8, 1.3
+"""Standard errors from which a residual looks like a distorted reference; factor of these for noise that neighbouring pixels share;
+smallest size relative to the noise of half of the samples, and to the difference whose cause it is; and how many times as much as
+any other it must explain."""
 
 Picture = Callable[[Mapping[str, np.ndarray], int], np.ndarray]
 """Function of values and a view that returns a picture (H, W, 3), with the random numbers of the first of the pictures of the end."""
@@ -104,11 +107,17 @@ def _worse(measure: str, after: float, before: float) -> str:
 def loss_of_halves(
     problem: Problem, values: Mapping[str, np.ndarray], views: Sequence[int], images: Sequence[tuple[np.ndarray, ...]]
 ) -> tuple[float, float]:
-    """Return the loss of images of some views without the bias from their noise, and about its standard error, from their halves."""
+    """Return the loss of images of some views without the bias from their noise, and about its standard error, from their halves.
+
+    Pixels that are not finite count as equal to the reference.
+    """
     loss, square, array = penalty(problem, values), 0.0, problem.renderer.array
     for view, (one, other) in zip(views, images, strict=True):
+        reference = np.asarray(problem.views[view].reference)
+        finite = np.isfinite(one + other)
         both, *parts = (
-            arrays.number(problem.loss_value(view, array(image))) for image in ((one + other) / 2, one, other)
+            arrays.number(problem.loss_value(view, array(np.where(finite, image, reference))))
+            for image in ((one + other) / 2, one, other)
         )
         half = sum(parts) / 2.0
         loss += 2.0 * both - half
@@ -118,30 +127,35 @@ def loss_of_halves(
 
 def differs_still(
     problem: Problem, result: Result, views: Sequence[int], ends: Sequence[tuple[np.ndarray, ...]]
-) -> list[str]:
-    """Return `no_improvement` of the halves of the final images; [] if a warning is known or the images are not all."""
-    known = any(DIFFERS in line for line in result.warnings) or result.verification.get("best") != "end"
+) -> Misfit | None:
+    """Return `no_improvement` of the halves of the final images; None if a difference is known or the images are not all."""
+    known = result.misfit is not None or result.verification.get("best") != "end"
     if known or len(views) < len(problem.views) or len(ends[0]) < 2:
-        return []
+        return None
     loss, _ = loss_of_halves(problem, result.parameters, views, ends)
     change = result.verification.get("change", {})
     return no_improvement(problem, change, loss, result.steps, *residuals_of_views(problem, views, ends))
 
 
-def joined_warnings(earlier: Sequence[str], later: Sequence[str]) -> list[str]:
-    """Return the warnings of a run with those of its final images, whose line about the references replaces an earlier one."""
-    known = any(DIFFERS in line for line in later)
-    return [*(line for line in earlier if not (known and DIFFERS in line)), *later]
+def with_misfit(result: Result, difference: Misfit | None) -> Result:
+    """Return a result with this difference from the references in place of its own one, also in its warnings; unchanged for None."""
+    if difference is None:
+        return result
+    known = result.misfit.line if result.misfit else ""
+    return replace(result, misfit=difference, warnings=[*(x for x in result.warnings if x != known), difference.line])
 
 
 def renderings_of_check(problem: Problem) -> int:
-    """Return the number of images of each view that `unexplained_pixels` renders: one for all unknowns, and one for each; 0 if it does not.
+    """Return the number of images of each view that `unexplained_pixels` renders; 0 if it does not.
 
-    Poses, lenses and vertex positions may change any pixel, so problems with such unknowns are not judged.
+    These are one for all unknowns, one for each, and one for each prior.
+
+    Poses of lights and sensors, lenses and vertex positions may change any pixel, so problems with such unknowns are not judged.
     """
-    known, count = problem.renderer.parameters(), len(problem.unknowns)
-    moving = any(known[key].rigid or known[key].viewpoint or known[key].welded for key in problem.unknowns)
-    return 0 if moving or count > _MOST_KEYS else 1 + count
+    known, count = [problem.renderer.parameters()[key] for key in problem.unknowns], len(problem.unknowns)
+    anywhere = any((of.rigid and of.light) or of.viewpoint or of.welded for of in known)
+    priors = sum(unknown.prior is not None for unknown in problem.unknowns.values())
+    return 0 if anywhere or count > _MOST_KEYS else 1 + count + priors
 
 
 def unexplained_pixels(
@@ -150,12 +164,13 @@ def unexplained_pixels(
     starts: Sequence[Sequence[np.ndarray]],
     ends: Sequence[Sequence[np.ndarray]],
     picture: Picture,
-) -> str:
-    """Return a warning if pixels that the unknowns hardly change differ from the references by more than noise; else "".
+) -> Misfit | None:
+    """Return the difference from the references of pixels that the unknowns hardly change; None if noise may explain it.
 
     A run may be short, so its residual r contains what the unknowns will still explain. Random changes of all elements show which pixels
     depend on them directly. Light that all elements send to the others, such as a wall's to the floor, changes with their mean: what the
     run's own change of the pictures and constant changes of each unknown explain of r is subtracted, by least squares in each channel.
+    A prior holds unknowns far from what the references say, so with one these pixels must differ as much as the others.
 
     Args:
         result: {key: array} at the end.
@@ -164,96 +179,152 @@ def unexplained_pixels(
     """
     views = range(len(problem.views))
     if not renderings_of_check(problem) or len(ends) < len(views) or len(ends[0]) < 2:
-        return ""
+        return None
     residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
 
     def change(values: Mapping[str, np.ndarray]) -> np.ndarray:
         return _joined([picture(values, view) - of[0] for view, of in zip(views, ends, strict=True)])
 
     signs = np.random.default_rng(_SEED)
-    random = {key: _changed(problem, key, x, signs.choice((-1.0, 1.0), x.shape)) for key, x in result.items()}
-    little = _is_little(_joined([of[0] for of in ends]), change(random), weights)
+    random = change({key: changed(problem, key, x, signs.choice((-1.0, 1.0), x.shape)) for key, x in result.items()})
+    weights = weights * np.isfinite(random).all(axis=1)
+    little = _is_little(residuals[0] + references, np.where(weights[:, None] > 0, random, 0.0), weights)
     if np.count_nonzero(little * weights) < _FEWEST:
-        return ""
+        return None
     explained = [_joined([np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)])]
-    explained += [change({**result, key: _changed(problem, key, x, np.ones(x.shape))}) for key, x in result.items()]
+    explained += [change({**result, key: changed(problem, key, x, np.ones(x.shape))}) for key, x in result.items()]
+    explained += map(change, _pulled(problem, result))
     rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
+    if any(problem.renderer.parameters()[key].rigid for key in problem.unknowns):
+        little = little & _calm(rest.mean(axis=0), weights * little, sizes)
     size, everywhere = (math.sqrt(mean_square(references, of)) for of in (weights * little, weights))
     least = _LEAST * max(1.0, everywhere / max(size, 1e-300))
     differs = misfit(rest[0::2], rest[1::2], references, weights * little, sizes, least)
-    cause, shared = _as_if(rest, residuals + references, weights * little, sizes)
-    if differs is None and cause:
+    cause, shared, sure = _as_if(rest, residuals + references, weights * little, sizes)
+    if differs is None and sure and shared > least * size:
         total = mean_square(rest.mean(axis=0), weights * little)
-        if shared > least * size:
-            differs = Misfit(shared, size, math.sqrt(max(total - shared**2, 0.0)))
-    if differs is None:
-        return ""
+        differs = Misfit(shared, size, math.sqrt(max(total - shared**2, 0.0)))
+    total = math.sqrt(mean_square(residuals.mean(axis=0), weights))
+    if differs is None or (problem.has_prior and differs.share * everywhere < _MOSTLY * total):
+        return None
     cause = cause if shared > _MOSTLY * differs.error else ""
     share = np.count_nonzero(little * weights) / np.count_nonzero(weights)
-    return (
-        f"{differs.describe()} in the {share:.0%} of its pixels that the unknowns hardly change{cause}: light, depth, alignment or "
-        "something else that is not among the unknowns is wrong"
+    explanation = (
+        f" in the {share:.0%} of its pixels that the unknowns hardly change{cause}: light, depth, alignment or something else that is "
+        "not among the unknowns is wrong"
     )
+    return replace(differs, explanation=explanation)
+
+
+def _calm(residual: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Return the pixels (N,) of all blocks but those where a residual (N, 3) is largest."""
+    blocks, first, start = np.zeros(len(residual), np.int64), 0, 0
+    for height, width in sizes:
+        y, x = np.mgrid[:height, :width] // _BLOCK
+        blocks[start : start + height * width] = first + np.ravel(y * (width // _BLOCK + 1) + x)
+        start, first = start + height * width, first + (height // _BLOCK + 1) * (width // _BLOCK + 1)
+    counts = np.bincount(blocks, weights, first)
+    sums = np.stack([np.bincount(blocks, weights * channel, first) for channel in residual.T], axis=1)
+    means = np.square(sums / np.maximum(counts, 1e-300)[:, None]).sum(axis=1)
+    used = counts > 0
+    return (means <= np.quantile(means[used], 1.0 - _ELSEWHERE))[blocks] if used.any() else used[blocks]
+
+
+def beyond_priors(
+    problem: Problem,
+    difference: Misfit,
+    values: Mapping[str, np.ndarray],
+    ends: Sequence[Sequence[np.ndarray]],
+    picture: Picture,
+) -> Misfit:
+    """Return a difference without `PRIOR` among its causes if steps against the pull of the priors explain little of it.
+
+    Args:
+        difference: difference of the final pictures from the references.
+        values: {key: array} at the end.
+        ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
+        picture: see `Picture`.
+    """
+    if PRIOR not in difference.causes or len(problem.unknowns) > _MOST_KEYS:
+        return difference
+    views = range(len(ends))
+    residuals, references, weights, sizes = residuals_of_views(problem, views, ends)
+    explained = [
+        _joined([picture(moved, view) - of[0] for view, of in zip(views, ends, strict=True)])
+        for moved in _pulled(problem, values)
+    ]
+    rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
+    left = misfit(rest[0::2], rest[1::2], references, weights, sizes, 0.0)
+    return difference if left is None or left.error < _MOSTLY * difference.error else without_prior(difference)
+
+
+def _pulled(problem: Problem, values: Mapping[str, np.ndarray]) -> list[dict[str, np.ndarray]]:
+    """Return values after a step against each prior, as the loss would take it without that prior."""
+    moved = []
+    for key, unknown in problem.unknowns.items():
+        if unknown.prior is not None:
+            _, slope = unknown.prior.evaluate(values[key])
+            along = slope / max(float(np.abs(slope).max()), 1e-300)
+            moved.append({**values, key: changed(problem, key, values[key], along)})
+    return moved
 
 
 def _as_if(
     residuals: np.ndarray, images: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]
-) -> tuple[str, float]:
-    """Return what a view's reference looks like, and the root mean square of the difference over all pixels; "" and 0 for nothing.
+) -> tuple[str, float, bool]:
+    """Return what a view's reference looks like, the root mean square of the difference over all pixels, and whether that proves it.
 
-    The residual of the first half of the images is fitted by changes of the second half, whose noise is independent of it. Rare bright
-    samples leave most pixels too dark, so a fit below the noise of a half in the same pixels means nothing.
+    These are "" and 0 for nothing, and "" if another distortion explains nearly as much. The residual of the first half of the images is
+    fitted by changes of the second half, whose noise is independent of it. Rare bright samples leave most pixels too dark, so another
+    brightness proves nothing, nor does a fit below the noise of a half in the same pixels.
     """
-    cause, shared, total, start = "", 0.0, max(float(weights.sum()) * 3, 1e-300), 0
-    noise = (residuals[0::2].mean(axis=0) - residuals[1::2].mean(axis=0)) / math.sqrt(2.0)
+    cause, shared, sure, total, start = "", 0.0, False, max(float(weights.sum()) * 3, 1e-300), 0
+    one, other = residuals[0::2].mean(axis=0), residuals[1::2].mean(axis=0)
     for view, (height, width) in enumerate(sizes):
         part = slice(start, start + height * width)
         start += height * width
         root = np.sqrt(weights[part])[:, None]
-        image = images[1::2, part].mean(axis=0).reshape(height, width, 3)
-        wanted = np.ravel(residuals[0::2, part].mean(axis=0) * root)
-        if not (np.isfinite(image).all() and np.isfinite(wanted).all()) or np.count_nonzero(root) < _FEWEST:
+        if np.count_nonzero(root) < _FEWEST:
             continue
-        for words, changes in _distortions(image).items():
+        wanted, again = (np.ravel(half[part] * root) for half in (one, other))
+        noise, best, explained = np.square(wanted - again) / 2.0, "", {}
+        distortions = _distortions(images[1::2, part].mean(axis=0).reshape(height, width, 3))
+        for index, (words, changes) in enumerate(distortions.items()):
             columns = np.stack([np.ravel(change.reshape(-1, 3) * root) for change in changes], axis=1)
             inverse = np.linalg.pinv(columns.T @ columns, hermitian=True)
             amounts = inverse @ (columns.T @ wanted)
             scores = columns * (wanted - columns @ amounts)[:, None]
             errors = np.sqrt(np.diagonal(inverse @ (scores.T @ scores) @ inverse))
-            squares = np.square(columns @ amounts)
+            fit = columns @ amounts
+            squares, name = np.square(fit), words(amounts)
+            explained[name] = float(wanted @ again - (wanted - fit) @ (again - fit))
             fitted = math.sqrt(float(squares.sum()) / total)
-            clear = float(squares @ squares) > _OF_NOISE**2 * float(squares @ np.square(np.ravel(noise[part] * root)))
+            clear = float(squares @ squares) > _OF_NOISE**2 * float(squares @ noise)
             if fitted > shared and clear and (np.abs(amounts) > _SURE * _OF_FILTER * errors).any():
-                moved = [f"{-x:.2g}" for x in amounts]
-                cause, shared = f", as if the reference of view {view} {words.format(*moved)}", fitted
-    return cause, shared
+                best, shared, sure = name, fitted, index > 0
+        if best:
+            alone = explained.pop(best) > _DISTINCT * max(explained.values())
+            cause = f", as if the reference of view {view} {best}" if alone else ""
+    return cause, shared, sure
 
 
-def _distortions(image: np.ndarray) -> dict[str, list[np.ndarray]]:
-    """Return changes of an image (H, W, 3), in units of a pixel where they move it, by their words."""
+def _distortions(image: np.ndarray) -> dict[Callable[[np.ndarray], str], list[np.ndarray]]:
+    """Return changes of an image (H, W, 3), in units of a pixel where they move it, by functions that name amounts; brightness first."""
     from scipy.ndimage import gaussian_filter  # takes long to import
 
     down, along = np.gradient(image, axis=(0, 1))
     height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width] - np.array([height - 1, width - 1]).reshape(2, 1, 1) / 2
     return {
-        "were shifted by {} pixels along x and {} along y": [-along, -down],
-        "were blurred": [gaussian_filter(image, (1.0, 1.0, 0.0)) - image],
-        "had another field of view": [x[..., None] * along + y[..., None] * down],
+        lambda by: f"were {1.0 - by[0]:.2g} times as bright": [image],
+        lambda by: f"were shifted by {-by[0]:.2g} pixels along x and {-by[1]:.2g} along y": [-along, -down],
+        lambda by: "were blurred" if by[0] < 0.0 else "were sharper": [gaussian_filter(image, (1.0, 1.0, 0.0)) - image],
+        lambda by: "had another field of view": [x[..., None] * along + y[..., None] * down],
     }
 
 
 def _joined(pictures: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.reshape(picture, (-1, 3)) for picture in pictures]).astype(np.float64)
-
-
-def _changed(problem: Problem, key: str, values: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """Return values changed by a step of the given signs, which turn where the step would leave the bounds."""
-    low, high = problem.unknowns[key].bounds
-    size = float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))) or 1.0
-    step = _STEP * (size if low is None or high is None else high - low) * signs
-    outside = values + step != np.asarray(problem.unknowns[key].project(values + step))
-    return np.asarray(problem.unknowns[key].project(values + np.where(outside, -step, step)), np.float32)
 
 
 def _is_little(image: np.ndarray, change: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -13,15 +13,22 @@ import numpy as np
 from unrender.core import phases
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
-from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor
+from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor, with_lost
 from unrender.runs.field_directions import TOO_SHORT
-from unrender.runs.final_checks import differs_still, image_name, renderings_of_check, rise, unexplained_pixels
+from unrender.runs.final_checks import (
+    beyond_priors,
+    differs_still,
+    image_name,
+    renderings_of_check,
+    rise,
+    unexplained_pixels,
+)
 from unrender.runs.folder.schema import WORSE
 from unrender.runs.image_sensitivity import Curvature, curvature, map_keys
 from unrender.runs.least_squares import NumbersCheck, check_numbers, checked_keys, compile_check
 from unrender.runs.map_uncertainty import Uncertainty, no_maps, of_residuals, pixel_noise
 from unrender.runs.result import Result
-from unrender.runs.verification import misfit_of_views
+from unrender.runs.verification import Misfit, misfit_of_views
 from unrender.scene.coarse_to_fine import NEVER
 from unrender.scene.problem import Problem
 from unrender.scene.render import MANY_SENSORS, power_of_two, render
@@ -45,6 +52,8 @@ _PASS_PATHS, _MOST_PASS = 1 << 18, 16
 _PICTURES_SHARE = 0.5
 """Share of the time that is left at the end that final pictures may take with the check of unchanged pixels, and of what is left then that
 this check may take."""
+_MOST_CHECK = 1.25
+"""Most time of this check, relative to that of the pictures, that is set aside by rendering fewer samples."""
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
@@ -69,6 +78,7 @@ class FinalImages:
         standard_error: see `Result.standard_error`.
         data_share: see `Result.data_share`.
         without_errors: see `Result.without_errors`.
+        misfit: see `Result.misfit`; None if no difference is found.
         rise: warning that the final images are worse than those of the start, where the verification was uncertain; "" if they are not.
             Nothing is tested then.
     """
@@ -82,6 +92,7 @@ class FinalImages:
     standard_error: Mapping[str, np.ndarray] = field(default_factory=dict)
     data_share: Mapping[str, np.ndarray] = field(default_factory=dict)
     without_errors: tuple[str, ...] = ()
+    misfit: Misfit | None = None
     rise: str = ""
 
 
@@ -122,8 +133,7 @@ def render_final_images(
         samples = spp or _affordable(problem, result, _PICTURES_SHARE * left())
         chosen, began = _chosen(problem), time.perf_counter()
         pictures, errors, halves_of = _pictures(problem, result, chosen, samples, advance)
-        of_check = _cost_of_check(problem) * (time.perf_counter() - began)
-        ends = halves_of["result"]
+        spent, ends = time.perf_counter() - began, halves_of["result"]
         if risen := rise(problem, result, pictures, errors, halves_of):
             return FinalImages(pictures, errors, samples, {}, rise=risen)
         tests = max(left(), _LEAST_TESTS * min(slowdown(), MOST_SLOWDOWN))
@@ -135,27 +145,28 @@ def render_final_images(
         known = curvature(problem, result.parameters, seconds=seconds, noise=noise) if everything else Curvature()
         sensitivities, deviations = known.sensitivity(), dict(result.standard_error)
         lines, warnings = [], ()
-        differs = _differs(problem, result, chosen, halves_of, samples, of_check < _PICTURES_SHARE * left())
+        can_check = _cost_of_check(problem) * spent < _PICTURES_SHARE * left()
+        differs = _differs(problem, result, chosen, halves_of, samples, can_check)
         if not tested and result.steps and not differs:
             late = NumbersCheck(unchecked=checked_keys(problem, result.parameters, result.initial))
             lines, deviations = [*untested_factor(problem), *late.missing()], _without(deviations, late.unchecked)
         if everything:
-            lines, warnings, deviations = _undetermined(
+            lines, warnings, deviations, unseen = _undetermined(
                 problem, result, sensitivities, 0.25 * tests, weights, fits=not differs, complete=complete
             )
+            differs = with_lost(problem, result, differs, unseen, ends, 4 * _pass_spp(problem), _pass_spp(problem))
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
     if differs:
         deviations = {}
         maps = _untested(problem, result, "the final picture differs from the references by more than noise")
-        warnings += () if differs in result.warnings else (differs,)
     else:
-        warnings += tuple(differs_still(problem, result, chosen, ends))
-    lines += maps.limited
-    return FinalImages(
-        pictures, errors, samples, sensitivities, tuple(lines), warnings, deviations, maps.data_share, maps.missing
-    )
+        differs = differs_still(problem, result, chosen, ends)
+    if differs and len(chosen) == len(problem.views) and len(ends[0]) == 2 and spent < left():
+        differs = beyond_priors(problem, differs, result.parameters, ends, partial(_first_half, problem, samples))
+    texts, errors_of = (*lines, *maps.limited), (deviations, maps.data_share, maps.missing)
+    return FinalImages(pictures, errors, samples, sensitivities, texts, warnings, *errors_of, differs)
 
 
 def at_start(result: Result, rise: str) -> Result:
@@ -219,14 +230,15 @@ def _undetermined(
     weights: Sequence[np.ndarray],
     fits: bool,
     complete: bool,
-) -> tuple[list[str], tuple[str, ...], dict[str, np.ndarray]]:
-    """Return lines about what the images do not determine and about numbers that have not settled, and standard errors; none without steps.
+) -> tuple[list[str], tuple[str, ...], dict[str, np.ndarray], list[str]]:
+    """Return lines about what the images do not determine and about numbers that have not settled, standard errors, and keys of
+    undetermined numbers; none without steps.
 
     Each test takes at most about `most` seconds. A final picture that does not fit the references (`fits`) has no standard errors.
     `complete`: see `render_final_images`.
     """
     if not result.steps:
-        return [], (), {}
+        return [], (), {}, []
     lines = undetermined_cells(sensitivities)
     seconds = min(max(_LOOK_SHARE * result.seconds, _LOOK_SECONDS), most)
     spp = power_of_two(min(max(_TRIAL_PATHS // math.prod(problem.sizes[0]), 1), _most_spp(problem) // 2))
@@ -245,7 +257,7 @@ def _undetermined(
         lines += numbers.noisy(result.standard_error)
     failed = result.status == "failed"  # such a run did not end by its budget
     unfinished = () if failed else tuple(line for key, line in numbers.unfinished.items() if key not in text)
-    return lines, unfinished, deviations
+    return lines, unfinished, deviations, [*numbers.undetermined]
 
 
 def _without(errors: Mapping[str, np.ndarray], keys: Sequence[str]) -> dict[str, np.ndarray]:
@@ -291,17 +303,17 @@ def _differs(
     halves: Mapping[str, Sequence[tuple[np.ndarray, ...]]],
     spp: int,
     can_check: bool,
-) -> str:
-    """Return a warning that the pictures of a run differ from the references by something that is not among the unknowns; else "".
+) -> Misfit | None:
+    """Return the difference of a run's pictures from the references by something that is not among the unknowns; None without one.
 
     `can_check` says whether there is time to render images for `unexplained_pixels`. Details that a coarse grid lacks are no other cause.
     """
     ends = halves["result"]
-    line = misfit_of_views(problem, views, ends, result.warnings) if result.steps else ""
+    differs = misfit_of_views(problem, views, ends, result.misfit) if result.steps else None
     coarse = any(result.steps <= levels.steps[-1] < NEVER for levels in problem.coarse_to_fine.values())
     possible = can_check and not coarse and spp >= 2 * _FEWEST_SAMPLES
-    if line or not result.steps or not possible or result.verification.get("best") != "end":
-        return line
+    if differs or not result.steps or not possible or result.verification.get("best") != "end":
+        return differs
     return unexplained_pixels(problem, result.parameters, halves["initial"], ends, partial(_first_half, problem, spp))
 
 
@@ -324,7 +336,8 @@ def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
         started = time.perf_counter()
         render(problem, result.parameters, 0, trial, seed, per_pass=trial)
         seconds = time.perf_counter() - started
-    allowed = min(max(_SHARE * result.seconds, _LEAST_SECONDS), most_seconds / (1.0 + _cost_of_check(problem)))
+    check = min(_cost_of_check(problem), _MOST_CHECK)
+    allowed = min(max(_SHARE * result.seconds, _LEAST_SECONDS), most_seconds / (1.0 + check))
     paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
     return max(2, 2 * trial, power_of_two(int(min(most, max(paths, 0.0) / (2 * sum(sizes))))))
 

@@ -73,7 +73,7 @@ def check_numbers(
     so are those with a prior. Standard errors with fixed unknowns would be too small, so there are none: the numbers are `unchecked`.
 
     Steps are reported for losses with a linear derivative only: others have their minimum elsewhere. The result is empty if there are
-    no numbers (see `Numbers.of`), or if the renderer rejects a value.
+    no numbers (see `Numbers.of`), if the renderer rejects a value, or if a picture is not finite.
 
     Args:
         values: {key: array} at the end.
@@ -138,8 +138,12 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
             factors = np.clip(change / np.maximum(changes, 1e-30), 1.0 / _CHANGES[index], _CHANGES[index])
             widths = np.minimum(factors * widths, numbers.limits)
     matrix = differences.matrix()
-    if not (np.isfinite(matrix).all() and matrix.any()):
-        return NumbersCheck()  # pictures that are not finite, or that no number changes
+    if not np.isfinite(matrix).all():
+        return NumbersCheck()
+    if not matrix.any():
+        unseen = {key: f"{key}: no picture depends on its value at the end" for key in numbers.keys}
+        zeros = {key: np.zeros(numbers.values[key].size) for key in numbers.keys}
+        return NumbersCheck(unseen, errors={key: x + np.inf for key, x in zeros.items()}, steps=zeros, noise=zeros)
     moved, fixed = fields_of(numbers, sensitivities)
     if moved:
         now = time.perf_counter()

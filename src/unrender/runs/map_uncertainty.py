@@ -124,7 +124,7 @@ def uncertainty(
         views = range(len(problem.views)) if mapped else selected_views(problem)
         halves = _halves(problem, values, views, seed)
         if differs := misfit_of_views(problem, views, list(zip(*halves, strict=True))):
-            return Uncertainty(missing=(differs,))
+            return Uncertainty(missing=(differs.line,))
         if mapped:
             known = curvature(problem, values, seconds=seconds, seed=seed, noise=pixel_noise(problem, halves))
             maps = of_residuals(problem, values, halves, known, seed)

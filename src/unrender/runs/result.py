@@ -14,6 +14,7 @@ from unrender.runs.folder.history import steps_in
 
 if TYPE_CHECKING:
     from unrender.runs.figure import ResultFigure
+    from unrender.runs.verification import Misfit
 
 INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
 """Reasons for a run to stop (`Result.stopped`) before its budget is used up: Ctrl-C or a stop command, SIGTERM, and gradients that are
@@ -49,6 +50,8 @@ class Result:
         adapted: settings that the optimizer has adapted, such as the changes of its learning rates, one line each.
         resumed: steps at which it was resumed.
         truth: {key: array} of known true values.
+        misfit: difference of the final pictures from the references that noise does not explain: its size, its `share` of the picture,
+            its warning (`line`), and the `causes` that are no fault of the scene; None if there is none.
         verification: results of new images, see `runs.verify`; empty if there were none. "status", "start", "end" and "best_loss" (loss
             and its standard error), "best" ("start", "step N" or "end"), "paths" (of each image), and "memory" (the root mean square
             "error" of a control variate, and of the "picture"). "change" holds the change of the "loss" since a "step", and its standard
@@ -111,6 +114,7 @@ class Result:
     without_errors: Sequence[str] = ()
     last: Mapping[str, np.ndarray] = field(default_factory=dict)
     verification: Mapping[str, Any] = field(default_factory=dict)
+    misfit: Misfit | None = None
 
     def __post_init__(self) -> None:
         if not self.last:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -21,17 +20,20 @@ from unrender.statistics import paired_losses
 
 DIFFERS = "the final picture differs from the references"
 """First words of warnings about images that do not agree with the references."""
-MAY_IMPROVE, NOT_CONVERGED, MORE_STEPS = "may still improve", "the run has not converged", "more steps"
-PRIOR, NOISY = "a prior may be too strong", "the references are noisy"
-"""Words of those warnings of them that more steps may answer: surely, or after few steps; and of those whose cause may be a prior, or noise
-of the references."""
-_SHARE, _OF_MODEL = re.compile(rf"{DIFFERS} by [^(]*\((\d+)% of the picture"), 0.25
-"""Size of the difference in these warnings, and the smallest one that ends a run without a known truth as "does not fit". References such
-as photographs differ from any model: an asset from rendered photographs and a carved mesh by 13 %."""
+STEPS, STEPS_OF_FEW, PRIOR, NOISE = "steps", "steps of few", "prior", "noise"
+"""Values of `Misfit.causes` that may explain a difference although the scene is right: too few steps, surely or if the run had few; a prior
+that is too strong; noise of the references."""
+LOST = "lost"
+"""Value of `Misfit.causes`: an unknown that the pictures show at the start, but no longer at the end."""
+_OF_PRIOR = "a prior may be too strong, or "
+"""Words about this cause."""
+_OF_MODEL = 0.25
+"""Smallest difference relative to the picture that ends a run without a known truth as "does not fit". References such as photographs
+differ from any model: an asset from rendered photographs and a carved mesh by 13 %."""
 _FEW_PIXELS, _OF_FEW = 96, 0.2
 """Number of pixels below which the difference is also judged pixel by pixel, which includes the references' noise; its smallest size
 relative to the image in this case."""
-_FEW_NUMBERS, _OF_PICTURE, _OF_CONCENTRATED = 24, 0.01, 0.1
+_FEW_NUMBERS, _OF_PICTURE, _OF_CONCENTRATED = 24, 0.01, 0.05
 """Most numbers of a problem whose images must agree with the references, and smallest size of a difference relative to the image; that of
 one in few pixels."""
 
@@ -54,12 +56,26 @@ class Misfit:
         size: root mean square of the references.
         noise: root mean square of the rest of the first picture's difference.
         by_pixel: whether pixels were judged one by one, so that the references' noise may be part of the difference.
+        explanation: rest of the warning, after `describe`.
+        causes: likely causes: `STEPS`, `STEPS_OF_FEW`, `PRIOR`, `NOISE`, `LOST`; () for something that is not among the unknowns.
     """
 
     error: float
     size: float
     noise: float
     by_pixel: bool = False
+    explanation: str = ""
+    causes: tuple[str, ...] = ()
+
+    @property
+    def share(self) -> float:
+        """Size relative to the references; infinite if these are black."""
+        return self.error / self.size if self.size > 0.0 else math.inf
+
+    @property
+    def line(self) -> str:
+        """The warning, one line."""
+        return self.describe() + self.explanation
 
     def is_references_noise(self, at_truth: Callable[[], float] | None) -> bool:
         """Return whether the references' noise may explain a difference that was judged pixel by pixel.
@@ -69,10 +85,15 @@ class Misfit:
         """
         return self.by_pixel and at_truth is not None and self.error**2 <= _OF_TRUTH * at_truth()
 
+    def record(self) -> dict[str, Any]:
+        """Return the values for run.json."""
+        share = float(f"{self.share:.6g}") if math.isfinite(self.share) else None
+        return {"error": float(f"{self.error:.6g}"), "share": share, "causes": list(self.causes)}
+
     def describe(self) -> str:
         """Return the first words of a warning, with the ratio to the noise where it is above 1."""
         times = f"{self.error / self.noise:.1f} times its noise" if 0.0 < self.noise < self.error else ""
-        share = f"{self.error / self.size:.0%} of the picture" if self.size > 0.0 else ""
+        share = f"{self.share:.0%} of the picture" if self.size > 0.0 else ""
         parts = ", ".join(filter(None, (share, times)))
         return f"{DIFFERS} by {formatting.number(self.error)}" + (f" ({parts})" if parts else "")
 
@@ -89,7 +110,7 @@ def misfit(
 ) -> Misfit | None:
     """Return the difference from the references that two pictures share; None if it may be noise or is small.
 
-    Noise of the references does not count, since neighbouring pixels do not share it.
+    Noise of the references does not count, since neighbouring pixels do not share it, nor do pixels where an image is not finite.
 
     Args:
         residuals: differences of K independent images from the references, (K, N, 3), in an order that mostly keeps neighbours adjacent.
@@ -102,9 +123,10 @@ def misfit(
             one by one.
         by_pixel: whether many pixels are, too. Without halves, only a difference that few of them hold counts.
     """
+    every = [residuals, others, *(halves or ())]
+    weights = weights * np.logical_and.reduce([np.isfinite(x).all(axis=(0, 2)) for x in every])
+    residuals, others, *parts = (np.where(weights[:, None] > 0, x, 0.0) for x in every)
     one, other = residuals.mean(axis=0), others.mean(axis=0)
-    if not (np.isfinite(one).all() and np.isfinite(other).all()):
-        return None
     size, total = (math.sqrt(paired_losses.mean_square(x, weights)) for x in (references, one))
 
     def significant(shared: paired_losses.SystematicDifference, smallest: float, one_by_one: bool) -> Misfit | None:
@@ -117,9 +139,9 @@ def misfit(
     scales = (significant(part, least, False) for part in (tiles, *edges))
     difference = max(filter(None, scales), key=lambda found: found.error, default=None)
     if difference is None and halves is not None and (by_pixel or np.count_nonzero(weights) < _FEW_PIXELS):
-        difference = significant(paired_losses.repeated(*halves, weights), _OF_FEW, True)
+        difference = significant(paired_losses.repeated(parts[0], parts[1], weights), _OF_FEW, True)
     if difference is None and by_pixel:
-        difference = significant(paired_losses.concentrated(one, other, weights), _OF_CONCENTRATED, True)
+        difference = significant(paired_losses.concentrated(one, other, weights, sizes), _OF_CONCENTRATED, True)
     return difference
 
 
@@ -129,22 +151,22 @@ def misfit_of_numbers(
     references: np.ndarray,
     weights: np.ndarray,
     sizes: Sequence[tuple[int, int]],
-    known: Sequence[str] = (),
+    known: Misfit | None = None,
     improved: bool = True,
     at_truth: Callable[[], float] | None = None,
-) -> str:
-    """Return a warning if only few numbers, or poses of lights, are unknown and the images differ from the references; else "".
+) -> Misfit | None:
+    """Return the difference of images from the references if only few numbers, or poses of lights, are unknown; None if noise explains it.
 
     Least squares of few numbers end where the difference is noise. Elsewhere their standard errors mean nothing. Noise of the references
     does not count, since pixels do not share it. It counts after a run without improvement, whose difference may be in few pixels.
 
     Args:
         problem: problem with the unknowns.
-        residuals: differences of K independent images from the references, (K, N, 3); K < 2 gives "".
+        residuals: differences of K independent images from the references, (K, N, 3); K < 2 gives None.
         references: references, (N, 3).
         weights: weight of each pixel, (N,), in [0, 1].
         sizes: see `misfit`.
-        known: warnings of the run; one that says so already is returned.
+        known: difference that the run has found, which is returned.
         improved: whether the images are better than at the start.
         at_truth: see `Misfit.is_references_noise`.
     """
@@ -152,25 +174,30 @@ def misfit_of_numbers(
     lights = all(info.rigid and info.light for info in infos)
     few = sum(math.prod(info.shape) for info in infos) <= _FEW_NUMBERS
     if not (few or lights) or len(residuals) < 2:
-        return ""
-    if line := next((warning for warning in known if DIFFERS in warning), ""):
-        return line
+        return None
+    if known is not None:
+        return known
     one, other = residuals[0::2], residuals[1::2]
     halves = None if improved or len(residuals) < 4 else (one, other)
     difference = misfit(one, other, references, weights, sizes, _OF_PICTURE, halves, by_pixel=True)
     if difference is None or difference.is_references_noise(at_truth):
-        return ""
-    noise = f"this picture's noise does not explain: {NOISY}, or" if difference.by_pixel else "noise does not explain:"
-    exchanged = "two lights are in each other's place, or " if lights and len(infos) > 1 else ""
-    return (
-        f"{difference.describe()}, which {noise} {prior_cause(problem)}{exchanged}the run needs more steps, another start or other bounds, "
-        "or something that is not among the unknowns is wrong; hence no standard errors"
+        return None
+    noise = "noise does not explain:"
+    if difference.by_pixel:
+        noise = "this picture's noise does not explain: the references are noisy, or"
+    words, causes = prior_cause(problem)
+    words += "two lights are in each other's place, or " if lights and len(infos) > 1 else ""
+    explanation = (
+        f", which {noise} {words}the run needs more steps, another start or other bounds, or something that is not among the unknowns is "
+        "wrong; hence no standard errors"
     )
+    causes = (*causes, STEPS_OF_FEW, *([NOISE] if difference.by_pixel else []))
+    return replace(difference, explanation=explanation, causes=causes)
 
 
 def misfit_of_views(
-    problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]], known: Sequence[str] = ()
-) -> str:
+    problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]], known: Misfit | None = None
+) -> Misfit | None:
     """Return `misfit_of_numbers` of independent images (H, W, 3) of each of some views."""
     return misfit_of_numbers(problem, *residuals_of_views(problem, views, images), known)
 
@@ -178,21 +205,32 @@ def misfit_of_views(
 def residuals_of_views(
     problem: Problem, views: Sequence[int], images: Sequence[Sequence[np.ndarray]]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, int]]]:
-    """Return `residuals`, `references`, `weights` and `sizes` of `misfit_of_numbers`, from K images (H, W, 3) of each of some views."""
+    """Return `residuals`, `references`, `weights` and `sizes` of `misfit_of_numbers`, from K images (H, W, 3) of each of some views.
+
+    Pixels where an image is not finite have residual and weight 0.
+    """
     references = [np.asarray(problem.views[view].reference, np.float32) for view in views]
     weights = [problem.test_weights(view, of) for view, of in zip(views, images, strict=True)]
     pixels = np.concatenate([image.reshape(-1, 3) for image in references])
     residuals = np.stack([np.concatenate([x.reshape(-1, 3) for x in of]) - pixels for of in zip(*images, strict=True)])
     sizes = [(height, width) for height, width, _ in map(np.shape, references)]
-    return residuals, pixels, np.concatenate([np.ravel(x) for x in weights]), sizes
+    finite = np.isfinite(residuals.sum(axis=(0, 2)))
+    weights = np.concatenate([np.ravel(x) for x in weights]) * finite
+    return np.where(finite[:, None], residuals, 0.0), pixels, weights, sizes
 
 
-def prior_cause(problem: Problem) -> str:
-    """Return the first words of the causes of a difference from the references if an unknown has a prior; "" otherwise."""
-    return f"{PRIOR}, or " if problem.has_prior else ""
+def prior_cause(problem: Problem) -> tuple[str, tuple[str, ...]]:
+    """Return the first words of the causes of a difference from the references, and `PRIOR`, if an unknown has a prior."""
+    return (_OF_PRIOR, (PRIOR,)) if problem.has_prior else ("", ())
 
 
-def fit_status(problem: Problem, status: str, warnings: Sequence[str], few: bool) -> str:
+def without_prior(difference: Misfit) -> Misfit:
+    """Return a difference that no prior explains."""
+    causes = tuple(cause for cause in difference.causes if cause != PRIOR)
+    return replace(difference, causes=causes, explanation=difference.explanation.replace(_OF_PRIOR, ""))
+
+
+def fit_status(problem: Problem, status: str, difference: Misfit | None, few: bool) -> str:
     """Return the status of a run that used up its budget: "does not fit" for a finished one that differs from its references for certain.
 
     Differences that more steps, a weaker prior or less noise in the references may explain do not change the status. Without a known
@@ -200,20 +238,15 @@ def fit_status(problem: Problem, status: str, warnings: Sequence[str], few: bool
 
     Args:
         status: status without the warnings.
-        few: whether the run had few steps. Lines that suggest more of them then do not change the status.
+        difference: difference of the run's pictures from the references; None for none.
+        few: whether the run had few steps. Differences that more of them may explain then do not change the status.
     """
-    answers = (MAY_IMPROVE, NOT_CONVERGED, PRIOR, NOISY, *((MORE_STEPS,) if few else ()))
-    least = 0.0 if problem.has_truth else _OF_MODEL
-    final = any(
-        DIFFERS in line and not any(words in line for words in answers) and _share(line) >= least for line in warnings
-    )
-    return MISFIT if final and status == "finished" else status
-
-
-def _share(line: str) -> float:
-    """Return the size of a warning's difference relative to the picture; infinite if the references are black."""
-    percent = _SHARE.search(line)
-    return int(percent[1]) / 100 if percent else math.inf
+    if status != "finished" or difference is None:
+        return status
+    if LOST in difference.causes:
+        return MISFIT
+    large = difference.share >= (0.0 if problem.has_truth else _OF_MODEL)
+    return MISFIT if large and not {*difference.causes} - (set() if few else {STEPS_OF_FEW}) else status
 
 
 def rare_light(images: Sequence[np.ndarray], weights: np.ndarray, spp: float) -> str:

@@ -31,6 +31,7 @@ from unrender.runs.run import Candidate
 from unrender.runs.truth_check import further_from_truth, has_few_steps
 from unrender.runs.verification import (
     Memory,
+    Misfit,
     compare_memory,
     control_variates,
     fit_status,
@@ -139,13 +140,14 @@ class Verify(Callback):
         best = min(places, key=lambda name: places[name][0].loss[0], default="end")
         disagrees = memory is not None and memory.disagrees
         best_loss = {"start": judged[0], "end": judged[1]}.get(best, candidate_picture or last).loss
-        lines, change = self._residual(problem, result, pictures, last, unaveraged)
-        if result.standard_error and not (lines or places):
-            lines = _misfit_of_numbers(problem, pictures, result, first, last)
-        if run.folder is None and not (lines or places):
-            lines = self._by_more_paths(run, result, pictures, change, seconds)
-        if lines:
+        differs, change = self._residual(problem, result, pictures, last, unaveraged)
+        if result.standard_error and not (differs or places):
+            differs = _misfit_of_numbers(problem, pictures, result, first, last)
+        if run.folder is None and not (differs or places):
+            differs = self._by_more_paths(run, result, pictures, change, seconds)
+        if differs:
             result = replace(result, standard_error={})
+        lines = [differs.line] if differs else []
         few = has_few_steps(result.steps, run.optimizer)
         if problem.has_truth and not _other_meshes(problem) and not (few and _is_worse(pictures, last, first)):
             ends = places[best][1] if places else result.parameters
@@ -156,7 +158,7 @@ class Verify(Callback):
         lines += filter(None, [rare_light(last.images, pictures.weights, spp)])
         status = WORSE if worse else MEMORY_DISAGREES if disagrees else "finished"
         verification: dict[str, Any] = {
-            "status": fit_status(problem, status, lines, few),
+            "status": fit_status(problem, status, differs, few),
             "start": _numbers(*judged[0].loss),
             "end": _numbers(*judged[1].loss),
             "best": best,
@@ -171,6 +173,7 @@ class Verify(Callback):
             parameters=dict(places[best][1]) if places else result.parameters,
             standard_error={} if places else result.standard_error,
             verification=verification,
+            misfit=differs,
             warnings=[*result.warnings, *lines],
         )
 
@@ -214,8 +217,8 @@ class Verify(Callback):
 
     def _by_more_paths(
         self, run: Run, result: Result, pictures: FreshPictures, change: Mapping[str, Any], seconds: float
-    ) -> list[str]:
-        """Return the warnings that final pictures would give, from an image of the end with the paths that are left.
+    ) -> Misfit | None:
+        """Return the difference that final pictures would show, from an image of the end with the paths that are left.
 
         `change` is the second value of `_residual`; see `_judged` for the others.
         """
@@ -223,12 +226,12 @@ class Verify(Callback):
             larger = self._larger_pictures(run, pictures, 1, 0, seconds)
             self._larger = larger and (larger, larger.picture(result.parameters))
         if self._larger is None:
-            return []
+            return None
         larger, end = self._larger
         of = larger.differences(end.images), larger.references, larger.weights_of(end.images), larger.sizes
-        if line := misfit_of_numbers(run.problem, *of):
-            return [line]
-        return no_improvement(run.problem, change.get("change", {}), end.loss[0], result.steps, *of)
+        return misfit_of_numbers(run.problem, *of) or no_improvement(
+            run.problem, change.get("change", {}), end.loss[0], result.steps, *of
+        )
 
     def _larger_pictures(
         self, run: Run, pictures: FreshPictures, count: int, waiting: int, seconds: float, least: int = _LEAST_LARGER
@@ -249,8 +252,8 @@ class Verify(Callback):
 
     def _residual(
         self, problem: Problem, result: Result, pictures: FreshPictures, end: Picture, unaveraged: Picture
-    ) -> tuple[list[str], dict[str, Any]]:
-        """Return a warning if the images differ from the references by more than noise, and the loss stays or still falls fast.
+    ) -> tuple[Misfit | None, dict[str, Any]]:
+        """Return a difference of the images from the references beyond noise, if the loss stays or still falls fast.
 
         The second value is {"change": …} of `Result.verification`; {} if no earlier image is compared.
 
@@ -262,7 +265,7 @@ class Verify(Callback):
         earlier = next((one for one in reversed(self._earlier) if one.is_compared(result.steps)), None)
         small = self._small
         if small is None or earlier is None:
-            return [], {}
+            return None, {}
         averages = unaveraged is not end
         if small is not pictures:
             unaveraged = small.picture(result.last)
@@ -280,8 +283,8 @@ class Verify(Callback):
         difference = misfit(last.residuals, earlier.residuals, *own, least_difference(earlier.step), halves)
         at_truth = partial(_at_truth, problem, small, result) if problem.has_truth else None
         if difference is None or difference.is_references_noise(at_truth):
-            return [], change
-        return [unexplained(problem, difference, earlier.step, result.steps)], change
+            return None, change
+        return unexplained(problem, difference, earlier.step, result.steps), change
 
 
 def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Picture, Picture]:
@@ -296,9 +299,9 @@ def _end(run: Run, result: Result, pictures: FreshPictures) -> tuple[Result, Pic
 
 def _misfit_of_numbers(
     problem: Problem, pictures: FreshPictures, result: Result, first: Picture, last: Picture
-) -> list[str]:
+) -> Misfit | None:
     """Return `misfit_of_numbers` of the image of the end."""
-    line = misfit_of_numbers(
+    return misfit_of_numbers(
         problem,
         pictures.differences(last.images),
         pictures.references,
@@ -307,7 +310,6 @@ def _misfit_of_numbers(
         improved=_is_worse(pictures, last, first),
         at_truth=partial(_at_truth, problem, pictures, result) if problem.has_truth else None,
     )
-    return [line] if line else []
 
 
 def _at_truth(problem: Problem, pictures: FreshPictures, result: Result) -> float:

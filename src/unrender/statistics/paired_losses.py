@@ -140,22 +140,25 @@ def repeated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> Systema
     return SystematicDifference(total / count, total / noise if noise > 0 else math.inf * np.sign(total))
 
 
-def concentrated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> SystematicDifference:
+def concentrated(
+    one: np.ndarray, other: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]] = ()
+) -> SystematicDifference:
     """Return the part of two pictures' differences from one reference that both share, if few pixels hold it; a score of 0 otherwise.
 
     A misplaced reflection or highlight changes its sign from pixel to pixel, which `systematic` and `nearby` miss. Noise of the reference
     is shared as well. Its variance is taken to be proportional to that of the pictures, with the median ratio of tiles of pixels; only four
-    times as much counts. A pixel where the picture is too dark does not count if no pixel is too bright by as much, since it may be an
-    outlier of the reference. Nor does the largest pixel of the rest.
+    times as much counts. A pixel where the picture is too dark does not count if neither a pixel is too bright by as much, nor two at a
+    distance of 2 are too dark by half as much, since it may be an outlier of the reference. Nor does the largest pixel of the rest.
 
     Args:
         one, other: differences of two independent pictures, (N, C).
         weights: (N,), how much each pixel counts, in [0, 1].
+        sizes: see `nearby`; () if neighbours are unknown.
     """
     one, other = (np.asarray(of, np.float64) * weights[:, None] for of in (one, other))
-    too_bright, products = (one + other).sum(axis=1) > 0, (one * other).sum(axis=1)
-    most = products[too_bright].max(initial=0.0)
-    counted = too_bright | (products <= most)
+    brighter, products = (one + other).sum(axis=1), (one * other).sum(axis=1)
+    most = products[brighter > 0].max(initial=0.0)
+    counted = (brighter > 0) | (products <= most) | _shared_with_neighbours(brighter, sizes)
     one, other, products = one * counted[:, None], other * counted[:, None], products * counted
     variances = np.square(one - other).sum(axis=1) / 2
     starts = np.linspace(0, len(one), min(len(one), _TILES), endpoint=False).astype(np.int64)
@@ -256,6 +259,20 @@ def nearby(
         shared, counted = shared + float(products.sum()), counted + float((weight * partner).sum())
     deviation, channels = _OF_PRODUCTS * math.sqrt(squares), values.shape[1]
     return SystematicDifference(shared / max(counted * channels, 1e-300), total / deviation if deviation > 0 else 0.0)
+
+
+def _shared_with_neighbours(values: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Return the pixels (N,) of which two at a distance of 2 have at least half the value (N,), with the same sign."""
+    shared, start = np.zeros(len(values), np.int64), 0
+    for height, width in sizes:
+        part = slice(start, start + height * width)
+        image, found = values[part].reshape(height, width), shared[part].reshape(height, width)
+        for axis in (0, 1):
+            here, there = (of.swapaxes(0, axis) for of in (image, found))
+            for one, other in ((slice(DISTANCE, None), slice(-DISTANCE)), (slice(-DISTANCE), slice(DISTANCE, None))):
+                there[one] += here[one] * here[other] >= 0.5 * np.square(here[one])
+        start += height * width
+    return (shared > 1) & (values != 0)
 
 
 def _pairs(values: np.ndarray, sizes: Sequence[tuple[int, int]], axis: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -108,6 +108,7 @@ def record(result: Result, status: str, error: str = "") -> dict[str, Any]:
             if np.ndim(error) < MAP_AXES
         },
         "verification": dict(result.verification),
+        "misfit": result.misfit.record() if result.misfit else {},
         "phases": {name: round(seconds, 3) for name, seconds in result.phases.items()},
     }
     if error:

@@ -130,6 +130,7 @@ class RunRecord(BaseModel):
         image_errors, undetermined, without_errors, phases: see `Result`.
         standard_error: standard errors of each number, {key: one value per element}, None for infinite; see `Result`.
         verification: see `Result`; empty for runs that were not verified.
+        misfit: "error", "share" (None if infinite) and "causes" of `Result.misfit`; empty without one.
         error: exception by which the run failed; "" for none.
     """
 
@@ -159,6 +160,7 @@ class RunRecord(BaseModel):
     without_errors: list[StrictStr] = []
     standard_error: dict[StrictStr, list[_Seconds | None]] = {}
     verification: dict[StrictStr, Any] = {}
+    misfit: dict[StrictStr, Any] = {}
     phases: dict[StrictStr, _Seconds] = {}
     error: StrictStr = ""
 

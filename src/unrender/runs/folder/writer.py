@@ -24,7 +24,7 @@ from unrender.io import files
 from unrender.optimizers.base import Measuring
 from unrender.runs import callbacks
 from unrender.runs.callbacks import Callback
-from unrender.runs.final_checks import joined_warnings
+from unrender.runs.final_checks import with_misfit
 from unrender.runs.final_images import at_start, render_final_images, warm_up
 from unrender.runs.folder import checkpoint, contents, method_file
 from unrender.runs.folder.history import THINNED_FROM, HistoryFile, thinned
@@ -189,11 +189,10 @@ class RunWriter(Callback):
             if images.rise:
                 result = at_start(result, images.rise)
                 images = render_final_images(run.problem, result, *given)
-            warnings, verification = joined_warnings(result.warnings, images.warnings), dict(result.verification)
+            result, verification = with_misfit(result, images.misfit), dict(result.verification)
             if verification and verification["status"] in ("finished", MISFIT):
-                verification["status"] = fit_status(
-                    run.problem, "finished", warnings, has_few_steps(result.steps, run.optimizer)
-                )
+                few = has_few_steps(result.steps, run.optimizer)
+                verification["status"] = fit_status(run.problem, "finished", result.misfit, few)
             result = replace(
                 result,
                 pictures=images.pictures,
@@ -203,7 +202,7 @@ class RunWriter(Callback):
                 undetermined=images.undetermined,
                 without_errors=images.without_errors,
                 standard_error=images.standard_error,
-                warnings=warnings,
+                warnings=[*result.warnings, *images.warnings],
                 verification=verification,
             )
             result = callbacks.with_phase(result, callbacks.PICTURES, time.perf_counter() - started)
