@@ -183,9 +183,8 @@ class HybridGradient:
                 raise InputError(
                     "HybridGradient: eliminated requires GaussNewton(remember=False), since the lines of earlier derivative images differ"
                 )
-            options = replace(
-                self.perturbed, scores=False, derivative_images=bool(self.eliminated)
-            )  # a block states no error
+            # a block states no error
+            options = replace(self.perturbed, scores=False, derivative_images=bool(self.eliminated))
             object.__setattr__(self, "perturbed", options)
 
     @property

@@ -121,9 +121,8 @@ class GradientRequest:
         """Return the contribution of one frame, computed in this process. `key` is the random key of the frame."""
         parameters, spp, adjoint_spp, pair_request = self.parameters, self.spp, self.adjoint_spp, self.pair_request
         difference_spp = pair_request.difference_spp if pair_request else None
-        on_images = (
-            pair_request if difference_spp is None else None
-        )  # the pair whose gradients use the paths of the images
+        # the pair whose gradients use the paths of the images
+        on_images = pair_request if difference_spp is None else None
         groups = leave_one_out_groups(spp, adjoint_spp)
         session = problem.renderer.prepare(list(parameters), pair_request.space if pair_request else None)
         image_estimate, contribution = self.image.estimate(

@@ -105,9 +105,7 @@ class AdaptiveCounts:
         checks.flags(self)
         checks.integer("AdaptiveCounts", "least", self.least, at_least=2)
         checks.integer("AdaptiveCounts", "refresh", self.refresh, at_least=1)
-        share = self.uniform
-        if share is not None and not checks.number("AdaptiveCounts", "uniform", share, above=0.0) <= 1:
-            raise InputError(f"AdaptiveCounts: uniform must be a share in (0, 1], got {share!r}")
+        uniform_share.check("AdaptiveCounts", self.uniform)
 
     def init(self, problem: Problem, parameters: Tree) -> AdaptiveCountsState:
         """Return the state before the first step. Raises `InputError` for a loss that is not pixelwise."""
@@ -152,23 +150,16 @@ class AdaptiveCounts:
         tiles, decay, evidence = _tiles(problem), _MEMORY**state.since, state.evidence
         tile = _tile_of_each_pixel(problem, tiles)
         factors = finite(draws.moments), finite(draws.squares)
-        counts = np.ones(len(tile)) if draws.counts is None else draws.counts
-        samples = TileSamples(tile, factors, np.ones(len(tile)), counts)
+        paths = np.ones(len(tile)) if draws.counts is None else draws.counts
+        samples = TileSamples(tile, factors, np.ones(len(tile)), paths)
         values = samples.normalised()
-        gain = self._gain(float(counts.mean()))
+        gain = self._gain(float(paths.mean()))
         if state.pooled:
             observed = samples.uniform_evidence(values, state.pooled)
             evidence = uniform_share.observed(evidence, observed, state.density[tile], decay, gain)
-        maps, paths = list(state.maps), state.counts * decay
-        for index, value in enumerate(values):
-            total, number = samples.summed(value, len(tiles.views))
-            if state.maps:
-                total, number = total + maps[index] * paths[:, None], number + paths
-            maps[index : index + 1] = [total / np.maximum(number, 1e-30)[:, None]]
-        _, number = samples.summed(values[0], len(tiles.views))
-        updated = replace(
-            state, maps=tuple(maps), counts=paths + number, evidence=evidence, since=0, learnt=state.learnt + 1
-        )
+        before = [state.counts * decay] * len(values)
+        maps, (counts, *_) = samples.averaged(values, len(tiles.views), state.maps, before)
+        updated = replace(state, maps=maps, counts=counts, evidence=evidence, since=0, learnt=state.learnt + 1)
         return self._with_density(tiles, updated, gain)
 
     def _gain(self, spp: float) -> Callable[[np.ndarray], np.ndarray]:

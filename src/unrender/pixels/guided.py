@@ -146,9 +146,7 @@ class GuidedSampler:
         checks.integer(self.owner, "levels", self.rule.levels, at_least=0)
         if options.samples is not None:
             checks.integer(self.owner, "samples", options.samples, at_least=1)
-        share = options.uniform
-        if share is not None and not checks.number(self.owner, "uniform", share, above=0.0) <= 1:
-            raise InputError(f"{self.owner}: uniform must be a share in (0, 1], got {share!r}")
+        uniform_share.check(self.owner, options.uniform)
         if options.denoiser not in MAP_DENOISERS:
             raise InputError(
                 f"{self.owner}: denoiser must be auto, oidn, optix, pooling, variation or none, got {options.denoiser!r}"
@@ -262,14 +260,9 @@ class GuidedSampler:
         if self.rule.needs_second_moment and state.denoised:
             observed = samples.uniform_evidence(values, state.denoised)
             evidence = uniform_share.observed(evidence, observed, state.density[samples.tile], decay)
-        maps, counts = list(state.maps), [count * decay for count in state.counts]
-        for index, value in enumerate(values):
-            total, count = samples.summed(value, len(tiles.views))
-            if state.maps:
-                total, count = total + maps[index] * counts[index][:, None], count + counts[index]
-            mean = total / np.maximum(count, 1e-30)[:, None]
-            maps[index : index + 1], counts[index : index + 1] = [mean], [count]
-        return replace(state, maps=tuple(maps), counts=tuple(counts), evidence=evidence, since=0)
+        before = [count * decay for count in state.counts]
+        maps, counts = samples.averaged(values, len(tiles.views), state.maps, before)
+        return replace(state, maps=maps, counts=tuple(counts), evidence=evidence, since=0)
 
     def _with_probabilities(self, problem: Problem, tiles: Tiles, state: GuidedSamplerState) -> GuidedSamplerState:
         denoised = tuple(

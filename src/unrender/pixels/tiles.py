@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,16 +126,8 @@ def _cut(resolutions: tuple[tuple[int, int], ...], most: int) -> Tiles:
         grid = Grid(math.ceil(height / side), math.ceil(width / side), side)
         y, x = (part.reshape(-1) * side for part in np.mgrid[: grid.rows, : grid.columns])
         grids.append(grid)
-        columns.append(
-            [
-                np.full(x.size, view),
-                x,
-                y,
-                np.minimum(side, width - x),
-                np.minimum(side, height - y),
-                np.full(x.size, width),
-            ]
-        )
+        views, films = np.full(x.size, view), np.full(x.size, width)
+        columns.append([views, x, y, np.minimum(side, width - x), np.minimum(side, height - y), films])
     return Tiles(tuple(grids), *(np.concatenate(parts) for parts in zip(*columns, strict=True)))
 
 
@@ -250,6 +242,20 @@ class TileSamples:
         paths = np.broadcast_to(np.asarray(self.paths, np.float64), self.tile.shape)
         sums = [np.bincount(self.tile, value * paths, tiles) for value in values.T]
         return np.stack(sums, axis=1), np.bincount(self.tile, paths, tiles)
+
+    def averaged(
+        self, values: Maps, tiles: int, maps: Maps, counts: Sequence[np.ndarray]
+    ) -> tuple[Maps, list[np.ndarray]]:
+        """Return maps to which these values are added, and the number of paths of each tile and map. `maps` are empty before the first
+        samples; those without values stay."""
+        means, paths = list(maps), list(counts) if maps else []
+        for index, value in enumerate(values):
+            total, number = self.summed(value, tiles)
+            if maps:
+                total, number = total + maps[index] * counts[index][:, None], number + counts[index]
+            means[index : index + 1] = [total / np.maximum(number, 1e-30)[:, None]]
+            paths[index : index + 1] = [number]
+        return tuple(means), paths
 
     def uniform_evidence(self, values: Maps, denoised: Maps) -> np.ndarray:
         """Return y of `uniform_share.observed`, (2, N): each factor of Eq. 12 from the samples, times the other one from the map."""

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from unrender.core import checks
+from unrender.core.errors import InputError
+
 SHARES = np.array([0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
 """Candidate fractions."""
 MOST = float(SHARES[-1])
@@ -16,6 +19,12 @@ map."""
 
 _UNKNOWN = 3.0
 """Second moment that n effective samples may have missed, in samples: at most 3 of 3 + n with 95 % confidence (rule of three)."""
+
+
+def check(owner: str, share: float | None) -> None:
+    """Raise `InputError` for a fraction that is neither None nor in (0, 1]."""
+    if share is not None and not checks.number(owner, "uniform", share, above=0.0) <= 1:
+        raise InputError(f"{owner}: uniform must be a share in (0, 1], got {share!r}")
 
 
 @dataclass(frozen=True)

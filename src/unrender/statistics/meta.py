@@ -246,9 +246,8 @@ def _variance(moments: Moments, scale: Array, centred: bool) -> Array:
     if not centred:
         return square
     about = square - mean * mean
-    return arrays.where(
-        about > 1e-4 * square, about, 0.0
-    )  # a smaller value is rounding error of equal samples in single precision
+    # a smaller value is rounding error of equal samples in single precision
+    return arrays.where(about > 1e-4 * square, about, 0.0)
 
 
 def _bounded_alpha(state: State, alpha: Array, var_f: Array, started: Array, clip: bool, max_weight: float) -> Array:

@@ -96,9 +96,8 @@ def parameter_traits(parameters: mi.SceneParameters, key: str, graph: ObjectGrap
         chains = [chain for reader in readers for chain in graph.chains(reader) if node in chain]
         return functools.reduce(_combined, [_traits_of(chain, key) for chain in chains], ParameterTraits(False, ""))
     chains = list(graph.chains(node))
-    effective = [
-        chain for chain in chains if len(chain) > 2
-    ] or chains  # a texture that the scene itself holds has no effect there
+    # a texture that the scene itself holds has no effect there
+    effective = [chain for chain in chains if len(chain) > 2] or chains
     return functools.reduce(_combined, [_traits_of(chain, key) for chain in effective])
 
 

@@ -136,9 +136,8 @@ class ObjectGraph:
     def check_complete(self) -> None:
         """Raise `InputError` for an object that a path can meet but its owner's `traverse` does not show."""
         shown = {kind: set(self.of(kind)) for kind in _KINDS}
-        shapes = [
-            shape for shape in all_shapes(self._scene) if shape.class_name() != "Instance"
-        ]  # rays hit its children instead
+        # rays hit the children of an instance instead
+        shapes = [shape for shape in all_shapes(self._scene) if shape.class_name() != "Instance"]
         for owner in (*shapes, *self._scene.emitters(), *self._scene.sensors()):
             for kind, item in _held(owner):
                 if item is not None and item not in shown[kind]:

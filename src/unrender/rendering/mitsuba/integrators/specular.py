@@ -69,9 +69,7 @@ class DeltaLobes:
     ) -> None:
         """Replace the BSDF values of the specular lobes, and the previous state's weight, in place."""
         bs = self._bs
-        for state in range(
-            1 if context.primal else 0, context.state_count
-        ):  # the current state's weight does not change
+        for state in range(int(context.primal), context.state_count):  # the current state's weight does not change
             with context.resume_grad():
                 lobe = self._value(bsdfs[state], surfaces[state])
                 values[state] = dr.select(self._delta, lobe, values[state])
