@@ -5,10 +5,10 @@ Mitsuba's projective integrator, and TEXTURE); FR22, the smoothed gradient of Fi
 CMA-ES; L-BFGS on the aggregate gradient; and the paper's: the gradient (OurG) with Adam, the Hessian (OurH) with
 Newton's method, Hessian-vector products element by element (OurHVP) and from the aggregate (OurHVPA) with Newton-CG;
 and, beyond the paper, gradient and products from the same renders (OurJoint), Gauss-Newton by differences of renders
-(OurGN), and `auto`, which has path gradients on TEXTURE and QUAD, and Gauss-Newton steps on the others. The others
-render their perturbations by the same launches, with antithetic draws and shared random numbers, and shrink σ as they
-go. Each but `auto` is tuned on each task over a grid (`methods.py`), on starts of its own, for the mean logarithm of its
-times; then the runs of all methods are done in turns.
+(OurGN), and `auto`, with the time of its plan, which has path gradients on TEXTURE and QUAD, and Gauss-Newton steps on
+the others. The others render their perturbations by the same launches, with antithetic draws and shared random numbers,
+and shrink σ as they go. Each but `auto` is tuned on each task over a grid (`methods.py`), on starts of its own, for the
+mean logarithm of its times; then the runs of all methods are done in turns.
 """
 
 from __future__ import annotations
