@@ -226,7 +226,7 @@ def test_a_texture_without_a_map_has_the_reason_in_the_record(tmp_path: Path) ->
     made = Problem(renderer, [Parameter("fog", initial=0.4, bounds=(0, 1))], [View(renderer.exact(truth))])
     result = run(made, run_directory=tmp_path / "run")
     record = json.loads((tmp_path / "run" / "run.json").read_text())
-    said = "fog: no map of standard errors: rays pass many voxels, so errors of voxels depend on each other"
+    said = "fog: no map of standard errors: rays pass many voxels, so errors of voxels depend on each other; see ur.runs.sensitivity"
     assert record["without_errors"] == list(result.without_errors) == [said]
     late = final_images.render_final_images(made, result, tested=False)
     assert late.without_errors == (

@@ -301,7 +301,7 @@ def test_volumes_have_no_map() -> None:
     found = uncertainty(made, made.initial_values())
     assert not found.standard_error
     assert found.missing == (
-        "fog: no map of standard errors: rays pass many voxels, so errors of voxels depend on each other",
+        "fog: no map of standard errors: rays pass many voxels, so errors of voxels depend on each other; see ur.runs.sensitivity",
     )
 
 

@@ -214,7 +214,7 @@ def _refusal(info: ParameterInfo, known: Curvature, key: str) -> str:
     if square is None:
         return "it has no path gradient"
     if square.ndim > MAP_AXES:
-        return "rays pass many voxels, so errors of voxels depend on each other"
+        return "rays pass many voxels, so errors of voxels depend on each other; see ur.runs.sensitivity"
     if not square.any():
         return "no picture depends on it"
     if info.curved:
