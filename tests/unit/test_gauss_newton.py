@@ -504,6 +504,22 @@ def test_a_bound_is_left_where_the_loss_falls_inside() -> None:
     np.testing.assert_allclose(tree["x"], [0.5, 1.0], atol=0.05)
 
 
+def test_the_curvature_of_another_scene_is_forgotten() -> None:
+    """The edge of a lamp in the picture has ten thousand times the curvature: its models held the lamp beside the picture."""
+    optimizer, tree = AveragedNewton(), {"x": np.zeros(3)}
+    state, minimum = optimizer.init(tree), np.full(3, 1.0)
+    for step in range(12):
+        curvature, end = (1e4, 0.1 * minimum) if 1 <= step < 4 else (1.0, minimum)
+        gradient = curvature * HESSIAN @ (tree["x"] - end)
+        steps, state = optimizer.update(
+            Estimate(0.0, {"x": gradient}, (Hessian(curvature * HESSIAN), HessianNoise(0.1 * curvature * HESSIAN))),
+            state,
+            tree,
+        )
+        tree = {"x": tree["x"] + steps["x"]}
+    np.testing.assert_allclose(tree["x"], minimum, atol=0.1)
+
+
 def test_noise_damps_the_directions_that_it_dominates() -> None:
     """Curvatures 1 and 0.01, noise of variance 4 and Δ = 2 of both: the first step is g / (a + s / (a Δ²))."""
     hessian, optimizer, x = np.diag([1.0, 0.01]), AveragedNewton(), np.zeros(2)

@@ -281,6 +281,7 @@ def test_auto_gives_poses_beside_a_texture_a_block_of_their_own() -> None:
     assert isinstance(plan.estimator.perturbed, ur.GaussNewton)
     assert isinstance(plan.optimizer, ur.optimizers.Partitioned)
     assert plan.optimizer.keys == plan.estimator.keys == ("pose",)
+    assert plan.estimator.wait == 8
     assert "Gauss-Newton steps for 2 numbers" in plan.reasons[0]
     assert "pose" not in plan.reasons[-1]
     other = method("auto").plan(absolute()).estimator

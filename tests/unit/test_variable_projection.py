@@ -199,10 +199,24 @@ def test_auto_eliminates_textures_from_the_steps_of_lights_alone() -> None:
     assert plan.eliminated == ("map",)
 
 
-def test_the_interval_of_steps_counts_the_images_of_the_elimination() -> None:
-    plan = method("auto").plan(problem(), {"spp": 8}).estimator
-    assert isinstance(plan, ur.estimators.HybridGradient)
-    assert plan.every == 2  # (2 · 2 · 8 + 3 · 8 + 8) / (4 · 8), without the images 1.25
+def test_blocks_of_lights_and_cameras_begin_at_once() -> None:
+    """After eight steps, as shapes begin, the texture has the error of the lamp. The interval counts the elimination's images."""
+    for renderer, every in (
+        (LampRenderer, 2),
+        (LensRenderer, 1),
+    ):  # (2 · 2 · 8 + 3 · 8 + 8) / (4 · 8), without the images 1.25
+        plan = method("auto").plan(problem(renderer=renderer), {"spp": 8}).estimator
+        assert isinstance(plan, ur.estimators.HybridGradient)
+        assert (plan.wait, plan.every, plan.eliminated) == (0, every, ("map",))
+
+
+def test_elements_of_a_sensor_change_all_views_where_textures_follow() -> None:
+    assert response_error(problem(0.0, LensRenderer)) < 0.02
+    asked = problem(renderer=LensRenderer)
+    slopes = {"map": np.zeros((2, *TRUTH["map"].shape), np.float32)}
+    follows = EliminatedParameters(asked.renderer, {"map": TRUTH["map"]}, np.zeros(2), slopes, {})
+    assert asked.renderer.parameters()["lamp"].sensor == 0
+    assert follows.parameters()["lamp"].sensor is None
 
 
 @pytest.mark.parametrize(
@@ -228,7 +242,6 @@ def test_what_cannot_be_eliminated_is_refused_by_name(options: dict[str, Any], m
         ({"preconditioner": ur.preconditioners.Sobolev()}, "map has a preconditioner, parameterisation or prior"),
         ({"parameterisation": "log"}, "map has a preconditioner, parameterisation or prior"),
         ({"prior": {"smoothness": 0.05}}, "map has a preconditioner, parameterisation or prior"),
-        ({"renderer": LensRenderer}, "parameters of a sensor, got lamp"),
     ],
 )
 def test_problems_whose_textures_cannot_be_eliminated_are_refused(settings: dict[str, Any], message: str) -> None:

@@ -132,7 +132,7 @@ class HybridGradient:
         every: interval of steps in which a block moves, >= 1. For `GaussNewton` only.
         eliminated: keys of reflectances or radiances that the block eliminates, without preconditioner, parameterisation and prior. Each
             of its steps takes three more images of each view, and an adjoint for each of its elements and one more, all with
-            `derivative_spp` samples per pixel. For `GaussNewton` without `remember` only, and not for parameters of a sensor.
+            `derivative_spp` samples per pixel. For `GaussNewton` without `remember` only.
     """
 
     path: Estimator = field(default_factory=PathGradient)
@@ -286,7 +286,6 @@ class HybridGradient:
         return replace(estimate, capabilities=(block,)), replace(state, perturbed=after, response=response), samples
 
     def _check_eliminated(self, problem: Problem, parameters: Tree, own: Sequence[str]) -> None:
-        known = problem.renderer.parameters()
         for name in self.eliminated:
             if name not in parameters or name in own:
                 hint = did_you_mean(name, [other for other in parameters if other not in own])
@@ -297,10 +296,6 @@ class HybridGradient:
                 raise InputError(
                     f"HybridGradient: parameter {name} has a preconditioner, parameterisation or prior; remove it from eliminated"
                 )
-        if self.eliminated and (sensors := [key for key in own if known[key].sensor is not None]):
-            raise InputError(
-                f"HybridGradient: eliminated excludes parameters of a sensor, got {sensors[0]}, as textures change all views"
-            )
 
     def _problems(
         self, problem: Problem, parameters: Tree, own: Sequence[str], response: Response | None

@@ -32,6 +32,8 @@ _FEWEST_MODELS = 8.0
 """Number of models from which their scatter gives a standard error."""
 _FIRST_MODELS = 8.0
 """Number of models from which `settled_averaging` applies."""
+_MOST_CURVATURE, _CURVATURE_ERRORS = 10.0, 3.0
+"""Ratio of the mean curvature to that of a new model from which the mean is of another scene; multiple of the new one's noise."""
 _USED, _SHRINK, _GROW = 0.5, 0.7, 1 / 0.7
 """Share of the radius from which a step counts as one that used the region, and the factors of the radius after such steps. Their product
 is 1, so noise alone neither closes the region nor opens it."""
@@ -107,7 +109,7 @@ class AveragedNewton:
 
     Directions along which noise (`GradientNoise`) moves the minimum by more than Δ are damped, by s / (a Δ²) for the curvature a and the
     variance s of the mean gradient. Elements at a bound beyond which the model falls stay there, and the others take their minimum for
-    that. A gradient that differs from the mean model's by more than noise allows reduces k.
+    that. A gradient that differs from the mean model's by more than noise allows reduces k, and so does a far smaller curvature.
 
     Δ shrinks after a long step if the new gradient shows that the loss rises along it, and grows while the loss falls. So averaging
     begins even where noise moves the minimum by more than the region.
@@ -182,6 +184,7 @@ class AveragedNewton:
             both = np.ix_(block, block)
             news = gradient[block] - (matrix[both] @ x[block] - target[block])
             surprise = _surprise(news, fluctuation[both] + shares[block].max() * gradient_noise[both])
+            surprise *= _outdated(matrix[both], hessian[both], added[both])
             count, length = counts[block].min() / surprise, state.lengths[block].max()
             growth = self._growth(count)
             weight = max((1.0 + growth) / (count + 1.0 + growth), length * length / (1.0 + length * length))
@@ -314,6 +317,18 @@ def _surprise(news: np.ndarray, noise: np.ndarray) -> float:
     inverse = np.linalg.pinv(noise / np.outer(units, units), rcond=_LEAST_NOISE, hermitian=True)
     square = float((news / units) @ inverse @ (news / units)) / news.size
     return max(square - _SURPRISE_ERRORS * math.sqrt(2.0 / news.size), 1.0)
+
+
+def _outdated(mean: np.ndarray, hessian: np.ndarray, noise: np.ndarray) -> float:
+    """Return the ratio of the curvature of the mean model to that of a new one with its noise, (n, n) each, over `_MOST_CURVATURE`; at
+    least 1.
+
+    The edge of a lamp that was in the picture, for example, leaves a curvature that holds the lamp beside it.
+    """
+    new = np.abs(np.diag(hessian)) + _CURVATURE_ERRORS * np.diag(noise)
+    old = np.diag(mean)
+    ratios = np.divide(old, new, out=np.zeros_like(old), where=new > 0.0)
+    return max(float(ratios.max(initial=0.0)) / _MOST_CURVATURE, 1.0)
 
 
 def _finite(capability: GradientNoise | HessianNoise | ScoreCovariance | None) -> np.ndarray | None:

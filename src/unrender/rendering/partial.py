@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,15 @@ from unrender.core import arrays, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
-from unrender.rendering.renderer import Derivatives, Renderer, RenderSession, SampleRequest, Space, differentiated
+from unrender.rendering.renderer import (
+    Derivatives,
+    ParameterInfo,
+    Renderer,
+    RenderSession,
+    SampleRequest,
+    Space,
+    differentiated,
+)
 from unrender.rendering.wrapper import RendererWrapper, SessionWrapper
 
 
@@ -87,6 +96,10 @@ class EliminatedParameters(HeldParameters):
     ):
         super().__init__(inner, held)
         self.origin, self.slopes, self.bounds = origin, slopes, bounds
+
+    def parameters(self) -> Mapping[str, ParameterInfo]:
+        """Return every parameter. None is of one sensor, since the eliminated ones follow, which all sensors see."""
+        return {key: replace(info, sensor=None) for key, info in self.inner.parameters().items()}
 
     def prepare(self, keys: list[str], space: Space | None, derivatives: Derivatives = True) -> RenderSession:
         if differentiated(keys, derivatives):

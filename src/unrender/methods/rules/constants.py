@@ -152,6 +152,11 @@ class Constants:
 
     pose_shift: float = 1.0 / 12.0
     """First shift of the differences of poses relative to the smallest image's side. Source: a block in a room .25 away."""
+    camera_shift: float = 1.0 / 48.0
+    """The same shift for cameras beside textures. Source: a camera .12 and .036 rad away, 64²: .009 and .003 rad after 40 steps, .28 and
+    .017 with twice the shift and a trust region of 2 widths."""
+    camera_trust: float = 0.5
+    """Trust region of such cameras in widths. Source: on 48² the rotation ends at .7 of the start's error, at 2.7 with 2 widths."""
     pose_reach: float = 2.0
     """Largest width of the differences of poses relative to the smoothing width. Source: as for `pose_shift`."""
     light_reach: float = 0.5
@@ -180,9 +185,12 @@ class Constants:
     block_images: float = 0.5
     """The same ratio for a block, while textures change the images. Source: the block with all else in the room unknown."""
     block_every: int = 2
-    """Largest number of steps of textures per step of a block. Source: as for `block_images`."""
+    """Largest number of steps of textures per step of a block, 1 for cameras. Source: as for `block_images`."""
     block_wait: int = 8
-    """Number of steps of textures before the first step of a block. Source: as for `block_images`."""
+    """Number of steps of textures before the first step of a block of shapes. Source: as for `block_images`.
+
+    Lamps, cameras, lenses and materials begin at once: a lamp beside a texture ends .002 away after 40 steps, .16 after such steps.
+    """
     eliminated_values: int = 1 << 22
     """Elements of a block times texels up to which the block eliminates a texture. Source: memory, 16 MiB."""
     path_cost: float = 4.0

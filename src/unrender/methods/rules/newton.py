@@ -129,19 +129,20 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     images = 2 * _elements(traits, keys) + (IMAGES if eliminated else 0)
     traced = images * estimator.derivative_spp + estimator.spp
     every = sampling.within((1, constants.block_every), round(traced / (constants.path_cost * plan.estimator.spp)))
+    # A texture that is fitted to a picture of a wrong lamp, lens or camera takes over its error.
+    wait = constants.block_wait if any(_is_shape(traits, key) for key in keys) else 0
+    optimizer = _optimizer(traits, keys)
+    if any(traits.infos[key].rigid and traits.infos[key].viewpoint for key in keys):
+        optimizer, every = replace(optimizer, trust_radius=constants.camera_trust), 1
     times = "" if every == 1 else f", every {every} steps"
     textures = f"; {listed(eliminated)} eliminated from their steps" if eliminated else ""
-    reason = (
-        f"{_reason(traits, keys, estimator)}{times}, after {constants.block_wait} steps of the others: {listed(keys)}"
-        f"{textures}"
-    )
+    after = f", after {wait} steps of the others" if wait else ""
+    reason = f"{_reason(traits, keys, estimator)}{times}{after}: {listed(keys)}{textures}"
     made = replace(
         plan,
         problem=problem,
-        estimator=HybridGradient(
-            plan.estimator, estimator, keys, wait=constants.block_wait, every=every, eliminated=eliminated
-        ),
-        optimizer=Partitioned(keys, _optimizer(traits, keys), plan.optimizer),
+        estimator=HybridGradient(plan.estimator, estimator, keys, wait=wait, every=every, eliminated=eliminated),
+        optimizer=Partitioned(keys, optimizer, plan.optimizer),
         reasons=(reason, *plan.reasons),
     )
     return best_start(traits, keys, made)
@@ -173,12 +174,13 @@ def _explained(first: Tree, problem: Problem, estimator: GaussNewton) -> float:
 
 
 def _eliminated(traits: Traits, keys: tuple[str, ...], plan: Plan) -> tuple[str, ...]:
-    """Return the textures that a block of lights eliminates: reflectances and radiances, in their own coordinates and without a prior.
+    """Return the textures that a block of lights, cameras and lenses eliminates: reflectances and radiances, in their own coordinates and
+    without a prior.
 
     Poses of shapes are visible in edges, which textures hardly explain.
     """
     unknowns, elements = plan.configured().unknowns, _elements(traits, keys)
-    if not all(traits.infos[key].light for key in keys):
+    if not all(traits.infos[key].light or traits.infos[key].viewpoint for key in keys):
         return ()
     return tuple(
         key
@@ -213,7 +215,7 @@ def _few(traits: Traits, keys: tuple[str, ...]) -> bool:
     constants, shapes, elements = traits.constants, traits.problem.shapes(), _elements(traits, keys)
     small = all(len(shapes[key]) <= 1 and math.prod(shapes[key]) <= constants.number_size for key in keys)
     infos = [traits.infos[key] for key in keys]
-    reached = all(info.perturbable and not (info.rigid and info.viewpoint) for info in infos)
+    reached = all(info.perturbable for info in infos)
     without_paths = any(info.light and info.rigid and not info.differentiable for info in infos)
     most = constants.moved_lights if without_paths else constants.few_numbers
     costly = elements > most or elements * traits.problem.pixels > 8 * constants.difference_paths
@@ -235,11 +237,12 @@ def _estimator(traits: Traits, keys: tuple[str, ...], images: float) -> GaussNew
     spp = traits.options.spp or sampling.within(constants.number_spp, paths)
     side = min(min(size) for size in problem.sizes)
     reach = constants.pose_reach if poses else constants.light_reach
+    shift = constants.camera_shift if any(traits.infos[key].viewpoint for key in poses) else constants.pose_shift
     return GaussNewton(
         max(spp, 2),
         differences,
         tolerance=_damping(traits),
-        coarse=max(constants.pose_shift * side, 1.0) if poses else None,
+        coarse=max(shift * side, 1.0) if poses else None,
         largest={key: reach * width for key, width in widths_of(traits.options.sigma, problem, moved).items()},
         noise_limit=None if poses else constants.noise_limit,
     )
@@ -250,6 +253,11 @@ def _optimizer(traits: Traits, keys: tuple[str, ...]) -> AveragedNewton:
     if _moves_shapes(traits, keys):
         return AveragedNewton(averaging=traits.constants.pose_averaging, linear=linear)
     return AveragedNewton(settled_averaging=traits.constants.number_averaging, linear=linear)
+
+
+def _is_shape(traits: Traits, key: str) -> bool:
+    info = traits.infos[key]
+    return info.rigid and not (info.light or info.viewpoint)
 
 
 def _moves_shapes(traits: Traits, keys: tuple[str, ...]) -> bool:
