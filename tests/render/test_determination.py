@@ -11,9 +11,13 @@ import pytest
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.app import report
-from unrender.runs.determination import common_factor, undetermined, undetermined_cells
+from unrender.core.errors import InputError
+from unrender.rendering.renderer import ReplacedMesh
+from unrender.runs import determination
+from unrender.runs.determination import common_factor, undetermined, undetermined_cells, with_lost
 from unrender.runs.final_images import render_final_images
 from unrender.runs.least_squares import checked_keys
+from unrender.runs.refinement import remeshed
 from unrender.runs.result import Result
 from unrender.runs.verification import LOST, fit_status
 
@@ -247,3 +251,29 @@ def test_a_ball_that_ends_outside_of_the_picture_does_not_fit(end: list[float], 
     assert (found.misfit is not None and found.misfit.causes == (LOST,)) is is_lost
     assert fit_status(made, "finished", found.misfit, few=False) == ("does not fit" if is_lost else "finished")
     assert (found.misfit is not None) is any(end)
+
+
+def test_unknowns_beside_a_remeshed_mesh_are_not_tested_for_loss():
+    """Its initial values are those of another mesh."""
+    positions = "body.vertex_positions"
+    made = problem(scene(GREY, body={"type": "cube"}), positions, COLOUR)
+    vertices = np.array([[0, 0, 0.5], [1, 0, 0.5], [0, 1, 0.5]], np.float32)
+    moved = remeshed(made, {positions: ReplacedMesh(vertices, np.array([[0, 1, 2]]), vertices[:, :2])})
+    result = Result(
+        moved.initial_values(), made.initial_values(), [{}], 1.0, 0.0, "steps", verification={"best": "end"}
+    )
+    ends = [(np.zeros((SIZE, SIZE, 3), np.float32),) * 2]
+    assert with_lost(moved, result, None, [COLOUR], ends, 4, 4) is None
+
+
+def test_unknowns_with_values_that_the_renderer_rejects_are_not_lost(monkeypatch: pytest.MonkeyPatch):
+    made = problem(scene(GREY), COLOUR)
+    values = {COLOUR: np.full(3, 0.9, np.float32)}
+    result = Result(values, made.initial_values(), [{}], 1.0, 0.0, "steps", verification={"best": "end"})
+    ends = [(np.zeros((SIZE, SIZE, 3), np.float32),) * 2]
+
+    def reject(*_: object):
+        raise InputError("rejected")
+
+    monkeypatch.setattr(determination, "change_of_images", reject)
+    assert with_lost(made, result, None, [COLOUR], ends, 4, 4) is None

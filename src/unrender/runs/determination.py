@@ -301,16 +301,20 @@ def with_lost(
         ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
         spp, per_pass: see `change_of_images`.
     """
-    if not keys or len(ends[0]) < 2 or result.verification.get("best") != "end":
+    remeshed = problem.remeshed_from is not None  # the initial values are then those of another mesh
+    if not keys or remeshed or len(ends[0]) < 2 or result.verification.get("best") != "end":
         return difference
     residuals, references, weights, _ = residuals_of_views(problem, range(len(ends)), ends)
     products = (residuals[0::2].mean(axis=0) * residuals[1::2].mean(axis=0)).sum(axis=1)
     left = max(float(products @ weights) / max(3.0 * float(weights.sum()), 1e-300), 0.0)
     start, end, lost = result.initial, result.parameters, []
     for key in keys:
-        seen = change_of_images(problem, start, {**start, key: end[key]}, spp, per_pass)
         near = {**end, key: changed(problem, key, end[key], np.ones(end[key].shape))}
-        hidden = change_of_images(problem, end, near, spp, per_pass).is_below(_GONE, seen.square)
+        try:
+            seen = change_of_images(problem, start, {**start, key: end[key]}, spp, per_pass)
+            hidden = change_of_images(problem, end, near, spp, per_pass).is_below(_GONE, seen.square)
+        except InputError:  # the renderer rejects a value
+            continue
         lost += [key] * (hidden and seen.is_above(_LEAST) and left > _OF_LOST**2 * seen.square)
     if not lost:
         return difference
