@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +16,6 @@ from unrender.methods.plan import Plan
 from unrender.methods.rules import starts
 from unrender.methods.rules.brightness import start_factors
 from unrender.methods.rules.constants import CONSTANTS
-from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.optimize import optimize
 from unrender.runs.reopen import resume
 from unrender.scene.parameter import Parameter
@@ -261,9 +259,29 @@ def test_places_of_a_shape_share_launches(shape: tuple[int, int], views: int, mo
 
 
 @pytest.mark.parametrize(
-    ("other", "told"), [("fill.rotation.x", True), ("fill.rotation.y", False), ("box.rotation.x", False)]
+    ("other", "light", "told"),
+    [
+        ("fill.rotation.x", 1.0, True),
+        ("fill.rotation.x", 2.0, False),
+        ("fill.rotation.y", 1.0, False),
+        ("lamp.rotation.y", 1.0, False),
+        ("box.rotation.x", 1.0, False),
+    ],
 )
-def test_lights_that_may_be_exchanged_have_a_line(other: str, told: bool) -> None:
-    infos = {key: ParameterInfo((), rigid=True, light="box" not in key) for key in ("lamp.rotation.x", other)}
-    found = starts.exchangeable(cast(Any, SimpleNamespace(poses=list(infos), infos=infos)))
-    assert [line.startswith("lamp, fill may end in each other's place") for line in found] == [True] * told
+def test_lights_that_may_be_exchanged_have_a_line(
+    other: str, light: float, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lights of other colours, other unknown coordinates, or a single one, are not exchanged."""
+    values = {"lamp.intensity": np.ones(1), "fill.intensity": np.full(1, light)}
+    poses = {f"{name}.rotation.{axis}": np.zeros(1) for name in ("lamp", "fill", "box") for axis in "xy"}
+    renderer = AnalyticRenderer({**values, **poses}, np.zeros((48, 8)))
+    known = {
+        key: dataclasses.replace(
+            info, rigid=key in poses, light="box" not in key, brightness="light" if key in values else ""
+        )
+        for key, info in renderer.parameters().items()
+    }
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda self: known)
+    unknown = [Parameter("lamp.rotation.x"), Parameter(other)]
+    scene = Problem(renderer, unknown, [View(np.zeros((4, 4, 3)))])
+    assert starts.exchangeable_lights(scene) == (["lamp", "fill"] if told else [])

@@ -13,6 +13,7 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
+from unrender.methods.rules.starts import exchangeable_lights
 from unrender.runs.folder.schema import MISFIT
 from unrender.runs.folder.state import parts
 from unrender.scene.problem import Problem
@@ -186,7 +187,7 @@ def misfit_of_numbers(
     if difference.by_pixel:
         noise = "this picture's noise does not explain: the references are noisy, or"
     words, causes = prior_cause(problem)
-    words += "two lights are in each other's place, or " if lights and len(infos) > 1 else ""
+    words += "two lights are in each other's place, or " if exchangeable_lights(problem) else ""
     explanation = (
         f", which {noise} {words}the run needs more steps, another start or other bounds, or something that is not among the unknowns is "
         "wrong; hence no standard errors"
@@ -234,7 +235,7 @@ def fit_status(problem: Problem, status: str, difference: Misfit | None, few: bo
     """Return the status of a run that used up its budget: "does not fit" for a finished one that differs from its references for certain.
 
     Differences that more steps, a weaker prior or less noise in the references may explain do not change the status. Without a known
-    truth, neither do those below a quarter of the picture.
+    truth, neither do those below a quarter of the picture. An unknown that the pictures have lost always changes it.
 
     Args:
         status: status without the warnings.

@@ -85,19 +85,34 @@ def best_start(traits: Traits, keys: Sequence[str], plan: Plan, plateau: bool = 
 
 
 def exchangeable(traits: Traits) -> list[str]:
-    """Return a line about lights whose poses have the same unknown coordinates; [] for none.
+    """Return a line about lights that may end in each other's place; [] for none.
 
-    A descent may end with two of them in each other's place. The loss there may exceed that of the truth by less than noise, so pictures of
-    other starts do not tell (`shapes.lights`).
+    The loss there may exceed that of the truth by less than noise, so pictures of other starts do not tell (`shapes.lights`).
     """
-    lights: dict[str, list[str]] = {}
-    for key in traits.poses:
-        if traits.infos[key].light:
-            lights.setdefault(_owner(key), []).append(key.removeprefix(_owner(key)))
-    coordinates = [sorted(own) for own in lights.values()]
-    alike = [name for name, own in zip(lights, coordinates, strict=True) if coordinates.count(own) > 1]
     place = "may end in each other's place, where the picture is nearly the same; the start decides"
-    return [f"{listed(alike)} {place}"] if alike else []
+    return [f"{listed(alike)} {place}"] if (alike := exchangeable_lights(traits.problem)) else []
+
+
+def exchangeable_lights(problem: Problem) -> list[str]:
+    """Return the names of lights that another light of the same kind equals but for the unknown coordinates of its pose."""
+    infos = problem.renderer.parameters()
+    poses: dict[str, set[str]] = {}
+    for key in problem.shapes():
+        if infos[key].rigid and infos[key].light:
+            poses.setdefault(_owner(key), set()).add(key.removeprefix(_owner(key)))
+    return [one for one in poses if any(one != other and _alike(problem, one, other, poses) for other in poses)]
+
+
+def _alike(problem: Problem, one: str, other: str, poses: Mapping[str, set[str]]) -> bool:
+    """Return whether two lights have the same unknown coordinates, the same parameters, and equal or unknown light."""
+    infos = problem.renderer.parameters()
+    parts = [{key.removeprefix(name) for key in infos if key.startswith(f"{name}.")} for name in (one, other)]
+    if poses[one] != poses[other] or parts[0] != parts[1]:
+        return False
+    pairs = [(one + part, other + part) for part in parts[0] if infos[one + part].brightness == "light"]
+    fixed = [pair for pair in pairs if not any(key in problem.shapes() for key in pair)]
+    values = problem.renderer.values([key for pair in fixed for key in pair])
+    return all(np.array_equal(np.asarray(values[key]), np.asarray(values[twin])) for key, twin in fixed)
 
 
 def better_place(

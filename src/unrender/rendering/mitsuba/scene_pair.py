@@ -167,7 +167,7 @@ class ScenePair:
         return self._tables
 
     def emitter_tables(self, previous: bool, probabilities: np.ndarray) -> dict[str, Any]:
-        """Return `emitter_tables.emitter_tables`, cached for the last probabilities."""
+        """Return the tables of the emitters (`integrators.emitters`), cached for the last probabilities."""
         known = self._emitters.get(previous)
         if known is None or not np.array_equal(known[0], probabilities):
             tables = emitter_tables(self.loaded(previous).scene, probabilities)
