@@ -441,6 +441,28 @@ def test_beside_a_pose_a_difference_of_a_few_blocks_may_be_the_object(
     assert bool(told_of(made, truth)) is (told or (wrong == "object" and not rigid))
 
 
+@pytest.mark.parametrize("rigid", [False, True])
+def test_a_large_object_whose_pose_is_not_found_is_no_proof_of_wrong_references(
+    rigid: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may belong in more blocks than are left out. A difference that the run has found before says more."""
+    reference = np.array(half_textured().views[0].reference)
+    reference[:32, 20:] += 0.3
+    made = half_textured(reference)
+    known = {key: replace(info, rigid=rigid) for key, info in made.renderer.parameters().items()}
+    monkeypatch.setattr(AnalyticRenderer, "parameters", lambda _: known)
+    truth = np.random.default_rng(0).uniform(0.1, 0.9, 50).astype(np.float32)
+    result = Result({"map": truth}, made.initial_values(), [{}] * 20, 1.0, 0.0, "steps", verification={"best": "end"})
+    differs = final_images.render_final_images(made, result, 64, tested=False).misfit
+    assert differs is not None
+    assert UNCHANGED in differs.line
+    assert ("the pose needs more steps" in differs.line) is rigid
+    assert fit_status(made, "finished", differs, few=False) == ("finished" if rigid else "does not fit")
+    before = replace(differs, explanation=", and may still improve")
+    result = replace(result, misfit=before, warnings=[before.line])
+    assert final_checks.with_misfit(result, differs).warnings == [before.line if rigid else differs.line]
+
+
 @pytest.mark.parametrize(("shift", "std", "is_cause"), [(0.5, 0.2, False), (0.0, 1e-3, True)])
 def test_a_prior_is_the_cause_of_a_difference_only_where_it_pulls(shift: float, std: float, is_cause: bool) -> None:
     """Two references that contradict each other, and a prior that holds the values far from right ones."""

@@ -15,7 +15,7 @@ from unrender.runs.determination import changed
 from unrender.runs.earlier_image import no_improvement
 from unrender.runs.folder.schema import MISFIT
 from unrender.runs.result import Result
-from unrender.runs.verification import PRIOR, Misfit, misfit, residuals_of_views, without_prior
+from unrender.runs.verification import PRIOR, STEPS, Misfit, misfit, residuals_of_views, without_prior
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import mean_square
 
@@ -33,6 +33,8 @@ _FEWEST, _MOST_KEYS = 64, 12
 """Fewest pixels that are judged, and most unknowns that change as a whole."""
 _BLOCK, _ELSEWHERE = 8, 0.25
 """Side of the blocks of pixels, and share of them that does not count beside unknown poses: the object may belong there."""
+_OF_POSE = "the pose needs more steps or another start, or "
+"""Words about the cause that a larger object belongs in these pixels."""
 _LEAST = 0.02
 """Smallest difference relative to these pixels of the references."""
 _SEED = 7
@@ -138,8 +140,11 @@ def differs_still(
 
 
 def with_misfit(result: Result, difference: Misfit | None) -> Result:
-    """Return a result with this difference from the references in place of its own one, also in its warnings; unchanged for None."""
-    if difference is None:
+    """Return a result with this difference from the references in place of its own one, also in its warnings.
+
+    It is unchanged for None, and if it has a difference and more steps may explain the new one.
+    """
+    if difference is None or (result.misfit is not None and difference.causes == (STEPS,)):
         return result
     known = result.misfit.line if result.misfit else ""
     return replace(result, misfit=difference, warnings=[*(x for x in result.warnings if x != known), difference.line])
@@ -170,7 +175,8 @@ def unexplained_pixels(
     A run may be short, so its residual r contains what the unknowns will still explain. Random changes of all elements show which pixels
     depend on them directly. Light that all elements send to the others, such as a wall's to the floor, changes with their mean: what the
     run's own change of the pictures and constant changes of each unknown explain of r is subtracted, by least squares in each channel.
-    A prior holds unknowns far from what the references say, so with one these pixels must differ as much as the others.
+    A prior holds unknowns far from what the references say, so with one these pixels must differ as much as the others. An object whose
+    pose is not found yet may belong in these pixels, so beside a pose, more steps are a cause.
 
     Args:
         result: {key: array} at the end.
@@ -195,7 +201,7 @@ def unexplained_pixels(
     explained += [change({**result, key: changed(problem, key, x, np.ones(x.shape))}) for key, x in result.items()]
     explained += map(change, _pulled(problem, result))
     rest = residuals - _projection(residuals.mean(axis=0), explained, weights)
-    if any(problem.renderer.parameters()[key].rigid for key in problem.unknowns):
+    if moves := any(problem.renderer.parameters()[key].rigid for key in problem.unknowns):
         little = little & _calm(rest.mean(axis=0), weights * little, sizes)
     size, everywhere = (math.sqrt(mean_square(references, of)) for of in (weights * little, weights))
     least = _LEAST * max(1.0, everywhere / max(size, 1e-300))
@@ -210,10 +216,10 @@ def unexplained_pixels(
     cause = cause if shared > _MOSTLY * differs.error else ""
     share = np.count_nonzero(little * weights) / np.count_nonzero(weights)
     explanation = (
-        f" in the {share:.0%} of its pixels that the unknowns hardly change{cause}: light, depth, alignment or something else that is "
-        "not among the unknowns is wrong"
+        f" in the {share:.0%} of its pixels that the unknowns hardly change{cause}: {_OF_POSE if moves else ''}light, depth, alignment or "
+        "something else that is not among the unknowns is wrong"
     )
-    return replace(differs, explanation=explanation)
+    return replace(differs, explanation=explanation, causes=(STEPS,) if moves else ())
 
 
 def _calm(residual: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
