@@ -277,3 +277,24 @@ def test_unknowns_with_values_that_the_renderer_rejects_are_not_lost(monkeypatch
 
     monkeypatch.setattr(determination, "change_of_images", reject)
     assert with_lost(made, result, None, [COLOUR], ends, 4, 4) is None
+
+
+@pytest.mark.parametrize(
+    ("key", "start", "end", "is_lost"),
+    [
+        ("wall.translation", [0.0, 0.0, 0.3], [0.0, 0.0, 1e-4], False),
+        ("wall.rotation.x", 0.5, 1e-3, False),
+        (LIGHT, [6.0, 5.0, 4.0], [1e-3, 1e-3, 1e-3], False),
+        ("wall.translation", [0.0, 0.0, 0.0], [-50.0, -50.0, -50.0], True),
+    ],
+)
+def test_values_that_end_near_0_are_not_lost(
+    key: str, start: list[float] | float, end: list[float] | float, is_lost: bool
+):
+    """A tenth of such a value changes no picture; a step from a place outside of the picture must not lead back to the start."""
+    view = ur.View(np.full((SIZE, SIZE, 3), 0.3, np.float32))
+    made = ur.Problem(scene(GREY), [ur.Parameter(key, initial=start)], [view], max_depth=2)
+    values = {key: np.asarray(end, np.float32)}
+    result = Result(values, made.initial_values(), [{}], 1.0, 0.0, "steps", verification={"best": "end"})
+    found = with_lost(made, result, None, [key], [(np.zeros((SIZE, SIZE, 3), np.float32),) * 2], 64, 16)
+    assert (found is not None) is is_lost

@@ -39,7 +39,7 @@ _SCALE = "scale"
 _ROLES = ("value", "height")
 """Roles of the tested parameters; equal normals or directions are no range."""
 _STEP = 0.1
-"""Change of the parameters, relative to the range between their bounds, or to the root mean square of their values."""
+"""Change of the parameters, relative to the range between their bounds, or to the root mean square of their values or size of a pose."""
 _GONE, _OF_LOST = 0.1, 0.25
 """Change of the images up to which an unknown is no longer seen, and least difference from the references if it is lost, both relative to
 the change from its start to its end."""
@@ -309,7 +309,9 @@ def with_lost(
     left = max(float(products @ weights) / max(3.0 * float(weights.sum()), 1e-300), 0.0)
     start, end, lost = result.initial, result.parameters, []
     for key in keys:
-        near = {**end, key: changed(problem, key, end[key], np.ones(end[key].shape))}
+        path = np.asarray(end[key], np.float64) - start[key]
+        away = np.where(path < 0.0, -1.0, 1.0)  # a step towards the start might end there
+        near = {**end, key: changed(problem, key, end[key], away, least=_root_mean_square(path))}
         try:
             seen = change_of_images(problem, start, {**start, key: end[key]}, spp, per_pass)
             hidden = change_of_images(problem, end, near, spp, per_pass).is_below(_GONE, seen.square)
@@ -326,10 +328,18 @@ def with_lost(
     return replace(difference, explanation=explanation, causes=(LOST,))
 
 
-def changed(problem: Problem, key: str, values: np.ndarray, signs: np.ndarray) -> np.ndarray:
-    """Return values changed by a step times numbers in [-1, 1], whose signs turn where the step would leave the bounds."""
-    low, high = problem.unknowns[key].bounds
-    size = float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))) or 1.0
-    step = _STEP * (size if low is None or high is None else high - low) * signs
+def changed(problem: Problem, key: str, values: np.ndarray, signs: np.ndarray, least: float = 0.0) -> np.ndarray:
+    """Return values changed by a step times numbers in [-1, 1], whose signs turn where the step would leave the bounds.
+
+    `least` is the smallest step of unknowns without bounds. That of poses is at least 0.1 radians, or 0.1 lengths of the object.
+    """
+    (low, high), info = problem.unknowns[key].bounds, problem.renderer.parameters()[key]
+    smallest = (1.0 if info.angle else info.length) if info.rigid else 0.0
+    size = max(_root_mean_square(values), smallest) or 1.0
+    step = signs * (max(_STEP * size, least) if low is None or high is None else _STEP * (high - low))
     outside = values + step != np.asarray(problem.unknowns[key].project(values + step))
     return np.asarray(problem.unknowns[key].project(values + np.where(outside, -step, step)), np.float32)
+
+
+def _root_mean_square(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
