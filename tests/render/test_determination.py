@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import mitsuba as mi
@@ -263,7 +264,7 @@ def test_unknowns_beside_a_remeshed_mesh_are_not_tested_for_loss():
         moved.initial_values(), made.initial_values(), [{}], 1.0, 0.0, "steps", verification={"best": "end"}
     )
     ends = [(np.zeros((SIZE, SIZE, 3), np.float32),) * 2]
-    assert with_lost(moved, result, None, [COLOUR], ends, 4, 4) is None
+    assert with_lost(moved, result, None, [COLOUR], ends, 4) is None
 
 
 def test_unknowns_with_values_that_the_renderer_rejects_are_not_lost(monkeypatch: pytest.MonkeyPatch):
@@ -276,7 +277,7 @@ def test_unknowns_with_values_that_the_renderer_rejects_are_not_lost(monkeypatch
         raise InputError("rejected")
 
     monkeypatch.setattr(determination, "change_of_images", reject)
-    assert with_lost(made, result, None, [COLOUR], ends, 4, 4) is None
+    assert with_lost(made, result, None, [COLOUR], ends, 4) is None
 
 
 @pytest.mark.parametrize(
@@ -296,5 +297,23 @@ def test_values_that_end_near_0_are_not_lost(
     made = ur.Problem(scene(GREY), [ur.Parameter(key, initial=start)], [view], max_depth=2)
     values = {key: np.asarray(end, np.float32)}
     result = Result(values, made.initial_values(), [{}], 1.0, 0.0, "steps", verification={"best": "end"})
-    found = with_lost(made, result, None, [key], [(np.zeros((SIZE, SIZE, 3), np.float32),) * 2], 64, 16)
+    found = with_lost(made, result, None, [key], [(np.zeros((SIZE, SIZE, 3), np.float32),) * 2], 16)
     assert (found is not None) is is_lost
+
+
+@pytest.mark.parametrize(("remaining", "changes"), [(-1.0, 0), (0.01, 2), (np.inf, 4)])
+def test_the_test_of_lost_unknowns_ends_with_the_time(monkeypatch: pytest.MonkeyPatch, remaining: float, changes: int):
+    made = problem(scene(GREY), COLOUR, LIGHT)
+    done: list[int] = []
+
+    def change(*_: object) -> determination.Change:
+        done.append(len(done))
+        time.sleep(0.01)
+        return determination.Change(0.09, 0.0, 0.09)
+
+    monkeypatch.setattr(determination, "change_of_images", change)
+    values = made.initial_values()
+    result = Result(values, values, [{}], 1.0, 0.0, "steps", verification={"best": "end"})
+    ends = [(np.zeros((SIZE, SIZE, 3), np.float32),) * 2]
+    assert with_lost(made, result, None, [COLOUR, LIGHT], ends, 4, lambda: remaining) is None
+    assert len(done) == changes

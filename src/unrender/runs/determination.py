@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -287,8 +287,8 @@ def with_lost(
     difference: Misfit | None,
     keys: Sequence[str],
     ends: Sequence[Sequence[np.ndarray]],
-    spp: int,
-    per_pass: int | None,
+    per_pass: int,
+    remaining: Callable[[], float] = lambda: math.inf,
 ) -> Misfit | None:
     """Return the difference of the final pictures from the references with the cause that unknowns are lost, if so.
 
@@ -299,7 +299,8 @@ def with_lost(
         difference: difference that is known.
         keys: unknowns that the pictures of the end do not determine.
         ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
-        spp, per_pass: see `change_of_images`.
+        per_pass: samples per pixel of each of the four passes of an image.
+        remaining: function that returns the remaining seconds. The test ends before an unknown for which they do not suffice.
     """
     remeshed = problem.remeshed_from is not None  # the initial values are then those of another mesh
     if not keys or remeshed or len(ends[0]) < 2 or result.verification.get("best") != "end":
@@ -307,17 +308,21 @@ def with_lost(
     residuals, references, weights, _ = residuals_of_views(problem, range(len(ends)), ends)
     products = (residuals[0::2].mean(axis=0) * residuals[1::2].mean(axis=0)).sum(axis=1)
     left = max(float(products @ weights) / max(3.0 * float(weights.sum()), 1e-300), 0.0)
-    start, end, lost = result.initial, result.parameters, []
+    start, end, lost, longest, spp = result.initial, result.parameters, [], 0.0, 4 * per_pass
     for key in keys:
-        path = np.asarray(end[key], np.float64) - start[key]
+        if remaining() <= longest:
+            break
+        began, path = time.perf_counter(), np.asarray(end[key], np.float64) - start[key]
         away = np.where(path < 0.0, -1.0, 1.0)  # a step towards the start might end there
         near = {**end, key: changed(problem, key, end[key], away, least=_root_mean_square(path))}
         try:
             seen = change_of_images(problem, start, {**start, key: end[key]}, spp, per_pass)
-            hidden = change_of_images(problem, end, near, spp, per_pass).is_below(_GONE, seen.square)
+            if seen.is_above(_LEAST) and left > _OF_LOST**2 * seen.square:
+                hidden = change_of_images(problem, end, near, spp, per_pass).is_below(_GONE, seen.square)
+                lost += [key] * hidden
         except InputError:  # the renderer rejects a value
             continue
-        lost += [key] * (hidden and seen.is_above(_LEAST) and left > _OF_LOST**2 * seen.square)
+        longest = max(longest, time.perf_counter() - began)
     if not lost:
         return difference
     explanation = (

@@ -154,7 +154,7 @@ def render_final_images(
             lines, warnings, deviations, unseen = _undetermined(
                 problem, result, sensitivities, 0.25 * tests, weights, fits=not differs, complete=complete
             )
-            differs = with_lost(problem, result, differs, unseen, ends, 4 * _pass_spp(problem), _pass_spp(problem))
+            differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
