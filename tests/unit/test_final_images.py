@@ -441,6 +441,20 @@ def test_beside_a_pose_a_difference_of_a_few_blocks_may_be_the_object(
     assert bool(told_of(made, truth)) is (told or (wrong == "object" and not rigid))
 
 
+def test_pixels_of_several_elements_each_are_not_taken_for_unchanged_ones() -> None:
+    """Of four grey elements a pixel, random changes cancel in a third of the pixels."""
+    y, x = np.mgrid[:24, :24]
+    matrix = sum(
+        (2 * y + i)[..., None] * 48 + (2 * x + j)[..., None] == np.arange(48**2) for i in (0, 1) for j in (0, 1)
+    )
+    matrix = np.repeat(matrix.reshape(-1, 1, 48**2) / 4.0, 3, axis=1).reshape(-1, 48**2)  # pyright: ignore[reportAttributeAccessIssue]
+    rng = np.random.default_rng(0)
+    truth = (0.5 + 0.3 * np.sin(np.arange(48) / 5.0) * np.sin(np.arange(48) / 4.0)[:, None]).ravel()
+    renderer = AnalyticRenderer({"map": truth}, matrix, 0.1, noise=0.1, grain=0.1, shape=(24, 24))
+    made = Problem(renderer, [Parameter("map", initial=0.5, bounds=(0, 1))], [View(renderer.exact({"map": truth}))])
+    assert not told_of(made, (0.5 + rng.uniform(0.0, 0.4, 48**2) * (truth - 0.5)).astype(np.float32))
+
+
 @pytest.mark.parametrize("rigid", [False, True])
 def test_a_large_object_whose_pose_is_not_found_is_no_proof_of_wrong_references(
     rigid: bool, monkeypatch: pytest.MonkeyPatch

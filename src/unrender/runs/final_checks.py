@@ -29,6 +29,9 @@ _OF_BIAS = 0.25
 _LITTLE, _OF_PIXEL = 0.1, 0.02
 """Changes of a pixel by random changes of all elements up to which the unknowns hardly change it: relative to the usual one, and relative
 to the pixel."""
+_AROUND, _OF_AROUND = 5, 0.8
+"""Side of the square around such a pixel in which most others must be hardly changed as well, and share of these: random changes of the
+elements in a pixel may cancel."""
 _FEWEST, _MOST_KEYS = 64, 12
 """Fewest pixels that are judged, and most unknowns that change as a whole."""
 _BLOCK, _ELSEWHERE = 8, 0.25
@@ -195,6 +198,7 @@ def unexplained_pixels(
     random = change({key: changed(problem, key, x, signs.choice((-1.0, 1.0), x.shape)) for key, x in result.items()})
     weights = weights * np.isfinite(random).all(axis=1)
     little = _is_little(residuals[0] + references, np.where(weights[:, None] > 0, random, 0.0), weights)
+    little &= _around(little, sizes) >= _OF_AROUND
     if np.count_nonzero(little * weights) < _FEWEST:
         return None
     explained = [_joined([np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)])]
@@ -220,6 +224,16 @@ def unexplained_pixels(
         "something else that is not among the unknowns is wrong"
     )
     return replace(differs, explanation=explanation, causes=(STEPS,) if moves else ())
+
+
+def _around(little: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Return the share (N,) of the pixels around each pixel of all views, itself included, that are among some pixels (N,)."""
+    from scipy.ndimage import uniform_filter  # takes long to import
+
+    parts = np.split(little.astype(np.float64), np.cumsum([height * width for height, width in sizes])[:-1])
+    return np.concatenate(
+        [np.ravel(uniform_filter(x.reshape(of), _AROUND)) for x, of in zip(parts, sizes, strict=True)]
+    )
 
 
 def _calm(residual: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
