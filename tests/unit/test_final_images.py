@@ -25,7 +25,7 @@ from unrender.runs.metadata import RunAnnotations
 from unrender.runs.optimize import optimize
 from unrender.runs.result import Result
 from unrender.runs.run import Run
-from unrender.runs.verification import PRIOR, Misfit, fit_status
+from unrender.runs.verification import PRIOR, STEPS, STEPS_OF_FEW, Misfit, fit_status
 from unrender.scene.parameter import Parameter
 from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
@@ -497,6 +497,23 @@ def test_a_prior_is_the_cause_of_a_difference_only_where_it_pulls(shift: float, 
     assert fit_status(made, "finished", replace(differs, size=1e-9), few=False) == (
         "finished" if is_cause else "does not fit"
     )
+
+
+@pytest.mark.parametrize(
+    ("causes", "stays"), [((PRIOR,), False), ((PRIOR, STEPS_OF_FEW), False), ((PRIOR, STEPS), True)]
+)
+def test_a_prior_stays_a_cause_while_the_loss_may_still_fall(causes: tuple[str, ...], stays: bool) -> None:
+    """What holds a run back is not known before it ends, so a step against the pull explains too little of the difference."""
+    made = textured(0.5, 0.1)
+    values = {"map": np.full(32, 0.45, np.float32)}
+    made = made.replaced(parameters=[Parameter("map", initial=0.5, bounds=(0, 1), prior=Prior(near=0.45, std=0.2))])
+    rng, ends = np.random.default_rng(0), []
+    for view in made.views:
+        reference = np.asarray(view.reference)
+        ends.append([reference + 0.3 + 0.01 * rng.standard_normal(reference.shape) for _ in range(2)])
+    difference = Misfit(0.3, 1.0, 0.0, causes=causes)
+    left = final_checks.beyond_priors(made, difference, values, ends, lambda _, view: ends[view][0])
+    assert (PRIOR in left.causes) is stays
 
 
 @pytest.mark.parametrize("count", [1, 4])
