@@ -252,7 +252,8 @@ def _optimizer(traits: Traits, keys: tuple[str, ...]) -> AveragedNewton:
     linear = tuple(key for key in traits.lights if key in keys)
     if _moves_shapes(traits, keys):
         return AveragedNewton(averaging=traits.constants.pose_averaging, linear=linear)
-    return AveragedNewton(settled_averaging=traits.constants.number_averaging, linear=linear)
+    settles = not any(traits.infos[key].rigid or traits.infos[key].of_expression for key in keys)
+    return AveragedNewton(settled_averaging=traits.constants.number_averaging if settles else None, linear=linear)
 
 
 def _is_shape(traits: Traits, key: str) -> bool:
