@@ -46,6 +46,7 @@ class Partitioned:
     (`HybridGradient` with `GaussNewton`). In steps without a block the scalars do not change.
 
     Args:
+        keys: parameters of the block, by key.
         optimizer: optimizer of `keys`. One that requires more than the gradient uses the block of these keys (`BlockEstimate`).
         others: optimizer of all other parameters; it may require the gradient only.
     """
