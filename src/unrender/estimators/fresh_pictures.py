@@ -147,7 +147,7 @@ class FreshPictures:
             varied: keys of unknowns.
         """
         known = self._problem.renderer.parameters()
-        posed = all(known[key].rigid and not (known[key].light or known[key].viewpoint) for key in varied)
+        posed = all(known[key].shape_pose for key in varied)
         if self.sampled or self._parts > 1 or not posed:
             return [self.images(state) for state in states]
         images_by_state: list[list[np.ndarray]] = []

@@ -23,7 +23,7 @@ Space = Literal["path", "primary"]
 """Sample space that two states share: "path" for one set of paths, "primary" for one set of random numbers."""
 
 Derivatives = bool | AbstractSet[str]
-"""Whether derivatives will be requested, or the keys that they will be requested for."""
+"""Whether derivatives will be requested, or the keys of the parameters whose derivatives will be."""
 LossWeights = Callable[[Array], Array]
 """Function from an image (H, W, 3) to the derivative of the loss by each of its elements."""
 
@@ -89,6 +89,11 @@ class ParameterInfo:
         Those that expressions read count as such.
         """
         return self.of_expression or (self.resizable and not self.brightness)
+
+    @property
+    def shape_pose(self) -> bool:
+        """True for a coordinate of the pose of a shape that is no light."""
+        return self.rigid and not (self.light or self.viewpoint)
 
     @property
     def moving_mesh(self) -> Callable[[], tuple[np.ndarray, np.ndarray]] | None:

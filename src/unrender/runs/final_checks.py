@@ -17,7 +17,7 @@ from unrender.runs.folder.schema import MISFIT
 from unrender.runs.result import Result
 from unrender.runs.verification import PRIOR, STEPS, Misfit, misfit, residuals_of_views, without_prior
 from unrender.scene.problem import Problem
-from unrender.statistics.paired_losses import mean_square
+from unrender.statistics.paired_losses import mean_square, slices_of_images
 
 _ERRORS, _ERRORS_OF_RISE, _OF_START, _OF_PICTURE = 2.0, 4.0, 0.2, 1e-4
 """Standard errors by which a verified loss must have fallen to be lower; those by which final images must be worse than the initial ones,
@@ -230,19 +230,17 @@ def _around(little: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
     """Return the share (N,) of the pixels around each pixel of all views, itself included, that are among some pixels (N,)."""
     from scipy.ndimage import uniform_filter  # takes long to import
 
-    parts = np.split(little.astype(np.float64), np.cumsum([height * width for height, width in sizes])[:-1])
-    return np.concatenate(
-        [np.ravel(uniform_filter(x.reshape(of), _AROUND)) for x, of in zip(parts, sizes, strict=True)]
-    )
+    images = [little[part].reshape(size) for part, size in zip(slices_of_images(sizes), sizes, strict=True)]
+    return np.concatenate([np.ravel(uniform_filter(image.astype(np.float64), _AROUND)) for image in images])
 
 
 def _calm(residual: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
     """Return the pixels (N,) of all blocks but those where a residual (N, 3) is largest."""
-    blocks, first, start = np.zeros(len(residual), np.int64), 0, 0
-    for height, width in sizes:
+    blocks, first = np.zeros(len(residual), np.int64), 0
+    for part, (height, width) in zip(slices_of_images(sizes), sizes, strict=True):
         y, x = np.mgrid[:height, :width] // _BLOCK
-        blocks[start : start + height * width] = first + np.ravel(y * (width // _BLOCK + 1) + x)
-        start, first = start + height * width, first + (height // _BLOCK + 1) * (width // _BLOCK + 1)
+        blocks[part] = first + np.ravel(y * (width // _BLOCK + 1) + x)
+        first += (height // _BLOCK + 1) * (width // _BLOCK + 1)
     counts = np.bincount(blocks, weights, first)
     sums = np.stack([np.bincount(blocks, weights * channel, first) for channel in residual.T], axis=1)
     means = np.square(sums / np.maximum(counts, 1e-300)[:, None]).sum(axis=1)
@@ -300,17 +298,15 @@ def _as_if(
     fitted by changes of the second half, whose noise is independent of it. Rare bright samples leave most pixels too dark, so another
     brightness proves nothing, nor does a fit below the noise of a half in the same pixels.
     """
-    cause, shared, sure, total, start = "", 0.0, False, max(float(weights.sum()) * 3, 1e-300), 0
+    cause, shared, sure, total = "", 0.0, False, max(float(weights.sum()) * 3, 1e-300)
     one, other = residuals[0::2].mean(axis=0), residuals[1::2].mean(axis=0)
-    for view, (height, width) in enumerate(sizes):
-        part = slice(start, start + height * width)
-        start += height * width
+    for view, part in enumerate(slices_of_images(sizes)):
         root = np.sqrt(weights[part])[:, None]
         if np.count_nonzero(root) < _FEWEST:
             continue
         wanted, again = (np.ravel(half[part] * root) for half in (one, other))
         noise, best, explained = np.square(wanted - again) / 2.0, "", {}
-        distortions = _distortions(images[1::2, part].mean(axis=0).reshape(height, width, 3))
+        distortions = _distortions(images[1::2, part].mean(axis=0).reshape(*sizes[view], 3))
         for index, (words, changes) in enumerate(distortions.items()):
             columns = np.stack([np.ravel(change.reshape(-1, 3) * root) for change in changes], axis=1)
             inverse = np.linalg.pinv(columns.T @ columns, hermitian=True)

@@ -14,6 +14,7 @@ from unrender.rendering.renderer import RenderSession, SampleRequest
 from unrender.runs.image_sensitivity import mask_roots
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, selected_views
+from unrender.statistics.paired_losses import slices_of_images
 
 MOST_ELEMENTS, _MOST_OF_ONE = 24, 4
 """Elements of all numbers up to which they are tested; elements of a number or colour; longer lists are left out first."""
@@ -212,9 +213,8 @@ class Numbers:
     def by_view(self, pictures: np.ndarray) -> list[np.ndarray]:
         """Return pictures (k, P, 3) of all views as (k, H, W, 3) of each view."""
         sizes = [self.problem.sizes[view] for view in self.views]
-        ends = np.cumsum([height * width for height, width in sizes])[:-1]
-        parts = np.split(pictures, ends, axis=1)
-        return [part.reshape(len(pictures), *size, 3) for part, size in zip(parts, sizes, strict=True)]
+        parts = zip(slices_of_images(sizes), sizes, strict=True)
+        return [pictures[:, part].reshape(len(pictures), *size, 3) for part, size in parts]
 
     def references(self) -> np.ndarray:
         """Return the references (P, 3) with the roots of the pixels' weights."""

@@ -121,6 +121,12 @@ def mean_square(values: np.ndarray, weights: np.ndarray) -> float:
     return total / max(float(weights.sum()) * values.shape[1], 1e-300)
 
 
+def slices_of_images(sizes: Sequence[tuple[int, int]]) -> list[slice]:
+    """Return the slice of each image, of height and width, in an array of the pixels of all."""
+    ends = np.cumsum([height * width for height, width in sizes], dtype=np.int64).tolist()
+    return [slice(end - height * width, end) for end, (height, width) in zip(ends, sizes, strict=True)]
+
+
 def repeated(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> SystematicDifference:
     """Return the part of two pictures' differences from one reference that both share, pixel by pixel.
 
@@ -263,15 +269,13 @@ def nearby(
 
 def _shared_with_neighbours(values: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
     """Return the pixels (N,) of which two at a distance of 2 have at least half the value (N,), with the same sign."""
-    shared, start = np.zeros(len(values), np.int64), 0
-    for height, width in sizes:
-        part = slice(start, start + height * width)
-        image, found = values[part].reshape(height, width), shared[part].reshape(height, width)
+    shared = np.zeros(len(values), np.int64)
+    for part, size in zip(slices_of_images(sizes), sizes, strict=True):
+        image, found = (of[part].reshape(size) for of in (values, shared))
         for axis in (0, 1):
             here, there = (of.swapaxes(0, axis) for of in (image, found))
             for one, other in ((slice(DISTANCE, None), slice(-DISTANCE)), (slice(-DISTANCE), slice(DISTANCE, None))):
                 there[one] += here[one] * here[other] >= 0.5 * np.square(here[one])
-        start += height * width
     return (shared > 1) & (values != 0)
 
 
@@ -280,9 +284,6 @@ def _pairs(values: np.ndarray, sizes: Sequence[tuple[int, int]], axis: int) -> l
     if not sizes:
         pairs = values[: len(values) // 4 * 4].reshape(-1, 2, 2, values.shape[1])[:, 1 - axis]
         return [(pairs[:, 0], pairs[:, 1])]
-    images, start = [], 0
-    for height, width in sizes:
-        image = values[start : start + height * width].reshape(height, width, -1).swapaxes(0, axis)
-        images.append((image[:-DISTANCE], image[DISTANCE:]))
-        start += height * width
-    return images
+    parts = zip(slices_of_images(sizes), sizes, strict=True)
+    images = [values[part].reshape(*size, -1).swapaxes(0, axis) for part, size in parts]
+    return [(image[:-DISTANCE], image[DISTANCE:]) for image in images]

@@ -18,7 +18,7 @@ from unrender.losses import Loss
 from unrender.rendering.photographs import OF_PHOTOGRAPHS, member_values, scene_renderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
 from unrender.rendering.worlds import WorldsRenderer
-from unrender.rendering.wrapper import RendererWrapper
+from unrender.rendering.wrapper import layers
 from unrender.scene.coarse_to_fine import NEVER, CoarseToFine
 from unrender.scene.parameter import Parameter, ties_of
 from unrender.scene.problem import Problem
@@ -140,12 +140,10 @@ class StagedProblem:
 
 def _keys_of_scene(problem: Problem, view: int) -> frozenset[str]:
     """Return the keys of the parameters of a view's own scene; empty for the problem's scene."""
-    renderer = problem.renderer
-    while isinstance(renderer, RendererWrapper) and not isinstance(renderer, WorldsRenderer):
-        renderer = renderer.inner
-    if problem.original_views[view].scene is None or not isinstance(renderer, WorldsRenderer):
+    worlds = next((layer for layer in layers(problem.renderer) if isinstance(layer, WorldsRenderer)), None)
+    if problem.original_views[view].scene is None or worlds is None:
         return frozenset()
-    return frozenset(renderer.renderer_of(problem.views[view].sensor).parameters())
+    return frozenset(worlds.renderer_of(problem.views[view].sensor).parameters())
 
 
 def _differs(renderer: Renderer, key: str, initial: np.ndarray) -> bool:

@@ -130,7 +130,7 @@ def with_separate_block(traits: Traits, keys: tuple[str, ...], plan: Plan) -> Pl
     traced = images * estimator.derivative_spp + estimator.spp
     every = sampling.within((1, constants.block_every), round(traced / (constants.path_cost * plan.estimator.spp)))
     # A texture that is fitted to a picture of a wrong lamp, lens or camera takes over its error.
-    wait = constants.block_wait if any(_is_shape(traits, key) for key in keys) else 0
+    wait = constants.block_wait if any(traits.infos[key].shape_pose for key in keys) else 0
     optimizer = _optimizer(traits, keys)
     if any(traits.infos[key].rigid and traits.infos[key].viewpoint for key in keys):
         optimizer, every = replace(optimizer, trust_radius=constants.camera_trust), 1
@@ -254,11 +254,6 @@ def _optimizer(traits: Traits, keys: tuple[str, ...]) -> AveragedNewton:
         return AveragedNewton(averaging=traits.constants.pose_averaging, linear=linear)
     settles = not any(traits.infos[key].rigid or traits.infos[key].of_expression for key in keys)
     return AveragedNewton(settled_averaging=traits.constants.number_averaging if settles else None, linear=linear)
-
-
-def _is_shape(traits: Traits, key: str) -> bool:
-    info = traits.infos[key]
-    return info.rigid and not (info.light or info.viewpoint)
 
 
 def _moves_shapes(traits: Traits, keys: tuple[str, ...]) -> bool:

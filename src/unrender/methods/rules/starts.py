@@ -279,9 +279,7 @@ def _dimensions(problem: Problem, key: str) -> int:
 
 
 def _is_shape(problem: Problem, key: str) -> bool:
-    """Return whether a key moves a shape that emits no light."""
-    info = problem.renderer.parameters()[key]
-    return info.rigid and not info.light and not info.viewpoint
+    return problem.renderer.parameters()[key].shape_pose
 
 
 def _groups(problem: Problem, keys: Sequence[str]) -> list[list[str]]:
