@@ -7,6 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 import kernels
 import unrender as ur
@@ -14,8 +15,8 @@ from tests.analytic import AnalyticRenderer
 from unrender.core import trees
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capability, Hessian, HessianProduct, LossFunction, Smoothing
-from unrender.optimizers import CMAES, LBFGS, Adam, Newton, NewtonCG
+from unrender.estimators.capabilities import AtBounds, Capability, Hessian, HessianProduct, LossFunction, Smoothing
+from unrender.optimizers import CMAES, LBFGS, Adam, AveragedNewton, Newton, NewtonCG
 from unrender.optimizers.cma_es import CMAESState
 from unrender.schedules import Constant, Exponential
 
@@ -674,3 +675,45 @@ def test_trust_regions_are_as_wide_as_the_smoothing(optimizer):
         reach = np.linalg.norm(step / np.array([sigma["a"], sigma["a"], sigma["b"]]))
         assert reach == pytest.approx(0.05 if isinstance(optimizer, LBFGS) else 0.5)
     assert np.linalg.norm(first(None)) == pytest.approx(0.05 if isinstance(optimizer, LBFGS) else 0.5)
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        Newton(trust_radius=2.0, damping=1e-3),
+        NewtonCG(trust_radius=2.0, iterations=8, damping=1e-3, tolerance=1e-3),
+        LBFGS(trust_radius=2.0),
+        AveragedNewton(),
+    ],
+    ids=lambda optimizer: type(optimizer).__name__,
+)
+@pytest.mark.parametrize("known", [True, False])
+def test_bounded_elements_do_not_lead_the_others_astray(optimizer: Any, known: bool) -> None:
+    """Half of eight correlated elements are at bounds where the loss is least. The planted fault leaves these unknown."""
+    rng = np.random.default_rng(0)
+    matrix = rng.normal(size=(40, 8))
+    matrix[:, 1:] += 0.8 * matrix[:, :1]
+    hessian, minimum = matrix.T @ matrix / 40, rng.uniform(-0.6, 1.6, 8)
+    root = np.linalg.cholesky(hessian).T
+    expected = lsq_linear(root, root @ minimum, (0.0, 1.0)).x
+    x = np.full(8, 0.5)
+    state = optimizer.init({"x": x})
+    for _ in range(60):
+        at = AtBounds(lambda x=x: {"x": (x >= 1.0).astype(float) - (x <= 0.0)})
+        curvature = Hessian(hessian), HessianProduct(lambda v: {"x": hessian @ v["x"]})
+        estimate = Estimate(0.0, {"x": hessian @ (x - minimum)}, (*curvature, *([at] if known else [])))
+        step, state = optimizer.update(estimate, state, {"x": x})
+        x = np.clip(x + step["x"], 0.0, 1.0)
+    assert bool(np.abs(x - expected).max() < 1e-3) is known
+
+
+def test_the_loop_tells_optimizers_which_elements_are_at_their_bounds() -> None:
+    """Two numbers with nearly the same picture, whose minimum without bounds is far outside."""
+    matrix = np.random.default_rng(0).uniform(size=(48, 1)) * [1.0, 0.8] + 0.1 * np.eye(48, 2)
+    renderer = AnalyticRenderer({"a": np.array([-1.0]), "b": np.array([1.5])}, matrix, 0.0, 0.0)
+    reference = renderer.exact({"a": np.array([-1.0]), "b": np.array([1.5])})
+    problem = ur.Problem(renderer, [ur.Parameter("a", 0.5, (0, 1)), ur.Parameter("b", 0.5)], [ur.View(reference)])
+    best = matrix[:, 1] @ reference.ravel() / (matrix[:, 1] @ matrix[:, 1])
+    result = ur.optimize(problem, ur.GaussNewton(2, 2), AveragedNewton(), steps=9)
+    assert result.parameters["a"] == pytest.approx([1e-4], abs=1e-6)
+    assert result.parameters["b"] == pytest.approx([best], abs=1e-3)

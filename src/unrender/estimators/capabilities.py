@@ -154,6 +154,19 @@ class Smoothing(Capability):
 
 
 @dataclass(frozen=True)
+class AtBounds(Capability):
+    """Elements at a bound, which the loop adds for the optimizer.
+
+    Attributes:
+        sides: function that returns {key: array}, with the parameters' keys, shapes and types: -1 at the lower bound, 1 at the upper one,
+            0 elsewhere, and for parameters with a preconditioner, whose steps have other coordinates.
+    """
+
+    name: ClassVar[str] = "at_bounds"
+    sides: Callable[[], Tree]
+
+
+@dataclass(frozen=True)
 class DerivativeImages(Capability):
     """Derivative images of every element, by view. They are total derivatives where other parameters are eliminated.
 

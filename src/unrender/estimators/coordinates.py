@@ -13,6 +13,7 @@ from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
+    AtBounds,
     BlockEstimate,
     Capability,
     FreshGradient,
@@ -36,10 +37,10 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
 
     J is the diagonal matrix of φ'. Gradients become S J g, variances J² Var (a variance per element cannot be mapped by S). Second
     derivatives are exact, J H J + diag(g φ''), and the loss becomes a function of u. The σ of smoothed derivatives refers to x and is
-    converted for each element of u, see `_width`.
+    converted for each element of u, see `_width`. `AtBounds` is added.
     """
-    if estimate.preconditioned:
-        return estimate
+    if estimate.preconditioned:  # by an estimator with a state in these coordinates
+        return _bounded(estimate, problem, parameters)
     coordinates = problem.coordinates
     slopes = coordinates.slopes(parameters)
 
@@ -52,12 +53,25 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
 
     gradient = coordinates.pull_back(estimate.gradient, slopes)
     capabilities = tuple(converted(capability) for capability in estimate.capabilities)
-    return replace(estimate, gradient=gradient, capabilities=capabilities, preconditioned=True)
+    mapped = replace(estimate, gradient=gradient, capabilities=capabilities, preconditioned=True)
+    return _bounded(mapped, problem, parameters)
 
 
 def restricted(problem: Problem, keys: Sequence[str]) -> Problem:
     """Return the problem with these unknowns only."""
     return problem.with_parts(unknowns={key: problem.unknowns[key] for key in keys})
+
+
+def _bounded(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
+    """Return the estimate with the bounds that parameters have reached, see `AtBounds`."""
+    if estimate.get(AtBounds) is not None:
+        return estimate
+
+    def sides() -> Tree:
+        smooth, unknowns = problem.coordinates.preconditioners, problem.unknowns
+        return {k: arrays.zeros_like(x) if k in smooth else unknowns[k].sides(x) for k, x in parameters.items()}
+
+    return replace(estimate, capabilities=(*estimate.capabilities, AtBounds(sides)))
 
 
 def _block(block: BlockEstimate, problem: Problem, parameters: Tree) -> BlockEstimate:

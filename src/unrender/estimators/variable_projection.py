@@ -65,9 +65,8 @@ class Response:
         """Return the response with texels fixed at their bounds, where a gradient of the loss remains."""
         slopes = {}
         for key, own in self.slopes.items():
-            value, project = arrays.numpy(parameters[key]), problem.unknowns[key].project
-            low, high = (project(np.full_like(value, end)) for end in (-np.inf, np.inf))
-            slopes[key] = np.where((value > low) & (value < high), own, np.float32(0.0))
+            sides = problem.unknowns[key].sides(arrays.numpy(parameters[key]))
+            slopes[key] = np.where(sides == 0.0, own, np.float32(0.0))
         return replace(self, slopes=slopes)
 
     def upsampled(self, upsampler: Upsampler) -> Response:

@@ -23,7 +23,7 @@ from unrender.estimators.capabilities import (
     ScoreCovariance,
 )
 from unrender.optimizers import rates
-from unrender.optimizers.directions import coordinate_scales
+from unrender.optimizers.directions import coordinate_scales, sides_of_bounds
 from unrender.optimizers.newton import trust_region_step
 from unrender.optimizers.transforms.base import checked_keys
 from unrender.statistics.scores import positive_part, scaled_eigh
@@ -40,8 +40,6 @@ is 1, so noise alone neither closes the region nor opens it."""
 _LEAST_NOISE, _SURPRISE_ERRORS = 1e-6, 6.0
 """Relative eigenvalue of the gradient's noise below which a direction has none, and standard errors of a mean square of 1 that noise may
 reach."""
-_STOPPED = 1e-3
-"""Smallest miss of a step's end, relative to the step, that counts as a bound."""
 _WEAK_SHARE = 0.01
 """Squared share of an element in damped directions above which its standard error is infinite."""
 _OF_LINEAR = 1e4
@@ -67,7 +65,6 @@ class AveragedNewtonState:
             the model's gradient and that of the previous mean.
         radii: radius of the trust region of each element, (n,), in its units; 0 without a limit.
         step: last step, in units of the parameters, (n,).
-        end: planned parameters after the last step, (n,). The parameters differ from it where their bounds are.
         scores: latest covariance of the gradient from the references' noise, (n, n), see `ScoreCovariance`; None if it is unknown.
     """
 
@@ -82,7 +79,6 @@ class AveragedNewtonState:
     scatter: np.ndarray
     radii: np.ndarray
     step: np.ndarray
-    end: np.ndarray
     scores: np.ndarray | None
 
 
@@ -157,7 +153,7 @@ class AveragedNewton:
         n = trees.ravel(parameters).size
         square, row = np.zeros((n, n)), np.zeros(n)
         radii = np.full(n, self.trust_radius or 0.0)
-        return AveragedNewtonState(own, square, row, square, square, row, row, row, square, radii, row, row, None)
+        return AveragedNewtonState(own, square, row, square, square, row, row, row, square, radii, row, None)
 
     def update(
         self, estimate: Estimate, state: AveragedNewtonState, parameters: Tree
@@ -179,7 +175,7 @@ class AveragedNewton:
         noise, gradient_noise = state.noise.copy(), state.gradient_noise.copy()
         shares, counts = state.shares.copy(), state.counts.copy()
         lengths, scatter, radii = np.zeros_like(x), state.scatter.copy(), state.radii.copy()
-        outwards = _outwards(state, x)
+        outwards = sides_of_bounds(estimate, parameters)
         for block in _blocks((matrix != 0.0) | (hessian != 0.0)):
             both = np.ix_(block, block)
             news = gradient[block] - (matrix[both] @ x[block] - target[block])
@@ -207,8 +203,7 @@ class AveragedNewton:
             )
             lengths[block] = _length(x[block], step[block], scale[block], own > scale[block])
         return trees.unravel(step, parameters), AveragedNewtonState(
-            state.learning_rates, matrix, target, noise, gradient_noise, shares, counts, lengths, scatter, radii, step, x + step,
-            scores,
+            state.learning_rates, matrix, target, noise, gradient_noise, shares, counts, lengths, scatter, radii, step, scores,
         )  # fmt: skip
 
     def averages(self, keys: Iterable[str]) -> frozenset[str]:
@@ -337,17 +332,6 @@ def _finite(capability: GradientNoise | HessianNoise | ScoreCovariance | None) -
         return None
     matrix = arrays.numpy(capability.matrix).astype(np.float64)
     return matrix if np.isfinite(matrix).all() else None
-
-
-def _outwards(state: AveragedNewtonState, x: np.ndarray) -> np.ndarray:
-    """Return the directions, -1 or 1, in which bounds stopped the last step, and 0 for elements that they did not stop, (n,).
-
-    If all elements missed the end, the step was not taken, and no other element could make up for the bounds.
-    """
-    missed, step = state.end - x, state.step
-    rounding = 4.0 * float(np.finfo(np.float32).eps) * np.abs(x)
-    stopped = (np.abs(missed) > np.maximum(_STOPPED * np.abs(step), rounding)) & (missed * step > 0.0)
-    return np.where(stopped & ~stopped[step != 0.0].all(), np.sign(missed), 0.0)
 
 
 def _blocks(connected: np.ndarray) -> list[np.ndarray]:

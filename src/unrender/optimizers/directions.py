@@ -15,7 +15,7 @@ from unrender.core import arrays, checks, trees
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Smoothing
+from unrender.estimators.capabilities import AtBounds, Smoothing
 from unrender.optimizers import rates
 from unrender.optimizers.chain import ChainState
 from unrender.optimizers.recipes import Adam
@@ -98,6 +98,22 @@ def coordinate_scales(estimate: Estimate, state: Scaled, parameters: Tree) -> np
     smoothing = estimate.get(Smoothing)
     scales = {key: η * (smoothing.sigma[key] if smoothing else 1.0) for key, η in state.learning_rates.items()}
     return trees.repeat_per_element(scales, parameters)
+
+
+def sides_of_bounds(estimate: Estimate, parameters: Tree) -> np.ndarray:
+    """Return the side of the bound at which each element is, -1 or 1, and 0 for the others, (n,); see `AtBounds`."""
+    bounds = estimate.get(AtBounds)
+    return np.zeros(trees.ravel(parameters).size) if bounds is None else trees.ravel(bounds.sides())
+
+
+def free_elements(estimate: Estimate, parameters: Tree) -> np.ndarray:
+    """Return 0 for elements at a bound beyond which the loss falls, and 1 for the others, (n,).
+
+    The former stay, and the others take the step of a problem without them (Bertsekas 1982, "Projected Newton Methods for Optimization
+    Problems with Simple Constraints"). The projection of a step of all elements would end at that of the minimum without bounds.
+    """
+    downwards = -np.sign(trees.ravel(estimate.gradient))
+    return np.where(sides_of_bounds(estimate, parameters) * downwards > 0.0, 0.0, 1.0)
 
 
 def apply_direction(

@@ -13,7 +13,14 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient
-from unrender.optimizers.directions import NewtonState, apply_direction, check_options, coordinate_scales, init_state
+from unrender.optimizers.directions import (
+    NewtonState,
+    apply_direction,
+    check_options,
+    coordinate_scales,
+    free_elements,
+    init_state,
+)
 from unrender.optimizers.recipes import Adam
 from unrender.schedules import Schedule
 
@@ -93,7 +100,8 @@ class LBFGS:
         here, gradient = trees.ravel(parameters), trees.ravel(estimate.gradient)
         if state.newton.step:
             state = self._remember(state, here - state.parameters, gradient - state.gradient, scale)
-        direction = scale * self._direction(state, scale * gradient, scale)
+        free = free_elements(estimate, parameters)
+        direction = free * scale * self._direction(state, free * scale * gradient, scale)
         steps, newton = apply_direction("LBFGS", self, direction, state.newton, parameters)
         return steps, replace(state, newton=newton, parameters=here, gradient=gradient)
 

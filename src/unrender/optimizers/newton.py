@@ -12,7 +12,14 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, Gradient, Hessian, HessianProduct, LossFunction
-from unrender.optimizers.directions import NewtonState, apply_direction, check_options, coordinate_scales, init_state
+from unrender.optimizers.directions import (
+    NewtonState,
+    apply_direction,
+    check_options,
+    coordinate_scales,
+    free_elements,
+    init_state,
+)
 from unrender.optimizers.recipes import Adam
 from unrender.schedules import Schedule
 
@@ -99,7 +106,9 @@ class Newton:
         matrix = estimate.require("Newton", Hessian).matrix
         scale = coordinate_scales(estimate, state, parameters)
         hessian = scale[:, None] * arrays.numpy(matrix).astype(np.float64) * scale
-        step = self._solve(scale * trees.ravel(estimate.gradient), hessian)
+        step, gradient = np.zeros_like(scale), scale * trees.ravel(estimate.gradient)
+        free = np.flatnonzero(free_elements(estimate, parameters))
+        step[free] = self._solve(gradient[free], hessian[np.ix_(free, free)])
         return apply_direction("Newton", self, scale * step, state, parameters)
 
     def _solve(self, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
@@ -177,7 +186,7 @@ class NewtonCG:
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
         """Return the steps and the next state. On the host, between products."""
         hvp = estimate.require("NewtonCG", HessianProduct).apply
-        scale = coordinate_scales(estimate, state, parameters)
+        scale = coordinate_scales(estimate, state, parameters) * free_elements(estimate, parameters)
 
         def product(v: np.ndarray) -> np.ndarray:
             return scale * trees.ravel(hvp(trees.unravel(scale * v, parameters)))

@@ -108,12 +108,29 @@ def project(x: Array, low: float | None, high: float | None, scale: float = 1.0)
         high: upper bound; None if unbounded.
         scale: scale of the margin if the range is unbounded, see `open_scale`.
     """
-    margin = MARGIN * (high - low if low is not None and high is not None else scale)
+    low, high = _kept(low, high, scale)
     if low is not None:
-        x = arrays.maximum(x, low + margin)
+        x = arrays.maximum(x, low)
     if high is not None:
-        x = arrays.minimum(x, high - margin)
+        x = arrays.minimum(x, high)
     return x
+
+
+def sides_of_bounds(x: Array, low: float | None, high: float | None, scale: float = 1.0) -> Array:
+    """Return -1 for elements that `project` keeps at the lower bound, 1 for those at the upper one, and 0 for the others."""
+    low, high = _kept(low, high, scale)
+    sides = arrays.zeros_like(x)
+    if low is not None:
+        sides = arrays.where(x <= low, sides - 1.0, sides)
+    if high is not None:
+        sides = arrays.where(x >= high, sides + 1.0, sides)
+    return sides
+
+
+def _kept(low: float | None, high: float | None, scale: float) -> Bounds:
+    """Return the bounds less the margin."""
+    margin = MARGIN * (high - low if low is not None and high is not None else scale)
+    return None if low is None else low + margin, None if high is None else high - margin
 
 
 def angle_notice(info: ParameterInfo, *values: Any) -> str:

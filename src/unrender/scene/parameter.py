@@ -20,7 +20,7 @@ from unrender.preconditioners.base import Preconditioner
 from unrender.rendering.parameter_errors import ErrorMeasure
 from unrender.rendering.renderer import Renderer
 from unrender.rendering.tied import Tie, with_ties
-from unrender.scene.bounds import open_scale, project
+from unrender.scene.bounds import open_scale, project, sides_of_bounds
 from unrender.scene.coarse_to_fine import CoarseToFine
 from unrender.scene.meshes import MeshRegularizer, Remeshing
 from unrender.scene.prior import Prior
@@ -231,6 +231,10 @@ class Unknown:
     def project(self, values: Array) -> Array:
         """Return the nearest values inside the bounds, less the margin."""
         return project(values, *self.bounds, self._scale)
+
+    def sides(self, values: Array) -> Array:
+        """Return -1 for elements that `project` keeps at the lower bound, 1 for those at the upper one, and 0 for the others."""
+        return sides_of_bounds(values, *self.bounds, self._scale)
 
     def reached(self, values: Array) -> Array:
         """Return `values` projected onto the bounds. A direction (3,) whose length is outside [1e-3, 1e3] is normalised."""
