@@ -19,7 +19,7 @@ from unrender.optimizers import LBFGS, Adam, Partitioned, ScheduleFree
 from unrender.pixels import Views
 from unrender.preconditioners import Sobolev
 from unrender.rendering.parameter_errors import ErrorMeasure
-from unrender.runs.watches import MeshWatch
+from unrender.runs.watches import InfluenceWatch, MeshWatch
 from unrender.scene.meshes import (
     MeshRegularizer,
     Remeshing,
@@ -290,7 +290,9 @@ def test_a_mesh_that_leaves_the_pictures_or_folds_has_a_line() -> None:
     key = "ball.vertex_positions"
     problem = of_mesh(key, POINTS, FACES, "ignore")
     crumpled = POINTS + 0.3 * np.random.default_rng(0).normal(size=POINTS.shape)
-    run = SimpleNamespace(problem=problem, step=3, warnings=[], stopped="steps", parameters={key: crumpled.reshape(-1)})
+    run = SimpleNamespace(
+        problem=problem, step=3, estimator=None, warnings=[], stopped="steps", parameters={key: crumpled.reshape(-1)}
+    )
     descent, watch = run, MeshWatch()
     for size in (0.0, 1.0, 0.0, 0.0):
         watch.on_update(descent, Estimate(0.0, {key: np.full(POINTS.size, size)}), True)  # type: ignore
@@ -371,3 +373,37 @@ def test_only_the_last_stage_may_remesh() -> None:
         _check(stages, given)
     stages.stages = [last]
     _check(stages, given)
+
+
+def test_a_warning_about_the_end_is_in_every_result_and_in_none_after_it_was_given() -> None:
+    """A checkpoint of the last step asks for the warnings before the result does."""
+    key, away = "ball.vertex_positions", np.repeat([0.0, 3.0], len(POINTS))[:, None] * [1.0, 0, 0]
+    vertices, faces = np.concatenate([POINTS, POINTS]), np.concatenate([FACES, FACES + len(POINTS)])
+    problem = of_mesh(key, vertices + away, faces, "warn")
+    run: Any = SimpleNamespace(problem=problem, parameters={key: vertices + away / 2}, warnings=[], stopped="steps")
+    watch = MeshWatch()
+    (line,) = watch.warnings(run)
+    assert watch.warnings(run) == [line]
+    run.warnings = [f"step 25: {line}"]
+    assert MeshWatch().warnings(run) == []  # of a resumed run
+
+
+def test_a_mesh_that_one_view_shows_is_there_while_a_view_is_drawn_at_each_step() -> None:
+    key = "ball.vertex_positions"
+    problem = of_mesh(key, POINTS, FACES, "ignore")
+    problem.views = [None] * 4
+    run: Any = SimpleNamespace(
+        problem=problem,
+        parameters={key: POINTS.reshape(-1)},
+        warnings=[],
+        state=SimpleNamespace(zero_gradient={key: True}),
+        estimator=ur.PathGradient(pixels=Views(1)),
+    )
+    mesh, influence = MeshWatch(), InfluenceWatch()
+    for run.step in range(1, 161):
+        shown = run.step % 10 == 9 and run.step < 100
+        for watch in (mesh, influence):
+            watch.on_update(run, Estimate(0.0, {key: np.full(POINTS.size, float(shown))}), True)
+        assert len(run.warnings) == (run.step >= 99 + 48)
+    (line,) = run.warnings
+    assert line.endswith("its gradient has become zero: the mesh has left the pictures, or is hidden")

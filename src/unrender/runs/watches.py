@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,9 @@ from unrender.estimators.capabilities import BlockEstimate
 from unrender.optimizers import rates
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.recipes import Adam, MetaAdam
+from unrender.pixels.uniform import Views
 from unrender.runs.callbacks import Callback
+from unrender.runs.folder.state import parts
 from unrender.scene.problem import Problem
 from unrender.scene.surfaces import crossing_triangles, folds
 
@@ -53,27 +56,36 @@ class BoundsWatch(Callback):
         return lines
 
 
-_STEPS = 5
+_STEPS, _DRAWS = 5, 12
+"""Number of first steps whose gradients are tested; the same in units of the steps that drawn views need to show all views."""
 
 
 class InfluenceWatch(Callback):
-    """Callback that warns of parameters whose gradient was exactly zero in each of the first five steps.
+    """Callback that warns of parameters whose gradient was exactly zero in each of the first steps.
 
-    Parameters of a block that is not estimated yet are excluded.
+    These are five, or more if steps draw some of the views. Parameters of a block that is not estimated yet are excluded.
     """
 
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
-        zero = run.state.zero_gradient
-        if not applied or run.step > _STEPS:
+        zero, steps = run.state.zero_gradient, max(_STEPS, _draws(run))
+        if not applied or run.step > steps:
             return
         block = estimate.get(BlockEstimate)
         waiting = block.keys if block is not None and block.estimate is None else ()
         for key, gradient in estimate.gradient.items():
             zero[key] = zero[key] and key not in waiting and arrays.number(memory.square(gradient)) == 0.0
-            if zero[key] and run.step == _STEPS:
+            if zero[key] and run.step == steps:
                 run.warnings.append(
                     f"parameter {key}: its gradient is zero so far; it does not seem to influence the images"
                 )
+
+
+def _draws(run: Run) -> int:
+    """Return the number of steps that very probably show all views: 1 if each does."""
+    counts = (part.count for part in parts(run.estimator) if isinstance(part, Views))
+    return max(
+        (_DRAWS * math.ceil(len(run.problem.views) / n) for n in counts if n < len(run.problem.views)), default=1
+    )
 
 
 _EVERY, _TRIANGLES = 25, 100
@@ -84,8 +96,7 @@ class MeshWatch(Callback):
     """Callback that warns of meshes that no image shows any more, and of new self-intersections and folds."""
 
     def __init__(self) -> None:
-        self._seen: set[str] = set()
-        self._crossing: set[str] = set()
+        self._hidden: dict[str, int] = {}  # steps since a picture showed the mesh
 
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
         for key, faces in run.problem.faces.items() if applied else ():
@@ -93,12 +104,13 @@ class MeshWatch(Callback):
             gradient = estimate.gradient.get(key)
             shown = gradient is not None and arrays.number(memory.square(gradient)) > 0.0
             if shown:
-                self._seen.add(key)
-            elif gradient is not None and key in self._seen:
-                self._seen.discard(key)
-                run.warnings.append(
-                    f"step {run.step}: {key}: its gradient has become zero: the mesh has left the pictures, or is hidden"
-                )
+                self._hidden[key] = 0
+            elif gradient is not None and key in self._hidden:
+                self._hidden[key] += 1
+                if self._hidden[key] == _draws(run):
+                    run.warnings.append(
+                        f"step {run.step}: {key}: its gradient has become zero: the mesh has left the pictures, or is hidden"
+                    )
             if run.step % max(_EVERY, len(faces) // _TRIANGLES) == 0 and (line := self._crosses(run, key)):
                 run.warnings.append(f"step {run.step}: {line}")
 
@@ -116,15 +128,16 @@ class MeshWatch(Callback):
 
     def _crosses(self, run: Run, key: str) -> str:
         """Return the warning about new self-intersections of a mesh; "" if there are none, or it was issued."""
-        if key in self._crossing or run.problem.unknowns[key].parameter.self_intersection == "ignore":
+        told = f"{key}: the mesh passes through itself"
+        ignored = run.problem.unknowns[key].parameter.self_intersection == "ignore"
+        if ignored or any(told in line for line in run.warnings):
             return ""
         before, after, joined = _joined(run, key)
         count = len(crossing_triangles(after, joined))
         if count == 0 or count <= len(crossing_triangles(before, joined)):
             return ""
-        self._crossing.add(key)
         return (
-            f"{key}: the mesh passes through itself at {count} pairs of triangles: a lower learning rate or a larger λ of LargeSteps, "
+            f"{told} at {count} pairs of triangles: a lower learning rate or a larger λ of LargeSteps, "
             'or self_intersection = "prevent" of the parameter'
         )
 
