@@ -317,3 +317,16 @@ def test_the_test_of_lost_unknowns_ends_with_the_time(monkeypatch: pytest.Monkey
     ends = [(np.zeros((SIZE, SIZE, 3), np.float32),) * 2]
     assert with_lost(made, result, None, [COLOUR, LIGHT], ends, 4, lambda: remaining) is None
     assert len(done) == changes
+
+
+def test_pixels_outside_the_mask_do_not_determine_a_factor():
+    """A card of known colour that no loss sees."""
+    turned = mi.ScalarTransform4f().translate([0, -0.6, 0.2]).scale(0.5)
+    described = scene(DIFFUSE, card={"type": "rectangle", "to_world": turned, "bsdf": GREY})
+    reference = np.full((SIZE, SIZE, 3), 0.3, np.float32)
+    for first, count in ((0, 0), (SIZE // 2, 1)):
+        mask = (np.arange(SIZE) < SIZE - first)[:, None] * np.ones((SIZE, SIZE), np.float32)
+        made = ur.Problem(
+            described, [ur.Parameter(LIGHT), ur.Parameter(COLOUR)], [ur.View(reference, mask=mask)], max_depth=2
+        )
+        assert len(common_factor(made, made.initial_values(), 16)) == count

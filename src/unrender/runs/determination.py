@@ -267,18 +267,22 @@ def change_of_images(
 ) -> Change:
     """Return the change between two states.
 
-    The product of two independent differences has no noise bias; each uses equal random numbers.
+    The product of two independent differences has no noise bias; each uses equal random numbers. Pixels have the weights of the masks.
     """
-    products, squares = [], []
+    products, squares, weights = [], [], []
     for view in selected_views(problem):
-        differences = []
+        differences, own = [], problem.test_weights(view)
         for seed in _SEEDS:
             first, second = (render(problem, state, view, spp, seed, per_pass) for state in (before, after))
-            differences.append((second - first).astype(np.float64))
-            squares.append(np.mean(np.square(first, dtype=np.float64)))
-        products.append(np.mean(differences[0] * differences[1], axis=-1).reshape(-1))
-    flat = np.concatenate(products)
-    return Change(float(flat.mean()), float(flat.std() / np.sqrt(flat.size)), float(np.mean(squares)))
+            first, second = (np.where(own[..., None] > 0, x, 0.0).astype(np.float64) for x in (first, second))
+            differences.append(second - first)
+            squares.append(np.sum(own * np.mean(np.square(first), axis=-1)) / len(_SEEDS))
+        products.append((own * np.mean(differences[0] * differences[1], axis=-1)).reshape(-1))
+        weights.append(float(np.sum(own)))
+    flat, total = np.concatenate(products), max(sum(weights), 1e-300)
+    return Change(
+        float(flat.sum() / total), float(flat.std() * np.sqrt(flat.size) / total), float(np.sum(squares) / total)
+    )
 
 
 def with_lost(
