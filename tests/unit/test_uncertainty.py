@@ -137,7 +137,7 @@ def test_changes_that_neighbours_share_have_their_own_eigenvalue() -> None:
 
 
 def test_without_the_references_noise_the_end_would_seem_exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "pixel_noise", lambda problem, halves: [np.full((SIZE, SIZE, 1), 1e-12)])
+    monkeypatch.setattr(module, "pixel_noise", lambda problem, halves: [np.full((SIZE, SIZE, 2), 1e-6)])
     assert scores(1.0).std() > 3
 
 
@@ -156,7 +156,7 @@ def test_errors_follow_the_noise_of_the_pixels_that_see_a_texel() -> None:
 
 def test_one_noise_for_all_pixels_would_be_wrong_in_both_halves(monkeypatch: pytest.MonkeyPatch) -> None:
     def mean(of: Problem, halves: object) -> list[np.ndarray]:
-        return [np.full_like(noise, noise.mean()) for noise in pixel_noise(of, halves)]  # type: ignore[arg-type]
+        return [np.broadcast_to(noise.mean(axis=(0, 1)), noise.shape) for noise in pixel_noise(of, halves)]  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "pixel_noise", mean)
     quiet, loud = spreads_of_halves()
@@ -329,3 +329,22 @@ def test_an_overlap_that_is_not_measured_gives_no_map(monkeypatch: pytest.Monkey
     )
     monkeypatch.setattr(image_sensitivity, "_overlap", lambda *given: 1.0)
     assert "wall" in uncertainty(made, estimate(made)).standard_error
+
+
+@pytest.mark.parametrize("grey", [True, False])
+def test_noise_that_channels_share_is_that_of_one_channel(grey: bool) -> None:
+    """A texture of one channel, with references whose noise is equal in red, green and blue, and independent."""
+    z = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        truth = {"wall": rng.uniform(0.2, 0.8, (TEXELS, TEXELS, 1))}
+        rows = np.kron(np.eye(TEXELS), np.ones((2, 1)))
+        a = np.repeat(np.kron(rows, rows), 3, axis=0)
+        renderer = AnalyticRenderer(truth, a, 0.0, 0.0, shape=(SIZE, SIZE), sensors=1)
+        noise = NOISE * rng.normal(size=(SIZE, SIZE, 1 if grey else 3))
+        made = Problem(renderer, [Parameter("wall", initial=0.5, bounds=(0, 1))], [View(renderer.exact(truth) + noise)])
+        picture = np.asarray(made.views[0].reference, np.float64).ravel()
+        values = np.linalg.lstsq(a, picture, rcond=None)[0].reshape(TEXELS, TEXELS, 1).astype(np.float32)
+        error = uncertainty(made, {"wall": values}).standard_error["wall"]
+        z.append((values - truth["wall"]) / error)
+    assert np.std(z) == pytest.approx(1.0, abs=0.2)

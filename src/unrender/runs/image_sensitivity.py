@@ -44,7 +44,7 @@ class Curvature:
         smooth: {key: tr(SAS) / tr(SS)}, at least 1, of textures and grids, for A = JᵀJ with unit diagonal and the means S over neighbouring
             cells: the eigenvalue of smooth changes, 1 if no pixel depends on two elements. Infinite like `overlap`.
         probes: number of probes of the estimate.
-        noise: {key: diagonal elements of JᵀΣJ} for pixels of variance Σ; {} if that is unknown.
+        noise: {key: diagonal elements of JᵀΣJ} for pixels of covariance Σ; {} if that is unknown.
     """
 
     squares: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -109,7 +109,8 @@ def curvature(
     """Return the curvature of `sensitivity`, with the same arguments.
 
     The overlap is the mean of (Jᵀs · Jᵀs')² over pairs of probes, whose expectation is Σ_ij (JᵀJ)_ij², with separate paths of its factors.
-    With the variance `noise` (H, W, 1) of each view's pixels, the probes are also weighted by its root, on the same paths.
+    With the `noise` (H, W, 2) of each view, a and b of the root a I + b 11ᵀ of the channels' covariance, the probes are also weighted by
+    that root, on the same paths.
     """
     checks.integer("sensitivity", "probes", probes, at_least=1)
     if spp is None:
@@ -304,7 +305,11 @@ def _projections(
     signs, pictures = np.random.default_rng(key.uint32()), []
     for view in range(len(problem.views))[:views]:
         image = signs.choice(np.array([-1, 1], np.float32), size=(*problem.sizes[view], 3)) * mask_roots(problem, view)
-        pictures.append(np.stack([image, image * np.sqrt(noise[view])] if noise else [image]))
+        images = [image]
+        if noise:
+            own, shared = np.split(noise[view], 2, axis=-1)
+            images.append(own * image + shared * image.sum(axis=-1, keepdims=True))
+        pictures.append(np.stack(images))
     seeds = {view: key.fold(2 * view + half) for view in range(len(pictures))}
     return adjoints(problem, session, parameters, keys, spp, seeds, pictures)
 

@@ -186,7 +186,7 @@ def of_residuals(
         return Uncertainty(missing=no_maps(reasons))
     roots = [mask_roots(problem, view) for view in range(len(problem.views))]
     residuals = _residuals(problem, halves)
-    noise = _Mean.of(np.concatenate([products[seen] for products, seen in _unshared(residuals)]))
+    noise = _Mean.of(np.concatenate([products[seen] for products, _, seen in _unshared(residuals)]))
     weighted = [[root * x for root, x in zip(roots, half, strict=True)] for half in residuals]
     one, other = (
         transposed(problem, values, of, _PASSES, Key(seed, half, _STREAM)) for half, of in enumerate(weighted)
@@ -358,25 +358,23 @@ def _smoothed(means: np.ndarray, probes: int) -> np.ndarray:
 
 
 def pixel_noise(problem: Problem, halves: Sequence[Sequence[np.ndarray]]) -> list[np.ndarray]:
-    """Return the variance (H, W, 1) of each view's residual that neighbouring pixels do not share, as mean over nearby pixels.
-
-    Args:
-        problem: problem with views and scene.
-        halves: two independent pictures (H, W, 3) of each view, without the references.
-    """
+    """Return a and b (H, W, 2) of the root a I + b 11ᵀ of the channels' covariance, of noise that neighbouring pixels do not share."""
     from scipy.ndimage import uniform_filter  # takes long to import
 
     parts = _unshared(_residuals(problem, halves))
-    least = _LEAST_NOISE * max(_Mean.of(np.concatenate([products[seen] for products, seen in parts])).value, 0.0)
-    variances = []
-    for products, seen in parts:
+    least = _LEAST_NOISE * max(_Mean.of(np.concatenate([products[seen] for products, _, seen in parts])).value, 0.0)
+    roots = []
+    for products, shared, seen in parts:
         sums, counts = (
             uniform_filter(np.pad(np.sum(x, axis=-1, dtype=float), ((0, 1), (0, 1))), _NEARBY, mode="constant")
             for x in (products * seen, seen)
         )
         near = counts > 0.5 / _NEARBY**2  # running sums round
-        variances.append(np.where(near, np.maximum(sums / np.where(near, counts, 1.0), least), least)[..., None])
-    return variances
+        variances = np.where(near, np.maximum(sums / np.where(near, counts, 1.0), least), least)[..., None]
+        correlation = min(max(float(shared[seen].sum()) / max(float(products[seen].sum()), 1e-300), 0.0), 1.0)
+        own, both = math.sqrt(1.0 - correlation), math.sqrt(1.0 + 2.0 * correlation)
+        roots.append(np.sqrt(variances) * [own, (both - own) / 3.0])
+    return roots
 
 
 def _residuals(problem: Problem, halves: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]]:
@@ -390,10 +388,11 @@ def _residuals(problem: Problem, halves: Sequence[Sequence[np.ndarray]]) -> list
     ]
 
 
-def _unshared(residuals: Sequence[Sequence[np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return, for each view, estimates of the variance that neighbouring pixels do not share, (H - 1, W - 1, 3), and which are known."""
+def _unshared(residuals: Sequence[Sequence[np.ndarray]]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Return, for each view, estimates (H - 1, W - 1, 3) of the variance that neighbouring pixels do not share, and of the covariance with
+    the other channels, and which are known."""
     views = []
     for pair in zip(*residuals, strict=True):
         one, other = (0.5 * (x[1:, 1:] - x[:-1, 1:] - x[1:, :-1] + x[:-1, :-1]) for x in pair)
-        views.append((one * other, one != 0.0))
+        views.append((one * other, 0.5 * (one.sum(axis=-1, keepdims=True) - one) * other, one != 0.0))
     return views
