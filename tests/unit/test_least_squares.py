@@ -476,3 +476,13 @@ def test_the_error_along_an_axis_of_symmetry_is_not_that_of_its_noisy_sum_with_o
     assert first.max() < 0.1  # the planted fault: without measuring weak directions again
     assert again[0] < 0.1
     assert again[1] > 0.3
+
+
+def test_a_number_that_starts_and_ends_at_0_is_changed_within_its_bounds():
+    """Its limit was 0, so its differences were no numbers, and the check was left out in silence."""
+    renderer = AnalyticRenderer({"a": np.zeros(1), "b": np.ones(1)}, MATRIX[:, :2], offset=2.0, noise=0.0, shape=SHAPE)
+    values = {"a": np.zeros(1, np.float32), "b": np.ones(1, np.float32)}
+    reference = renderer.exact(values) + NUMBERS.normal(0.0, NOISE, (*SHAPE, 3))
+    parameters = [ur.Parameter(key, initial=x, bounds=(0, None)) for key, x in values.items()]
+    made = ur.Problem(renderer, parameters, [ur.View(reference)])
+    assert set(check_numbers(made, values, values, FAR).errors) == {"a", "b"}

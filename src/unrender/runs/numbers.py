@@ -139,7 +139,7 @@ class Numbers:
                 size, limit = min(size, high - low), 0.25 * (high - low)
             elif low is not None:  # positive without an end: what counts is the ratio
                 size = float(np.abs(values[key]).max()) or size
-                limit = 0.5 * size
+                limit = 0.5 * (size or known[key].length)
             sizes += [size] * values[key].size
             limits += [limit] * values[key].size
         rigid = np.concatenate([np.full(values[key].size, known[key].rigid) for key in keys])
