@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.app.cli.sweep_driver import equally_good, run_command
 from unrender.app.sweeps import trials
 from unrender.app.sweeps.record import (
@@ -336,3 +338,13 @@ def test_a_comparison_has_the_exit_status_of_its_worst_run(runs: dict[str, str],
     from unrender.app.cli.compare import status_of
 
     assert status_of([run(status=of, stopped=why) for of, why in runs.items()]) == status
+
+
+def test_an_error_during_a_run_leaves_out_the_lower_bounds_that_the_picture_reaches() -> None:
+    """As the error at the end does: saturated pixels of the references are bounds for this loss."""
+    truth, white = {"x": np.full(1, 0.9)}, 0.5
+    matrix = np.random.default_rng(0).uniform(0.1, 1.0, (192, 1))
+    renderer = AnalyticRenderer(truth, matrix, noise=0.1, shape=(8, 8))
+    reference = np.minimum(renderer.exact(truth), white)
+    problem = ur.Problem(renderer, [ur.Parameter("x")], [ur.View(reference)], ur.losses.Censored(ur.losses.L2(), white))
+    assert trials._picture_error(problem, truth) < 0.01

@@ -158,8 +158,7 @@ def _picture_error(problem: Problem, values: Mapping[str, np.ndarray]) -> float:
     errors = []
     for index, view in enumerate(problem.views):
         one, other = (render(problem, values, index, spp, _SEED + half) for half in (0, 1))
-        mask = None if view.mask is None else np.asarray(view.mask)
-        errors.append(debiased.rmse(one, other, np.asarray(view.reference), mask))
+        errors.append(debiased.rmse(one, other, np.asarray(view.reference), problem.test_weights(index, (one, other))))
     return debiased.mean(errors)[0]
 
 
