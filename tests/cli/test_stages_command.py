@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import typer
 
 from conftest import KEY, Unrender
 from unrender.app.cli import stages
+from unrender.app.cli.signals import DOUBTFUL
 from unrender.app.stages import stages_file
 from unrender.app.stages.stage_problem import StagedProblem
 from unrender.core.errors import InputError
-from unrender.runs.folder import checkpoint, method_file
+from unrender.display.terminal import Console
+from unrender.runs.folder import checkpoint, method_file, reader
 from unrender.runs.folder.lock import Lock
 
 STAGES = f"""\
@@ -333,3 +338,30 @@ def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     (tmp_path / "stages.toml").write_text(stages_file.text(made, "A note"))
     assert stages_file.read(tmp_path / "stages.toml") == made
     assert made.settings_of(stage) == {"smooth": "false", "spp": "4", "space": "path"}
+
+
+def test_a_doubtful_stage_before_a_resume_is_doubtful_at_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = tuple(stages_file.Stage(name, ("x",)) for name in ("one", "two"))
+    planned = stages_file.Stages(tmp_path / "problem.toml", both, run=stages_file.RunOptions())
+    statuses = {"1-one": "does not fit", "2-two": "finished"}
+    for name in statuses:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.json").touch()
+    monkeypatch.setattr(reader, "read_run_record", lambda folder: SimpleNamespace(status=statuses[folder.name]))
+    monkeypatch.setattr(reader, "read", lambda folder: SimpleNamespace(parameters={}))
+    run: Any = stages.StagesRun(planned, None, tmp_path, "", "", None)  # type: ignore[arg-type]
+    with pytest.raises(typer.Exit) as left:
+        stages._run_stages(run, Console(file=io.StringIO()), None)  # type: ignore[arg-type]
+    assert left.value.exit_code == DOUBTFUL
+
+
+def test_a_prior_around_the_initial_value_is_refused_in_a_later_stage(staged: Path) -> None:
+    """Its centre would be the result of the stage before, which the references have moved."""
+    problem = staged / "problem.toml"
+    problem.write_text(
+        problem.read_text().replace(f'key = "{KEY}"', f'key = "{KEY}"\nprior = {{ near = "initial", std = 0.1 }}')
+    )
+    with pytest.raises(InputError, match=r'stage all: the prior of .* is near = "initial"'):
+        StagedProblem.read(stages_file.read(staged / "stages.toml"))

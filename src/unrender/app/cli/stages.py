@@ -185,15 +185,16 @@ def _run_stages(run: StagesRun, console: Console, progress: Progress) -> None:
 
     from unrender.app.cli.run import conclude
     from unrender.app.stages import stages_file
-    from unrender.runs.folder import reader
+    from unrender.runs.folder import reader, schema
 
     values: dict[str, np.ndarray] = {}
     doubtful = False
     for index, stage in enumerate(run.stages.stages):
         folder = stages_file.folder_of(run.stages, index, run.out)
         console.print(f"[bold]stage {index + 1} of {len(run.stages.stages)}[/]: {escape(stage.name)}", soft_wrap=True)
-        if _is_finished(folder):
-            console.say(f"finished: {folder}")
+        if (status := _status(folder)) in schema.ENDED:
+            console.say(f"{status}: {folder}")
+            doubtful |= status in schema.DOUBTFUL
         else:
             problem, result = _run_stage(run, index, values, console, progress)
             last = index == len(run.stages.stages) - 1
@@ -251,10 +252,11 @@ def _read(stages: Stages) -> StagedProblem:
         return StagedProblem.read(stages)
 
 
-def _is_finished(folder: Path) -> bool:
+def _status(folder: Path) -> str:
+    """Return the status of a stage; "" before its start."""
     from unrender.runs.folder import reader, schema
 
-    return (folder / schema.RECORD).is_file() and reader.read_run_record(folder).status in schema.ENDED
+    return reader.read_run_record(folder).status if (folder / schema.RECORD).is_file() else ""
 
 
 def _clear(out: Path) -> None:

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from unrender.rendering.worlds import WorldsRenderer
 from unrender.rendering.wrapper import layers
 from unrender.scene.coarse_to_fine import NEVER, CoarseToFine
 from unrender.scene.parameter import Parameter, ties_of
+from unrender.scene.prior import Prior
 from unrender.scene.problem import Problem
 from unrender.scene.view import View
 from unrender.scene.view_worlds import requested_depth
@@ -155,6 +157,8 @@ def _differs(renderer: Renderer, key: str, initial: np.ndarray) -> bool:
 def _check(stages: Stages, parameters: Mapping[str, Parameter]) -> None:
     keys = list(parameters)
     moved: dict[str, str] = {}
+    known: set[str] = set()
+    pulled = {key for key, own in parameters.items() if own.prior is not None and _near(own.prior) == "initial"}
     for stage in stages.stages:
         for key in stage.unknowns:
             if key not in keys:
@@ -171,4 +175,14 @@ def _check(stages: Stages, parameters: Mapping[str, Parameter]) -> None:
                 f"stage {stage.name}: {remeshed} is remeshed, and later stages know the mesh by its first triangles: move it in the last "
                 "stage alone, or leave out remeshing"
             )
+        if key := next((key for key in pulled if key in stage.unknowns and key in known), None):
+            raise InputError(
+                f'stage {stage.name}: the prior of {key} is near = "initial", but a stage starts at the result of the earlier ones; '
+                f"give near as numbers, or name {key} in one stage alone"
+            )
+        known |= set(stage.unknowns)
         moved |= {key: stage.name for key in OF_PHOTOGRAPHS if key in stage.unknowns and key not in moved}
+
+
+def _near(prior: Prior | Mapping[str, Any]) -> Any:
+    return prior.near if isinstance(prior, Prior) else prior.get("near")
