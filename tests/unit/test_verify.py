@@ -962,3 +962,82 @@ def test_bright_pixels_of_references_leave_a_run_finished_with_standard_errors(o
     assert result.status == "finished", result.warnings
     assert not any(verification.DIFFERS in line for line in result.warnings)
     assert np.isfinite(result.standard_error["x"]).all()
+
+
+@pytest.mark.mitsuba
+def test_a_resumed_run_is_judged_by_the_same_earlier_images(tmp_path: Path) -> None:
+    """The loss has hardly fallen since step 64, which the session that ends the run has not seen."""
+    parts = ur.PathGradient(spp=4), ur.optimizers.Adam(0.05)
+    whole = ur.optimize(smooth(0.5, 0), *parts, steps=100, run_directory=tmp_path / "whole", checkpoint_every=10)
+    assert whole.verification["change"]["step"] == 64
+    options: Any = {"run_directory": tmp_path / "part", "checkpoint_every": 10, "callbacks": [Kill()]}
+    with pytest.raises(KeyboardInterrupt):
+        ur.optimize(smooth(0.5, 0), *parts, steps=100, **options)
+    resumed = ur.resume(tmp_path / "part", smooth(0.5, 0))
+    assert resumed.resumed == [80]
+    assert resumed.verification == whole.verification
+    assert (resumed.status, resumed.misfit) == (whole.status, whole.misfit)
+
+
+@pytest.mark.mitsuba
+def test_a_run_that_begins_anew_has_the_remarks_on_its_settings(tmp_path: Path) -> None:
+    def bounded() -> ur.Problem:
+        return made().replaced(parameters=[ur.Parameter("x", initial=np.full(SIZE, 0.1), bounds=(0, 1))])
+
+    class KillEarly(ur.protocols.Callback):
+        def on_step(self, run: Any, record: dict[str, Any]) -> None:
+            raise KeyboardInterrupt
+
+    parts = ur.PathGradient(spp=4), ur.optimizers.Adam(0.6)
+    with pytest.raises(KeyboardInterrupt):
+        ur.optimize(bounded(), *parts, steps=4, run_directory=tmp_path, callbacks=[KillEarly()])
+    resumed = ur.resume(tmp_path, bounded())
+    assert resumed.resumed == [0]
+    assert sum("crosses its range" in line for line in resumed.warnings) == 1
+
+
+def test_a_difference_of_the_end_is_not_that_of_better_parameters_which_the_result_holds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A rate that rises after 70 steps leaves the minimum that step 64 had found. Few pixels are judged one by one."""
+    monkeypatch.setitem(globals(), "SIDE", 5)
+    adam = ur.optimizers.Adam(0.05, schedule=Rising())
+    result = ur.optimize(made(1), ur.PathGradient(spp=4), adam, steps=90, seed=1)
+    assert result.verification["best"] == "step 64"
+    assert result.verification["end"][0] > 50 * result.verification["best_loss"][0]
+    assert (result.status, result.misfit) == ("finished", None)
+
+
+class FoldedBeside(Folded):
+    """`Folded` with another number z, in which it is linear."""
+
+    def image(self, parameters: Any, request: Any) -> Any:
+        return AnalyticRenderer.image(self, {**parameters, "x": folded(parameters["x"])}, request)
+
+    def adjoint(self, parameters: Any, paths: Any, weights: Any) -> Any:
+        found = AnalyticRenderer.adjoint(self, {**parameters, "x": folded(parameters["x"])}, paths, weights)
+        return {**found, "x": found["x"] * (3 * parameters["x"] ** 2 - 3)}
+
+
+@pytest.mark.parametrize("known", [(), ("z",), ("x", "z")])
+def test_true_values_of_some_unknowns_do_not_tell_the_noise_of_the_references(known: tuple[str, ...]) -> None:
+    """A local minimum of x leaves a difference, also with the true z."""
+    generator = np.random.default_rng(0)
+    matrix, truth = generator.uniform(0.5, 1.5, (12, 2)), {"x": np.full(1, 2.6), "z": np.full(1, 0.4)}
+    renderer = FoldedBeside({"x": np.full(1, -2.0), "z": np.full(1, 0.5)}, matrix, noise=0.3, shape=(2, 2))
+    reference = (matrix @ [*folded(truth["x"]), *truth["z"]]).reshape(2, 2, 3)
+    parameters = [ur.Parameter("x"), ur.Parameter("z", bounds=(0, 1))]
+    problem = ur.Problem(renderer, parameters, [ur.View(reference)], truth={key: truth[key] for key in known})
+    result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.02), steps=300)
+    assert abs(result.parameters["x"][0] + 1) < 0.1
+    assert result.status == "does not fit"
+
+
+def test_arrays_of_an_earlier_end_do_not_outlast_it(tmp_path: Path) -> None:
+    result = ur.optimize(made(), ur.PathGradient(spp=4), ur.optimizers.Adam(0.03), steps=2)
+    maps: Any = {name: {"x": np.ones((2, 2, 3))} for name in ("sensitivity", "standard_error", "data_share")}
+    replace(result, pictures={"view0/result": np.ones((2, 2, 3))}, **maps).save(tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    result.save(tmp_path)
+    gone = names - {path.name for path in tmp_path.iterdir()}
+    assert gone == {"sensitivity.npz", "standard_error.npz", "data_share.npz", "pictures.npz"}

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from unrender.core.errors import InputError
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
 from unrender.runs.verification import STEPS, STEPS_OF_FEW, Misfit, misfit, prior_cause
 from unrender.scene.problem import Problem
@@ -70,6 +71,37 @@ class EarlierImage:
             return _SURE * error < value < math.inf
         value, error = self.change(earlier, _STILL)
         return -(error if math.isfinite(error) else 0.0) < value < math.inf
+
+
+def stored(images: Sequence[EarlierImage], rendered: int) -> dict[str, Any]:
+    """Return the contents of a checkpoint for images of earlier steps; `rendered` is the number of paths of all new images so far."""
+    parts = [{"step": x.step, "images": list(x.picture.images), "losses": x.picture.losses} for x in images]
+    return {"rendered": rendered, "earlier": parts}
+
+
+def check_stored(saved: Any, where: str) -> None:
+    """Raise `InputError` unless it is the result of `stored`, of any shapes."""
+
+    def is_image(one: Any) -> bool:
+        match one:
+            case {"step": int(), "images": list(parts), "losses": np.ndarray() as losses}:
+                return all(isinstance(x, np.ndarray) and x.dtype == np.float64 for x in (*parts, losses))
+        return False
+
+    match saved:
+        case {"rendered": int(rendered), "earlier": list(images)} if rendered >= 0 and all(map(is_image, images)):
+            return
+    raise InputError(f"{where}: expected images of earlier steps, got {repr(saved)[:60]}")
+
+
+def restored(saved: Mapping[str, Any], pictures: FreshPictures, like: Picture) -> list[EarlierImage]:
+    """Return the images of a checkpoint that have the shapes of another one, and count their paths."""
+    if not saved:
+        return []
+    pictures.rendered = saved["rendered"]
+    found = [(x["step"], Picture(tuple(x["images"]), x["losses"])) for x in saved["earlier"]]
+    shapes = [x.shape for x in (*like.images, like.losses)]
+    return [EarlierImage(n, x, pictures) for n, x in found if [y.shape for y in (*x.images, x.losses)] == shapes]
 
 
 def stays(loss: float, step: int, change: float, error: float) -> bool:
@@ -136,6 +168,14 @@ def unexplained(problem: Problem, differs: Misfit, step: int, steps: int, stays:
         still = f"has hardly improved since step {step} of {steps}" if stays else "may still improve"
         cause, causes = f"it may need more steps, or {cause}", (*causes, STEPS_OF_FEW if stays else STEPS)
     return replace(differs, explanation=f", and {still}: {cause}", causes=causes)
+
+
+def of_best(difference: Misfit, pictures: FreshPictures, best: Picture) -> Misfit | None:
+    """Return a difference of the end with the size of that of better parameters, which the result holds; None if these have none."""
+    residuals, weights = pictures.differences(best.images), pictures.weights_of(best.images)
+    of = residuals[0::2], residuals[1::2], pictures.references, weights, pictures.sizes
+    found = misfit(*of, _OF_PICTURE)
+    return found and replace(found, explanation=difference.explanation, causes=difference.causes)
 
 
 def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -> Misfit | None:

@@ -24,6 +24,7 @@ from unrender.runs.callbacks import COMPILING
 from unrender.runs.noise import GradientNoise
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, interruptible
+from unrender.runs.watches import remarks
 from unrender.scene.problem import Problem
 from unrender.scene.surfaces import guarded
 
@@ -47,6 +48,7 @@ def prepare(plan: Plan, steps: int | None, seconds: float | None, seed: int) -> 
             )
     state = RunState(None, None, GradientNoise(), dict.fromkeys(problem.shapes(), True))
     run = Run(plan, problem, estimator, optimizer, seed, steps, seconds, {}, state)
+    run.warnings += remarks(plan.problem, plan.optimizer)
     initialize(run, 0)
     return run
 

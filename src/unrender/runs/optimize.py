@@ -21,7 +21,6 @@ from unrender.estimators.base import Estimate, Estimator, as_numpy
 from unrender.methods import method, methods
 from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
-from unrender.runs import watches
 from unrender.runs.budget import Budget, check_budget
 from unrender.runs.callbacks import Callback, PhaseTimes, UserCallbacks
 from unrender.runs.folder import method_file
@@ -98,7 +97,6 @@ def optimize(
         annotations = replace(annotations, method=estimator, choices=plan.lines)
     run = prepare(plan, steps, seconds, seed)
     run.begin_budget(annotations.began)
-    run.warnings += watches.remarks(problem, plan.optimizer)
     run.description, run.initial = describe_run(run, annotations), first_values(run)
     folder = _folder(run, annotations, run_directory, checkpoint_every)
     with _progress(progress) as bar, folder as writers, connected(run, [*bar, *callbacks], writers, annotations.phases):

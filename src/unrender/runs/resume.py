@@ -20,6 +20,7 @@ from unrender.methods.plan import Plan
 from unrender.optimizers.base import Optimizer
 from unrender.runs.budget import check_budget
 from unrender.runs.callbacks import Callback
+from unrender.runs.earlier_image import check_stored
 from unrender.runs.folder import checkpoint, history, method_file, reader
 from unrender.runs.folder.checkpoint import Checkpoint
 from unrender.runs.folder.lock import holder
@@ -39,8 +40,8 @@ from unrender.scene.problem import Problem
 from unrender.scene.serialization import origin
 
 _WARNINGS = "warnings"
-_SENT, _CANDIDATE, _AHEAD, _NUMBERS = "sent", "candidate", "ahead", "numbers"
-_OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS, "few_steps", "other_start")
+_SENT, _CANDIDATE, _AHEAD, _NUMBERS, _PICTURES = "sent", "candidate", "ahead", "numbers", "pictures"
+_OPTIONAL = (_CANDIDATE, _AHEAD, _NUMBERS, _PICTURES, "few_steps", "other_start")
 """Parts of a snapshot that only some runs have."""
 
 
@@ -283,6 +284,8 @@ def _unpack(
         _check_candidate(saved[_CANDIDATE], full_shapes, f"{where}: {_CANDIDATE}")
     if _NUMBERS in saved:
         NumberTrace.check(saved[_NUMBERS], f"{where}: {_NUMBERS}")
+    if _PICTURES in saved:
+        check_stored(saved[_PICTURES], f"{where}: {_PICTURES}")
     return saved
 
 

@@ -168,7 +168,7 @@ class Run:
         candidate = None if state.candidate is None else vars(state.candidate)
         parts = {"sent": executor.snapshot(), "candidate": candidate, "ahead": self.ahead or None}
         parts |= {"few_steps": self.few_steps or None, "other_start": state.other_start or None}
-        parts |= {"numbers": state.numbers.snapshot()}
+        parts |= {"numbers": state.numbers.snapshot(), "pictures": state.pictures or None}
         return {
             "parameters": self.parameters,
             "step": self.step,
@@ -196,7 +196,7 @@ class Run:
         state.skipped_in_a_row, state.next_error = saved["skipped_in_a_row"], saved["next_error"]
         state.candidate = Candidate(**saved["candidate"]) if "candidate" in saved else None
         state.numbers = NumberTrace.restored(saved.get("numbers"))
-        state.other_start = str(saved.get("other_start") or "")
+        state.other_start, state.pictures = str(saved.get("other_start") or ""), saved.get("pictures", {})
         self.problem.executor.restore(saved.get("sent"))
 
 
@@ -228,6 +228,7 @@ class RunState:
         candidate: best of the tested earlier parameters; None before the first.
         numbers: values of the numbers at each step.
         other_start: outcome of the comparison with other starts, see `runs.other_start`; "" before it.
+        pictures: new images of earlier steps, see `earlier_image.stored`; {} before the first.
     """
 
     estimator: Any
@@ -240,6 +241,7 @@ class RunState:
     candidate: Candidate | None = None
     numbers: NumberTrace = field(default_factory=NumberTrace)
     other_start: str = ""
+    pictures: dict[str, Any] = field(default_factory=dict)
 
 
 SNAPSHOT_COUNTS = ("step", "clock", "skipped", "samples", "skipped_in_a_row", "next_error")

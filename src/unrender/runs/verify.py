@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +21,9 @@ from unrender.runs.earlier_image import (
     least_difference,
     no_improvement,
     not_converged,
+    of_best,
+    restored,
+    stored,
     unexplained,
 )
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
@@ -92,6 +94,7 @@ class Verify(Callback):
                 self._small.images(run.full())
             else:
                 self._first = self._small.picture(run.initial)
+                self._earlier = restored(run.state.pictures, self._small, self._first)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
         """Render a candidate at steps 64, 128, 256, …, and images for the residual of short runs at steps 4, 8, 16 and 32."""
@@ -105,6 +108,7 @@ class Verify(Callback):
         values = run.full()
         picture = pictures.picture(values)
         self._earlier = [*self._earlier[-1:], EarlierImage(run.step, picture, pictures)]
+        run.state.pictures = stored(self._earlier, pictures.rendered)
         known, loss = run.state.candidate, picture.loss[0]
         if not short and (known is None or loss < known.loss):
             run.state.candidate, self._candidate = Candidate(run.step, loss, values), (run.step, picture)
@@ -141,6 +145,7 @@ class Verify(Callback):
         disagrees = memory is not None and memory.disagrees
         best_loss = {"start": judged[0], "end": judged[1]}.get(best, candidate_picture or last).loss
         differs, change = self._residual(problem, result, pictures, last, unaveraged)
+        differs = of_best(differs, pictures, places[best][0]) if differs and places else differs
         if result.standard_error and not (differs or places):
             differs = _misfit_of_numbers(problem, pictures, result, first, last)
         if run.folder is None and not (differs or places):
@@ -187,7 +192,10 @@ class Verify(Callback):
     def _candidate_picture(self, pictures: FreshPictures, candidate: Candidate) -> Picture:
         if pictures is self._small and self._candidate is not None and self._candidate[0] == candidate.step:
             return self._candidate[1]
-        return pictures.picture(candidate.parameters)
+        known, picture = pictures.rendered, pictures.picture(candidate.parameters)
+        if pictures is self._small:  # of a resumed run, which has counted it
+            pictures.rendered = known
+        return picture
 
     def _judged(
         self, run: Run, result: Result, pictures: FreshPictures, ends: tuple[Picture, Picture], seconds: float
@@ -281,8 +289,7 @@ class Verify(Callback):
         # A sample of pixels has others than the images of earlier steps.
         halves = None if pictures.sampled or small.sampled else (differences[0::2], differences[1::2])
         difference = misfit(last.residuals, earlier.residuals, *own, least_difference(earlier.step), halves)
-        at_truth = partial(_at_truth, problem, small, result) if problem.has_truth else None
-        if difference is None or difference.is_references_noise(at_truth):
+        if difference is None or difference.is_references_noise(_at_truth(problem, small)):
             return None, change
         return unexplained(problem, difference, earlier.step, result.steps), change
 
@@ -308,14 +315,14 @@ def _misfit_of_numbers(
         pictures.weights_of(last.images),
         pictures.sizes,
         improved=_is_worse(pictures, last, first),
-        at_truth=partial(_at_truth, problem, pictures, result) if problem.has_truth else None,
+        at_truth=_at_truth(problem, pictures),
     )
 
 
-def _at_truth(problem: Problem, pictures: FreshPictures, result: Result) -> float:
-    """Return the mean square difference between the images at the true values and the references."""
-    truth = {**result.parameters, **{key: value for key, value in problem.truth.items() if key in result.parameters}}
-    return pictures.residual(pictures.images(truth))
+def _at_truth(problem: Problem, pictures: FreshPictures) -> Callable[[], float] | None:
+    """Return the function of `Misfit.is_references_noise`; None unless the true values of all unknowns are known."""
+    truth = problem.truth
+    return (lambda: pictures.residual(pictures.images(truth))) if truth.keys() == problem.unknowns.keys() else None
 
 
 def _memory(run: Run, pictures: FreshPictures, last: Picture) -> Memory | None:

@@ -36,7 +36,7 @@ def check_writable(folder: Path, result: Result, status: str) -> None:
 
 
 def write_arrays(folder: Path, result: Result, names: Sequence[str] = ()) -> None:
-    """Write the archives of a result, by default all, and remove a last.npz that no longer applies. Names are not yet on disk."""
+    """Write the archives of a result, by default all, and remove those of an earlier end without contents. Names are not yet on disk."""
     archives = {
         schema.PARAMETERS: result.parameters,
         schema.INITIAL: result.initial,
@@ -51,7 +51,7 @@ def write_arrays(folder: Path, result: Result, names: Sequence[str] = ()) -> Non
     for name in names or archives:
         if archives[name] or name in _ALWAYS:
             files.write_arrays(folder / name, archives[name], name_too=False)
-        elif name == schema.LAST:
+        else:
             (folder / name).unlink(missing_ok=True)
 
 
