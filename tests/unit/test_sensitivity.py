@@ -68,6 +68,14 @@ def test_cells_that_no_pixel_sees_are_hardly_seen():
     assert insensitive(np.zeros((2, 2, 3))).all()
 
 
+@pytest.mark.parametrize("share", [0.02, 0.1, 1.0])
+def test_paths_that_are_fewer_than_the_cells_do_not_make_seen_ones_unseen(share: float) -> None:
+    draw = np.random.default_rng(0)
+    values = draw.uniform(0.5, 2.0, (128, 96, 3)) * (draw.random((128, 96, 1)) < share)
+    values[:, 48:] = 0.0
+    assert 1.0 - insensitive(values).mean() == pytest.approx(0.5, abs=0.08)
+
+
 def test_time_ends_it_after_one_probe(monkeypatch: pytest.MonkeyPatch):
     counts: list[int] = []
     real = module._projections

@@ -32,6 +32,9 @@ _INSENSITIVE, _INSENSITIVE_ALONE = 0.1, 0.05
 """Sensitivity relative to the median below which a cell hardly affects the images, such as by bounced light alone; that of an element of a
 list, which has more noise than the medians over neighbouring cells."""
 
+_REACHED, _WINDOWS = 5, 6
+"""Fewest cells with paths in the windows of `around`, and least ratio of a texture's side to that of a window."""
+
 
 @dataclass(frozen=True)
 class Curvature:
@@ -212,11 +215,20 @@ def transposed(
 def around(values: np.ndarray) -> np.ndarray:
     """Return the root of the median over neighbouring cells of the mean square over channels: (..., channels) -> (...).
 
-    It lowers the noise of single elements from few probes, and keeps the border between seen and unseen cells.
+    It lowers the noise of single elements from few probes, and keeps the border between seen and unseen cells. Paths that are fewer than
+    the cells leave most seen ones at 0, so it is then the root of the mean over a window with some other cells that paths have reached.
     """
-    from scipy.ndimage import median_filter  # takes long to import
+    from scipy.ndimage import median_filter, uniform_filter  # takes long to import
 
-    return np.sqrt(median_filter(np.mean(np.square(values, dtype=np.float64), axis=-1), 3, mode="nearest"))
+    squares, side = np.mean(np.square(values, dtype=np.float64), axis=-1), 3
+    reached = squares > 0.0
+    while side < min(squares.shape) // _WINDOWS and reached.any():
+        counts = uniform_filter(reached.astype(np.float64), side, mode="nearest") * side**squares.ndim
+        if np.median(counts[reached]) >= _REACHED:
+            break
+        side += 2
+    means = (median_filter if side == 3 else uniform_filter)(squares, side, mode="nearest")
+    return np.sqrt(np.maximum(means, 0.0))  # of running sums, so some may be below 0
 
 
 def neighbour_means(cells: np.ndarray, channels: bool = False) -> np.ndarray:
