@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
-from unrender import pixels, schedules
+from tests.analytic import AnalyticRenderer
+from unrender import Parameter, Problem, View, pixels, schedules
 from unrender.core.errors import InputError
 from unrender.estimators.loss_values import LossValues
 from unrender.estimators.meta import MetaEstimator
@@ -183,3 +185,24 @@ def test_schedules_are_read(text: str | None, schedule: Any):
 def test_schedules_are_refused(text: str, message: str):
     with pytest.raises(InputError, match=message):
         parse_schedule(text)
+
+
+@pytest.mark.parametrize(("sigma", "width"), [(None, 20.0), ("0.2, lamp=45", 45.0)])
+def test_first_steps_are_widths_in_units_of_the_variable(sigma: str | None, width: float) -> None:
+    """A lamp of 150 in logarithms: a step of its width would multiply it by e^20."""
+    values = {"lamp": np.array([150.0]), "other": np.array([0.5])}
+    renderer = AnalyticRenderer(values, np.ones((48, 2)))
+    lamp = Parameter("lamp", bounds=(0, None), parameterisation="log")
+    problem = Problem(renderer, [lamp, Parameter("other")], [View(renderer.exact(values))])
+    rates = {"*": 0.1, "lamp": 0.5 * width / 150.0, "other": 0.1}
+    settings = {"sigma": sigma} if sigma else {}
+    adam = method("smoothed").plan(problem, {**settings, "optimizer": "adam"}).optimizer
+    assert isinstance(adam, Adam)
+    assert adam.learning_rate == pytest.approx(rates)
+    search = method("smoothed").plan(problem, {**settings, "optimizer": "cma-es"}).optimizer
+    assert isinstance(search, CMAES)
+    assert isinstance(search.learning_rate, dict)
+    assert {key: search.sigma0 * unit for key, unit in search.learning_rate.items()} == pytest.approx(rates)
+    both = method("hybrid").plan(problem, {**settings, "perturbed": "lamp"}).optimizer
+    assert isinstance(both, Adam)
+    assert both.learning_rate == pytest.approx({"*": 0.01, "lamp": 0.2 * width / 150.0})

@@ -69,14 +69,14 @@ class SmoothedMethod(Options):
         return self._parts(parse_widths(WIDTH if self.sigma is None else self.sigma), {})
 
     def plan(self, problem: Problem) -> Plan:
-        widths = parse_widths(self.sigma, problem)
-        own = widths if self.sigma is None and isinstance(widths, dict) else {}
-        return Plan(problem, *self._parts(widths, own), reasons=parameterised(problem))
+        sigma, first = parse_widths(self.sigma, problem), first_steps(self.sigma, problem, problem.shapes())
+        own = first if set(first.values()) - {_common(sigma)} else {}
+        return Plan(problem, *self._parts(sigma, own), reasons=parameterised(problem))
 
     def _parts(self, sigma: float | dict[str, float], own: Mapping[str, float]) -> tuple[Estimator, Optimizer]:
-        """Return both parts; `own` has the widths by which the first steps of adam and cma-es are scaled."""
+        """Return both parts; `own`: widths of the optimizer's variables, by which the first steps of adam and cma-es are scaled."""
         schedule = parse_schedule(self.sigma_schedule)
-        common = sigma.get("*", WIDTH) if isinstance(sigma, dict) else sigma
+        common = _common(sigma)
         units: dict[str, float] = {"*": 1.0} | {key: width / common for key, width in own.items()}
         if self.optimizer == "cma-es":
             return LossValues(self.spp), optimizers.CMAES(
@@ -132,7 +132,7 @@ class HybridMethod(AdamOptions):
         own = beyond_paths(known, keys) if self._keys is None else self._keys
         space = self.space or ("path" if all(known[key].shares_paths for key in keys) else "primary")
         widths = widths_of(self.sigma, problem, [key for key in own if key in keys])
-        rates = {key: self.step * width for key, width in widths.items()}
+        rates = {key: self.step * width for key, width in first_steps(self.sigma, problem, widths).items()}
         reason = f"perturbed renders of {', '.join(own)}; path gradients of all others"
         wanted = parse_widths(self.sigma, problem, tuple(widths))
         return Plan(problem, *self._parts(space, wanted, rates), reasons=(reason,) if own else ())
@@ -207,6 +207,19 @@ def widths_of(sigma: float | str | None, problem: Problem, keys: Iterable[str]) 
     """Return the width of each of these parameters, see `parse_widths`."""
     widths = parse_widths(sigma, problem)
     return {key: widths.get(key, widths.get("*", WIDTH)) if isinstance(widths, dict) else widths for key in keys}
+
+
+def first_steps(sigma: float | str | None, problem: Problem, keys: Iterable[str]) -> dict[str, float]:
+    """Return the width of each of these parameters in units of its optimizer's variable u, where x = φ(u): σ over the largest φ'."""
+    widths = widths_of(sigma, problem, keys)
+    known = {key: problem.unknowns[key] for key in widths}
+    slopes = {k: u.transform.slope(u.project(u.initial)) for k, u in known.items() if u.transform is not None}
+    return {k: width / float(np.max(slopes[k])) if k in slopes else width for k, width in widths.items()}
+
+
+def _common(sigma: float | Mapping[str, float]) -> float:
+    """Return the width of parameters without their own."""
+    return sigma.get("*", WIDTH) if isinstance(sigma, Mapping) else sigma
 
 
 def _size(problem: Problem, key: str) -> float:

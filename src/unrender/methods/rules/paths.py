@@ -20,7 +20,7 @@ from unrender.methods.rules.brightness import start_factors
 from unrender.methods.rules.first_rates import first_rates, logarithms
 from unrender.methods.rules.newton import with_separate_block
 from unrender.methods.rules.traits import Traits, refusal
-from unrender.methods.smoothed import parse_widths, widths_of
+from unrender.methods.smoothed import first_steps, parse_widths
 from unrender.optimizers.base import Optimizer
 from unrender.optimizers.partitioned import Partitioned
 from unrender.optimizers.recipes import Adam, ScheduleFree
@@ -144,7 +144,7 @@ def paths_and_perturbed(traits: Traits) -> Plan | None:
         return None
     if plan := with_separate_block(traits, tuple(keys), paths(replace(traits, problem=others, block=tuple(keys)))):
         return plan
-    rates = {key: constants.perturbed_share * width for key, width in widths_of(sigma, problem, keys).items()}
+    rates = {key: constants.perturbed_share * width for key, width in first_steps(sigma, problem, keys).items()}
     plan = paths(replace(traits, problem=others, rates=rates))
     smoothing = SmoothedDerivatives(
         parse_widths(sigma, problem, keys),
