@@ -20,9 +20,10 @@ from unrender.core.errors import InputError
 from unrender.core.random import Key
 from unrender.estimators.base import as_numpy
 from unrender.images.recursive_control_variate import RecursiveControlVariate
+from unrender.runs.reopen import problem_of
 from unrender.scene import serialization
 from unrender.scene.batches import PixelBatch, PixelSample
-from unrender.scene.fingerprint import fingerprint
+from unrender.scene.fingerprint import differences, fingerprint
 
 pytestmark = pytest.mark.mitsuba
 
@@ -343,3 +344,55 @@ def test_a_scene_without_the_unknowns_is_refused() -> None:
     other["floor"] = other.pop("wall")
     with pytest.raises(InputError, match="view 0: scene: it has none of the unknowns, such as wall"):
         problem([ur.View(picture(), scene=other)])
+
+
+def test_a_view_of_a_sensor_that_the_scene_lacks_is_refused_beside_other_worlds() -> None:
+    """It showed the other view's world, which is a sensor behind the scene's."""
+    views = [ur.View(picture(), sensor=1), ur.View(picture(right=0.0), known={LAMP: DARK})]
+    with pytest.raises(InputError, match="view 0: sensor: expected 0, the only sensor, got 1"):
+        problem(views)
+
+
+def test_changed_files_of_views_are_differences_and_another_working_directory_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Only their names counted: a run resumed with other lamps, and not from another directory."""
+    lamp, more = "lamp.intensity.value", '[[views]]\nreference = "two.npy"\nscene = "other.xml"\n'
+    file = files(tmp_path, f'with = {{ "{lamp}" = "lamp.npy" }}\n{more}')
+    np.save(tmp_path / "lamp.npy", np.full(3, 0.5, np.float32))
+    monkeypatch.chdir(tmp_path)
+    first = fingerprint(ur.Problem.from_file(file.name))
+    monkeypatch.chdir("/")
+    assert differences(first, fingerprint(ur.Problem.from_file(file))) == []
+    np.save(tmp_path / "lamp.npy", np.full(3, 0.6, np.float32))
+    (tmp_path / "other.xml").write_text(XML.format(width=6, light=6.0))
+    changes = [f"view 0: known {lamp} has changed", "file other.xml has changed"]
+    assert differences(first, fingerprint(ur.Problem.from_file(file))) == changes
+
+
+def test_a_scene_of_a_view_made_in_python_is_no_part_of_a_file(tmp_path: Path) -> None:
+    """The file was written without it, and the view reopened with the problem's scene."""
+    file = files(tmp_path, "")
+    key, one = "wall.bsdf.reflectance.value", np.load(tmp_path / "one.npy")
+    other = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+    made = []
+    for light in (1.0, 2.0):
+        views = [ur.View(one), ur.View(one, scene=scene(left=light) | {"wall": scene()["wall"] | {"bsdf": other}})]
+        made.append(ur.Problem(tmp_path / "scene.xml", [ur.Parameter(key)], views))
+    assert differences(*map(fingerprint, made)) == ["view 1: scene has changed"]
+    ur.optimize(made[0], "plain", steps=2, run_directory=tmp_path / "run", progress=False)
+    with pytest.raises(InputError, match="the problem was made in Python; pass it"):
+        problem_of(tmp_path / "run")
+    assert "scene" in ur.Problem.from_file(file).origin
+
+
+def test_a_reopened_folder_knows_the_same_values(tmp_path: Path) -> None:
+    """Its file with the values was compared with the values themselves, and runs did not resume."""
+    files(tmp_path, "")
+    one, lamp = np.load(tmp_path / "one.npy"), "lamp.intensity.value"
+    views = [ur.View(one), ur.View(one, known={lamp: 0.5}), ur.View(one, known={lamp: np.array([1.0, 2.0, 3.0])})]
+    made = ur.Problem(tmp_path / "scene.xml", [ur.Parameter("wall.bsdf.reflectance.value")], views)
+    (tmp_path / "run").mkdir()
+    serialization.save(made, tmp_path / "run")
+    again = ur.Problem.from_file(tmp_path / "run" / serialization.FILE)
+    assert differences(fingerprint(made), fingerprint(again)) == []

@@ -118,9 +118,9 @@ class WorldsRenderer(RendererWrapper):
         """See `RendererWrapper.notices`: those of all scenes, each once."""
         return tuple(dict.fromkeys(line for one in self.renderers for line in getattr(one, "notices", ())))
 
-    def renderer_of(self, sensor: int) -> Renderer:
-        """Return the renderer of a sensor's scene."""
-        return self.states[self._state[sensor]].renderer
+    def state_of(self, sensor: int) -> World:
+        """Return a world with the scene and the known values of a sensor."""
+        return self.states[self._state[sensor]]
 
     def sensors_of(self, worlds: Sequence[World]) -> list[int] | None:
         """Return the index of each world's sensor; None where one is missing."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,9 @@ import numpy as np
 from unrender.core import arrays
 from unrender.io import scene_files
 from unrender.rendering.expressions import expression_layer
+from unrender.rendering.renderer import Renderer
+from unrender.rendering.worlds import World, WorldsRenderer
+from unrender.rendering.wrapper import layers
 from unrender.scene.parameter import ties_of
 from unrender.scene.problem import Problem
 
@@ -25,7 +28,7 @@ def fingerprint(problem: Problem) -> dict[str, str]:
     """Return {part of the problem: its text, or the SHA-256 of its numbers}.
 
     Parts are the loss, the maximum path length, each unknown with its initial value, each view, the numbers of each scene object without
-    the unknowns and, for an XML scene, every file that it consists of. The result is cached per problem.
+    the unknowns and, for XML scenes, every file that they consist of. The result is cached per problem.
     """
     if problem not in _known:
         _known[problem] = _take(problem)
@@ -85,14 +88,14 @@ def _take(problem: Problem) -> dict[str, str]:
     if (layer := expression_layer(problem.renderer)) is not None:
         parts |= {f"expression of {one.key}": one.text or "a function" for one in layer.expressions}
     for index, view in enumerate(problem.original_views):
-        known = {} if view.known is None else dict(sorted(view.known.items()))
-        fields = {
-            f"known {key}": str(x) if isinstance(x, (str, Path)) else _of_array(np.asarray(x, np.float32))
-            for key, x in known.items()
-        }
-        fields |= (
-            {} if view.scene is None else {"scene": str(view.scene) if isinstance(view.scene, (str, Path)) else "given"}
-        )
+        if not view.own_world:
+            continue
+        world = _world(problem, index)
+        fields = {f"known {key}": _of_array(x) for key, x in sorted(world.values.items())}
+        if isinstance(view.scene, (str, Path)):
+            fields["scene"] = str(Path(view.scene).resolve())
+        elif view.scene is not None:
+            fields["scene"] = digest(*(part for parts in _objects(world.renderer).values() for part in parts))
         fields |= {} if view.aov is None else {"aov": view.aov}
         parts |= {f"view {index}: {name}": value for name, value in fields.items()}
     return parts | _of_scene(problem) | _of_files(problem)
@@ -103,23 +106,35 @@ def _of_array(array: np.ndarray) -> str:
 
 
 def _of_scene(problem: Problem) -> dict[str, str]:
-    known, unknowns = problem.renderer.parameters(), problem.unknowns
-    keys = sorted(key for key, info in known.items() if (info.perturbable or info.compiled) and key not in unknowns)
-    objects: dict[str, list[bytes]] = {}
-    for key, value in problem.renderer.values(keys).items():
-        name = key.partition(".")[0]
-        objects.setdefault(name, []).append(f"{key} {_of_array(arrays.numpy(value))}".encode())
+    objects = _objects(problem.renderer, problem.unknowns)
     if len(objects) > _MOST_OBJECTS:
         return {"scene": digest(*(part for parts in objects.values() for part in parts))}
     return {f"scene: {name}": digest(*parts) for name, parts in objects.items()}
 
 
+def _world(problem: Problem, view: int) -> World:
+    """Return the world of a view that has its own."""
+    worlds = next(layer for layer in layers(problem.renderer) if isinstance(layer, WorldsRenderer))
+    return worlds.state_of(problem.views[view].sensor)
+
+
+def _objects(renderer: Renderer, without: Container[str] = ()) -> dict[str, list[bytes]]:
+    """Return {object of a scene: its keys with the hashes of their values}."""
+    known = renderer.parameters()
+    keys = sorted(key for key, info in known.items() if (info.perturbable or info.compiled) and key not in without)
+    objects: dict[str, list[bytes]] = {}
+    for key, value in renderer.values(keys).items():
+        name = key.partition(".")[0]
+        objects.setdefault(name, []).append(f"{key} {_of_array(arrays.numpy(value))}".encode())
+    return objects
+
+
 def _of_files(problem: Problem) -> dict[str, str]:
-    scene = problem.origin.get("scene")
-    if scene is None:
-        return {}
-    root = Path(scene).parent
-    return {f"file {_shown(path, root)}": _of_file(path) for path in scene_files.of(Path(scene))}
+    """Return the hash of each file of the XML scenes: the problem's and those of single views."""
+    named = (problem.origin.get("scene"), *(view.scene for view in problem.original_views))
+    scenes = [Path(scene).resolve() for scene in named if isinstance(scene, (str, Path))]
+    paths = dict.fromkeys(path for scene in scenes for path in scene_files.of(scene))
+    return {f"file {_shown(path, scenes[0].parent)}": _of_file(path) for path in paths}
 
 
 def _shown(path: Path, root: Path) -> str:

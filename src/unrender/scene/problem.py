@@ -18,7 +18,7 @@ from unrender.core.trees import Tree
 from unrender.io.toml_lines import FieldError
 from unrender.losses import L2, Loss
 from unrender.preconditioners.mesh import MeshTopology
-from unrender.rendering.expressions import are_storable, with_expressions
+from unrender.rendering.expressions import with_expressions
 from unrender.rendering.photographs import OF_PHOTOGRAPHS, with_photographs
 from unrender.rendering.renderer import Renderer
 from unrender.scene import notebook
@@ -46,7 +46,7 @@ from unrender.scene.validation import (
 )
 from unrender.scene.view import View
 from unrender.scene.view_checks import check_views, known_angles
-from unrender.scene.view_worlds import check_determined, known_keys, of_views, requested_depth
+from unrender.scene.view_worlds import check_determined, is_storable, known_keys, of_views, requested_depth
 
 __all__ = ["Bounds", "Problem", "open_scene"]
 
@@ -147,7 +147,7 @@ class Problem(ViewLosses):
             loss=checked_loss,
             max_depth=max_depth or longest_path(renderer),
             name=name or (path.stem if path else "problem"),
-            origin={"scene": str(path.resolve())} if path and are_storable(renderer) else {},
+            origin={"scene": str(path.resolve())} if path and is_storable(renderer, original_views) else {},
             notices=[
                 *renderer_notices(renderer),
                 *unknown_notices,
@@ -196,8 +196,8 @@ class Problem(ViewLosses):
             name=name or self.name,
             surfaces={key: u.surface for key, u in self.unknowns.items() if u.surface is not None and key in keys},
         )
-        scene_file = {key: value for key, value in self.origin.items() if key == "scene" and self.remeshed_from is None}
-        return made.with_parts(origin=scene_file)
+        stored = self.remeshed_from is None and is_storable(made.renderer, made.original_views)
+        return made.with_parts(origin={k: v for k, v in self.origin.items() if stored and k == "scene"})
 
     def with_parts(
         self,
@@ -336,7 +336,7 @@ def _opened(
     renderer, located = of_views(
         renderer, views, members, lambda of: open_renderer(of, max_depth, [*members, *known_keys(views)])
     )
-    sensors = [view.sensor for view in located if isinstance(view.sensor, int)]
+    sensors = [view.sensor for view in located]
     for index, view in enumerate(views):
         if view.aov is not None and (conflict := next((key for key in keys if key in OF_PHOTOGRAPHS), None)):
             raise FieldError(

@@ -180,8 +180,8 @@ def check_views(views: Sequence[View], renderer: Renderer, loss: Loss) -> tuple[
         loss: loss; one that handles saturated pixels needs no notice of them.
     """
     checked, notices, losing, resolutions = [], [], list[int](), renderer.resolutions()
-    known = [v.sensor for v in views if isinstance(v.sensor, int) and 0 <= v.sensor < len(resolutions)]
-    store = PictureStore() if 12 * sum(math.prod(resolutions[sensor]) for sensor in known) > ON_DEVICE else None
+    total = sum(12 * math.prod(resolutions[view.sensor]) for view in views)
+    store = PictureStore() if total > ON_DEVICE else None
     for number, one in enumerate(views):
         view, notes, loses_alpha = _check_view(number, one, resolutions, renderer, not isinstance(loss, Censored))
         checked.append(view if store is None else _stored(view, store))
@@ -229,7 +229,6 @@ def _check_view(
     def wrong(field: str, what: str | Exception) -> FieldError:
         return FieldError(("views", index, field), str(what), f"{owner}: {field}")
 
-    check_sensor(index, view, len(resolutions))
     if not is_number(view.weight) or view.weight <= 0:
         raise wrong("weight", f"expected a number above 0, got {view.weight!r}")
     height, width = resolutions[view.sensor]

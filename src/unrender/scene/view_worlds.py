@@ -14,6 +14,7 @@ from unrender.core.errors import InputError
 from unrender.core.text import did_you_mean
 from unrender.io import parameter_values
 from unrender.io.toml_lines import FieldError
+from unrender.rendering.expressions import are_storable
 from unrender.rendering.photographs import scene_renderer
 from unrender.rendering.picture_format import AOVS, AovRenderer
 from unrender.rendering.renderer import ParameterInfo, Renderer
@@ -45,6 +46,7 @@ def of_views(
     worlds: dict[int, World] = {}
     for index, view in enumerate(views):
         if not view.own_world:
+            check_sensor(index, view, len(renderer.resolutions()))
             continue
         own = scene_renderer(renderer)
         if view.scene is not None:
@@ -62,6 +64,11 @@ def of_views(
         replace(view, sensor=located[index], known=None, scene=None, aov=None) if index in located else view
         for index, view in enumerate(views)
     )
+
+
+def is_storable(renderer: Renderer, views: Sequence[View]) -> bool:
+    """Return whether a problem file can contain the expressions of a renderer and the scenes of views."""
+    return are_storable(renderer) and all(v.scene is None or isinstance(v.scene, (str, Path)) for v in views)
 
 
 def requested_depth(renderer: Renderer, views: Sequence[View], max_depth: int) -> int | None:

@@ -145,7 +145,7 @@ def _keys_of_scene(problem: Problem, view: int) -> frozenset[str]:
     worlds = next((layer for layer in layers(problem.renderer) if isinstance(layer, WorldsRenderer)), None)
     if problem.original_views[view].scene is None or worlds is None:
         return frozenset()
-    return frozenset(worlds.renderer_of(problem.views[view].sensor).parameters())
+    return frozenset(worlds.state_of(problem.views[view].sensor).renderer.parameters())
 
 
 def _differs(renderer: Renderer, key: str, initial: np.ndarray) -> bool:
