@@ -175,6 +175,8 @@ def test_masks_may_be_alpha_and_integers() -> None:
         view = problem([ur.View(given, aov="mask")]).views[0]
         np.testing.assert_allclose(np.asarray(view.reference)[..., 0], coverage / 255.0)
         assert view.mask is None
+    with pytest.raises(InputError, match=r"view 0: reference: its largest value is 0\.0039: expected 1 where"):
+        problem([ur.View(coverage // 255, aov="mask")])
 
 
 XML = f"""<scene version="3.0.0"><sensor type="perspective"><float name="fov" value="40"/>

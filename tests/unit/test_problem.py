@@ -189,6 +189,15 @@ def test_eight_bit_masks_are_taken_as_they_are():
     assert made.notices == []
 
 
+def test_the_alpha_of_an_image_is_its_mask():
+    """Its colours were, which are white everywhere: no pixel was left out."""
+    mask = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    mask[..., 3] = np.arange(WIDTH)
+    made = problem(views=[View(REFERENCE, mask=mask), View(REFERENCE, mask=mask / np.float32(255))])
+    for view in made.views:
+        np.testing.assert_allclose(np.asarray(view.mask), mask[..., 3] / 255)
+
+
 def test_a_reference_with_saturated_pixels_says_so():
     """Of integers alone: floating-point values have no white."""
     levels = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
@@ -347,6 +356,10 @@ BAD_VIEWS = [
     (View(REFERENCE, mask=np.full((HEIGHT, WIDTH), -0.5)), r"mask: expected values from 0 to 1"),
     (View(REFERENCE, mask=np.full((HEIGHT, WIDTH, 3), (1.0, 0.5, 0.2))), r"mask: it has colours; expected one channel"),
     (View(REFERENCE, mask=np.zeros((HEIGHT, WIDTH))), r"mask: it is 0 everywhere"),
+    (
+        View(REFERENCE, mask=np.eye(HEIGHT, WIDTH, dtype=np.uint8)),
+        r"mask: its largest value is 0.0039: expected 1 where",
+    ),
 ]
 
 

@@ -51,7 +51,7 @@ def read(source: Any, linearise: bool = True, alpha: bool = False, channels: tup
             integers of 8 and 16 bits are sRGB, and their range is mapped to [0, 1]. Other integers and booleans must be 0 or 1, as in
             masks.
         linearise: whether to convert 8- and 16-bit values from sRGB; False for masks.
-        alpha: whether to return the alpha of 8- and 16-bit values. Requires `linearise`.
+        alpha: whether to return the alpha of 8- and 16-bit values.
         channels: numbers of channels that arrays may have; the second of 2 channels is alpha.
 
     Raises:
@@ -183,12 +183,12 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
         with variant.two_threads():
             bitmap = mi.Bitmap(str(path))
         if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-            return Picture(_colour_channels(bitmap))
+            return _colour_channels(bitmap)
         encoded = bool(bitmap.srgb_gamma())
         stored = np.array(bitmap)
         bits = 8 * stored.itemsize
         linearised = encoded and linearise
-        transparent = linearised and bitmap.has_alpha() and (stored[..., -1] < np.iinfo(stored.dtype).max).any()
+        transparent = encoded and bitmap.has_alpha() and (stored[..., -1] < np.iinfo(stored.dtype).max).any()
         single = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.Y, mi.Bitmap.PixelFormat.YA)
         kind = mi.Bitmap.PixelFormat.Y if single else mi.Bitmap.PixelFormat.RGB
         if encoded and not linearise:
@@ -199,11 +199,11 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
     except Exception as error:  # Mitsuba's image libraries may raise anything
         raise InputError(f"cannot be read as a picture: {reason_of(error, 300)}") from error
     values = values.reshape(*values.shape[:2], -1)
+    coverage = _coverage(stored[..., -1]) if transparent and alpha else None
     if not linearised:
         labelled = bitmap.pixel_format() in (mi.Bitmap.PixelFormat.XYZ, mi.Bitmap.PixelFormat.XYZA)
         opacity = _opacity(stored[..., -1]) if bitmap.has_alpha() and not encoded else None
-        return Picture(values, alpha=opacity, labelled_xyz=labelled, premultiplied=opacity is not None)
-    coverage = _coverage(stored[..., -1]) if transparent and alpha else None
+        return Picture(values, "", coverage if encoded else opacity, labelled, opacity is not None)
     note = f", {'its alpha left out' if coverage is None else _COUNTED}" if transparent else ""
     return Picture(values, f"{bits}-bit sRGB, linearised{note}", coverage)
 
@@ -219,14 +219,17 @@ def _opacity(alpha: np.ndarray) -> np.ndarray | None:
     return values if values.min() < OPAQUE else None
 
 
-def _colour_channels(bitmap: Any) -> np.ndarray:
-    """Return R, G and B, (H, W, 3), of an EXR file of many channels, such as those of Mitsuba's `aov` integrator."""
+def _colour_channels(bitmap: Any) -> Picture:
+    """Return R, G, B and A of an EXR file of many channels, such as those of Mitsuba's `aov` integrator."""
     names = [field.name for field in bitmap.struct_()]
     if not {"R", "G", "B"} <= set(names):
         raise InputError(
             f"has the channels {', '.join(names)[:200]}, but not R, G and B; save colour alone, such as mi.Bitmap(image[:, :, :3])"
         )
-    return np.array(bitmap)[..., [names.index(name) for name in "RGB"]].astype(np.float32)
+    stored = np.array(bitmap)
+    opacity = _opacity(stored[..., names.index("A")]) if "A" in names else None
+    values = stored[..., [names.index(name) for name in "RGB"]].astype(np.float32)
+    return Picture(values, alpha=opacity, premultiplied=opacity is not None)
 
 
 def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple[int, ...]) -> Picture:
@@ -245,10 +248,10 @@ def _from_array(array: np.ndarray, linearise: bool, alpha: bool, channels: tuple
     if array.dtype in (np.uint8, np.uint16):
         bits = 8 * array.dtype.itemsize
         values = values.astype(np.float64) / (2**bits - 1)
-        if not linearise:
-            return Picture(values.astype(np.float32))
         transparent = array.shape[2] in (2, 4) and bool((array[..., -1] < 2**bits - 1).any())
         coverage = _coverage(array[..., -1]) if alpha and transparent else None
+        if not linearise:
+            return Picture(values.astype(np.float32), alpha=coverage)
         note = f", {_COUNTED}" if coverage is not None else ""
         return Picture(srgb_to_linear(values).astype(np.float32), f"{bits}-bit sRGB, linearised{note}", coverage)
     if array.dtype.kind in "iu" and not ((values == 0) | (values == 1)).all():

@@ -44,6 +44,9 @@ _DARKEST = -1e-4
 _MOST_COLOUR = 0.05
 """Largest difference of a mask's channels, which compression may leave."""
 
+_DIMMEST = 1 / 254
+"""Largest value of a mask that is taken for an integer 1 of 8 bits."""
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -123,7 +126,7 @@ def _of_aov(source: Any, name: str) -> Reference:
     images.check_metadata(source)
     values, notices = image.values, []
     if name == "mask" and image.notice:
-        values = images.read(source, linearise=False).values if image.alpha is None else image.alpha[..., None]
+        values = _unscaled(source)
         notices += ["is the alpha of the file"] if image.alpha is not None else []
     elif name == "albedo":
         notices += [image.notice] if image.notice else []
@@ -267,7 +270,7 @@ def _check_view(
 
 def _read_mask(source: Any, height: int, width: int) -> np.ndarray:
     """Return a mask (H, W) from a file or an array. Raises `InputError` for colours, and values outside [0, 1] or 0 everywhere."""
-    mask = images.read(source, linearise=False).values
+    mask = _unscaled(source)
     images.check_metadata(source)
     _check_size(mask, height, width, source)
     if np.ptp(mask, axis=2).max(initial=0.0) > _MOST_COLOUR:
@@ -278,6 +281,19 @@ def _read_mask(source: Any, height: int, width: int) -> np.ndarray:
     if not mask.any():
         raise InputError("it is 0 everywhere, so no pixel would count")
     return mask
+
+
+def _unscaled(source: Any) -> np.ndarray:
+    """Return the values of a mask, (H, W, C): its alpha if that is not 1 everywhere.
+
+    Raises `InputError` for ones in 8 or 16 bits, which are 1/255 or 1/65535.
+    """
+    image = images.read(source, linearise=False, alpha=True)
+    values = image.values if image.alpha is None else image.alpha[..., None]
+    if 0 < values.max() <= _DIMMEST:
+        largest = "expected 1 where a pixel counts, which is 255 in 8 bits and 65535 in 16 bits; or booleans"
+        raise InputError(f"its largest value is {values.max():.2g}: {largest}")
+    return values
 
 
 def _saturated(reference: np.ndarray, counted: np.ndarray | None) -> float:
