@@ -12,7 +12,7 @@ import pytest
 
 import unrender as ur
 from tests.analytic import AnalyticRenderer
-from unrender.core import periodic
+from unrender.core import periodic, tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import (
@@ -170,6 +170,17 @@ def test_the_scale_turns_a_loss_into_a_log_likelihood() -> None:
     assert likelihood_scale(weighted) == pytest.approx(7 * likelihood_scale(squares), rel=1e-5)
 
 
+def test_a_grey_picture_has_one_value_per_pixel() -> None:
+    """It counted as three with independent noise, so that priors had a third of their weight."""
+    _, _, reference = linear(None)
+    grey = reference.reshape(SIDE, SIDE, 3)[..., :1]
+    scales = []
+    for picture in (grey, np.broadcast_to(grey, (SIDE, SIDE, 3)) * [1.0, 1.0, 1.0 + 1e-6]):
+        renderer = AnalyticRenderer({"x": np.full(SIZE, 0.5)}, np.zeros((SIDE * SIDE * 3, SIZE)), shape=(SIDE, SIDE))
+        scales.append(likelihood_scale(ur.Problem(renderer, [ur.Parameter("x")], [ur.View(picture)])))
+    assert scales[0] == pytest.approx(3 * scales[1], rel=0.2)
+
+
 def descended(problem: ur.Problem) -> ur.Result:
     adam = ur.optimizers.Adam(0.03, schedule=ur.schedules.Cosine(400))
     return ur.optimize(problem, ur.PathGradient(spp=4), adam, steps=400)
@@ -286,6 +297,14 @@ def test_positions_of_vertices_have_no_smoothness() -> None:
         .evaluate(positions)
     )
     assert value == 0.0
+
+
+def test_arrays_and_tuples_of_a_prior_are_stored_as_they_are_read_back() -> None:
+    """A run folder was refused for arrays, and a run with a tuple did not resume: its file has a list."""
+    arrays: Any = {"near": np.array([0.5, 0.4]), "palette": [np.array([0.1, 0.2])], "std": np.float32(0.5)}
+    given = Prior(**arrays)
+    assert repr(given) == repr(Prior(**tables.fields(given)))
+    assert given == Prior(near=(0.5, 0.4), palette=[[0.1, 0.2]], std=0.5)
 
 
 def test_a_prior_is_part_of_a_problem_and_its_fingerprint(tmp_path: Path) -> None:

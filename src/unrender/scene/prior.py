@@ -54,6 +54,8 @@ class Prior:
     _unknown: _Unknown | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
+        for name in ("near", "std", "palette", "smoothness", "total_variation", "weight"):
+            object.__setattr__(self, name, _frozen(getattr(self, name)))
         for name in ("std", "smoothness", "total_variation", "weight"):
             if getattr(self, name) is not None:
                 checks.number("prior", name, getattr(self, name), above=0.0)
@@ -252,6 +254,12 @@ def _palette(palette: Any, channels: int) -> np.ndarray:
     if colours.ndim != 2 or not len(colours) or colours.shape[1] != channels:
         raise InputError(f"prior: palette must be a list of colours of {channels} numbers each")
     return colours
+
+
+def _frozen(value: Any) -> Any:
+    """Return arrays and lists as tuples of numbers: what a file contains is read back equal."""
+    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    return tuple(map(_frozen, plain)) if isinstance(plain, (list, tuple)) else plain
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:

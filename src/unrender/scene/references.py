@@ -146,8 +146,8 @@ def likelihood_scale(problem: Problem) -> float:
     """Return s, the factor by which negative log densities of priors enter the loss L.
 
     A loss of |image − reference|^p per pixel is s times a negative log likelihood with s = p L(noise) / N. L(noise) is the loss of
-    pictures that differ from the N values of the references by their noise alone. p is measured: L grows by 2^p when that noise is
-    doubled; 2 if it does not grow. Raises `InputError` if the loss is not finite there.
+    pictures that differ from the N values of the references by their noise alone. A grey picture has one value per pixel, else three. p is
+    measured: L grows by 2^p when that noise is doubled; 2 if it does not grow. Raises `InputError` if the loss is not finite there.
     """
     once, twice, count = 0.0, 0.0, 0.0
     for index, view in enumerate(problem.views):
@@ -157,7 +157,8 @@ def likelihood_scale(problem: Problem) -> float:
         noise = np.random.default_rng(index).standard_normal(reference.shape).astype(np.float32) * np.float32(sigma)
         once += _loss(problem, index, reference + noise)
         twice += _loss(problem, index, reference + 2 * noise)
-        count += reference.size if mask is None else float(mask.sum()) * reference.shape[-1]
+        values = reference.shape[-1] if np.ptp(reference, axis=-1).any() else 1  # grey pixels are one value each
+        count += values * (reference[..., 0].size if mask is None else float(mask.sum()))
     power = math.log2(twice / once) if 0 < once < twice < math.inf else 2.0
     if not math.isfinite(once):
         raise InputError(
