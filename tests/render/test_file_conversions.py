@@ -65,6 +65,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     mesh: Any = mi.load_dict({"type": "obj", "filename": str(place / "block.obj")})
     count = mesh.vertex_count()
     mesh.add_attribute("vertex_paint", 3, np.random.default_rng(2).uniform(0, 1, 3 * count).astype(np.float32))
+    mesh.add_attribute(
+        "face_paint", 3, np.random.default_rng(3).uniform(0, 1, 3 * mesh.face_count()).astype(np.float32)
+    )
     mesh.write_ply(str(place / "block.ply"))
     return place
 
@@ -140,6 +143,7 @@ KEYS = {
     "sheet.vertex_positions": "block.ply",
     "sheet.vertex_normals": "block.ply",
     "sheet.vertex_paint": "block.ply",
+    "sheet.face_paint": "block.ply",
 }
 
 
@@ -173,6 +177,16 @@ def test_what_is_half_a_pixel_off_upside_down_or_decoded_twice_has_an_error(rend
     assert np.abs(of_file(renderer, "sky.data", folder / "single.exr")[::-1] - sky).max() > 0.1
     raw = np.array(renderer.values(["byte_raw.bsdf.reflectance.data"])["byte_raw.bsdf.reflectance.data"])
     assert np.abs(parameter_values.fill(folder / "byte.png", raw.shape)[0] - raw).max() > 0.1
+
+
+def test_an_array_is_rounded_to_half_precision_as_its_file_is(renderer: MitsubaRenderer, tmp_path: Path):
+    """It was not, so that a run folder, which stores the array as a file, did not resume."""
+    key = "rounded.bsdf.reflectance.data"
+    info = renderer.parameters()[key]
+    np.save(tmp_path / "picture.npy", PICTURE)
+    array = parameter_values.fill(PICTURE, info.shape, info.conversion)[0]
+    assert not np.array_equal(array, PICTURE)
+    np.testing.assert_array_equal(array, of_file(renderer, key, tmp_path / "picture.npy"))
 
 
 # ------------------------------------------------------------------ environment maps

@@ -92,7 +92,7 @@ def fill(initial: Any, shape: tuple[int, ...], conversion: FileConversion = PLAI
         if array.dtype == bool or not np.issubdtype(array.dtype, np.number) or np.iscomplexobj(array):
             raise TypeError
         with np.errstate(over="ignore"):
-            array = array.astype(np.float32)
+            array = conversion.stored(array.astype(np.float32))
     except (TypeError, ValueError) as error:
         raise InputError(
             f"expected a number, a colour, a picture or grid file or an array, got {_short(initial)}"

@@ -209,7 +209,7 @@ def conversion(parameters: mi.SceneParameters, key: str, description: SceneDescr
         description: what the scene was loaded from; its shapes place the vertices of mesh files.
     """
     value, node = parameters[key], parameters.properties[key][2]
-    if isinstance(node, mi.Mesh) and key.rpartition(".")[2].startswith("vertex_"):
+    if isinstance(node, mi.Mesh) and key.rpartition(".")[2].startswith(("vertex_", "face_")):
         return FileConversion(vertices=partial(read_vertices, description, key))
     if not key.endswith("data") or not dr.is_tensor_v(value):
         return PLAIN
