@@ -135,6 +135,14 @@ def test_ties_are_recovered_and_exported(tmp_path: Path) -> None:
         np.testing.assert_allclose(np.array(values[key]).ravel(), factor * result.parameters[LAMPS[0]], rtol=1e-4)
 
 
+def test_a_tie_is_singular_where_a_member_is() -> None:
+    """It was where the first member's own value is: bounds of 1.01 and more let the other cross 1."""
+    known = {key: ParameterInfo((), lowest=0.2, highest=5.0, singular=1.0) for key in "ab"}
+    assert Tie("both", {"a": 0.8, "b": 0.8}).info(known).singular == 1.25
+    with pytest.raises(ur.InputError, match=r"singular at 1 and 1\.25; expected equal"):
+        Tie("both", {"a": 1.0, "b": 0.8}).info(known)
+
+
 @pytest.mark.parametrize("role", ["value", "height", "normal", "direction"])
 def test_values_are_tied_unless_they_are_encoded_differently(role: Role) -> None:
     """A bump height is a number, as in another texture; a texel of a normal map is a vector."""

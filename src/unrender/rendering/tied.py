@@ -77,11 +77,17 @@ class Tie:
                     self.key, f"{member} and {first} read their values differently; expected parameters of one kind"
                 )
         low, high = self._limits(infos)
+        places = zip(infos, self.factors.values(), strict=True)
+        singular = {info.singular / factor for info, factor in places if info.singular is not None}
+        if len(singular) > 1:
+            ends = " and ".join(f"{place:g}" for place in sorted(singular))
+            raise KeyedError(self.key, f"with these factors images are singular at {ends}; expected equal factors")
         return replace(
             infos[0],
             **combined(infos),
             lowest=low,
             highest=high,
+            singular=next(iter(singular), None),
             resizable=all(info.resizable for info in infos),
             light=all(info.light for info in infos),
             brightness=infos[0].brightness if len({info.brightness for info in infos}) == 1 else "",
