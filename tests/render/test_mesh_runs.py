@@ -61,3 +61,18 @@ def _mesh(run: reader.RunFolder):
 
     mesh = run.meshes[STATUE]
     return ReplacedMesh(run.parameters[STATUE].reshape(-1, 3), mesh.faces, mesh.uv)
+
+
+def test_a_mesh_with_values_at_its_vertices_is_not_remeshed(tmp_path: Path) -> None:
+    """New vertices read beyond the values, and the picture was another one."""
+    mesh: Any = mi.load_dict({"type": "cube"})
+    mesh.add_attribute("vertex_color", 3, np.full(3 * mesh.vertex_count(), 0.5, np.float32))
+    mesh.write_ply(str(tmp_path / "box.ply"))
+    scene = {
+        "type": "scene",
+        "camera": {"type": "perspective", "film": {"type": "hdrfilm", "width": 4, "height": 4}},
+        "box": {"type": "ply", "filename": str(tmp_path / "box.ply")},
+    }
+    unknown = ur.Parameter("box.vertex_positions", remeshing={"steps": [5], "method": "subdivide"})
+    with pytest.raises(ur.InputError, match="remeshing: its mesh has vertex_color, and new triangles would have none"):
+        ur.Problem(scene, [unknown], [ur.View(np.zeros((4, 4, 3)))])

@@ -13,7 +13,7 @@ import numpy as np
 
 from unrender.core import arrays, tables
 from unrender.core.errors import InputError
-from unrender.core.text import did_you_mean, shorten
+from unrender.core.text import did_you_mean, listed, shorten
 from unrender.io import bounded_files, confinement, parameter_values, scene_files
 from unrender.io.toml_lines import FieldError
 from unrender.losses import FunctionLoss, Loss
@@ -112,6 +112,7 @@ def check_parameter(
         known_prior = None if parameter.prior is None else _bound_prior(parameter.prior, info, initial)
     with checking("remeshing"):
         remeshing = check_remeshing(parameter.remeshing, mesh, lambda: texture_coordinates(renderer, key, initial.size))
+        _check_attributes(remeshing, key, known)
     with checking("self_intersection"):
         check_self_intersection(parameter.self_intersection, mesh)
     ratios = _RATIOS if info.role == "ratios" else ""
@@ -236,6 +237,19 @@ def texture_coordinates(renderer: Renderer, key: str, size: int) -> np.ndarray |
         return None
     uv = arrays.numpy(renderer.values([name])[name]).reshape(-1, 2)
     return uv if len(uv) == size // 3 else None
+
+
+_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+
+
+def _check_attributes(remeshing: Any, key: str, known: Mapping[str, ParameterInfo]) -> None:
+    """Raise `InputError` if a mesh that will be remeshed has other values at its vertices or faces."""
+    parts = [name.rpartition(".") for name in known] if remeshing is not None else []
+    others = [name for owner, _, name in parts if owner == key.rpartition(".")[0] and name not in _GEOMETRY]
+    if attributes := [name for name in others if name.startswith(("vertex_", "face_"))]:
+        raise InputError(
+            f"its mesh has {listed(attributes)}, and new triangles would have none; remove them from its file"
+        )
 
 
 def _check_preconditioner(key: str, preconditioner: Any, info: ParameterInfo) -> Preconditioner | None:
