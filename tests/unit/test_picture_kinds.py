@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 import unrender
 from unrender.app.capture import pictures
@@ -267,6 +267,15 @@ def test_tiffs_are_read_as_stored(compression: str, orientation: int, tmp_path: 
     assert image_size.read_photograph_header(tmp_path / "a.tif").orientation == orientation
     Image.fromarray(PIXELS).save(tmp_path / "a.png")
     np.testing.assert_array_equal(pictures.read(tmp_path / "a.tif").values, pictures.read(tmp_path / "a.png").values)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_every_orientation_of_exif_turns_pixels_upright(orientation: int) -> None:
+    """As Pillow turns them: 5 and 7 are reflections at the two diagonals."""
+    picture = Image.fromarray(PIXELS)
+    picture.getexif()[0x0112] = orientation
+    upright = np.asarray(ImageOps.exif_transpose(picture))
+    np.testing.assert_array_equal(pictures._turn(PIXELS, orientation), upright)
 
 
 def test_sixteen_bits_are_kept_whatever_a_file_is_called(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ _PILLOW_KINDS = {
 """{kind of file: Pillow's name of the format} for files that Pillow decodes. Other Pillow plugins are not used."""
 _PILLOW_MODES = ("1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr")
 """Pillow modes of at most 8 bits per channel. Pillow clips others."""
-_QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 3}
+_QUARTER_TURNS = {6: 3, 8: 1, 5: 3, 7: 1}
 _TURNS = {1: 0, 3: 2, **_QUARTER_TURNS}
 """{EXIF orientation: counter-clockwise quarter turns}; orientations 2, 4, 5 and 7 are also mirrored."""
 _MIRRORED = (2, 4, 5, 7)
