@@ -96,6 +96,30 @@ def test_a_normal_map_is_found_in_and_under_other_materials(tmp_path: Path) -> N
 _RAW = '<boolean name="raw" value="true"/>'
 
 
+@pytest.mark.parametrize("flipped", ["false", "true"])
+@pytest.mark.parametrize("mirror", [1, -1])
+@pytest.mark.parametrize("kind", ["rectangle", "cube", "cube-flat"])
+def test_faces_and_normals_are_on_the_side_that_mitsuba_shades(
+    kind: str, mirror: int, flipped: str, tmp_path: Path
+) -> None:
+    """Other programs leave out the back of faces."""
+    place = f'<transform name="to_world"><scale x="{mirror}" y="1.3"/><rotate x="0.3" y="1" angle="33"/></transform>'
+    more = (
+        f'<boolean name="flip_normals" value="{flipped}"/><boolean name="face_normals" value="{kind == "cube-flat"}"/>'
+    )
+    text = shape(f"{place}{more.replace('True', 'true').replace('False', 'false')}", kind.split("-")[0])
+    (part,) = read(tmp_path, text).parts
+    corners = part.vertices[part.faces].astype(float)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    ray: Any = mi.Ray3f(mi.Point3f((corners.mean(1) + 0.01 * across).T), mi.Vector3f(-across.T))
+    scene: Any = mi.load_file(str(tmp_path / "scene.xml"))
+    shaded = np.array(scene.ray_intersect(ray).sh_frame.n).T
+    np.testing.assert_allclose(np.sum(shaded * across, axis=1), 1, atol=1e-5)
+    if part.normals is not None:
+        np.testing.assert_allclose(part.normals[part.faces].mean(1), across, atol=1e-2)
+
+
 def test_faces_turn_the_way_that_normals_point(tmp_path: Path) -> None:
     """A mirrored to_world turns the winding; a texture's transformation goes into the coordinates."""
     mirrored = '<transform name="to_world"><scale x="-1" y="2" z="1"/></transform>'

@@ -113,12 +113,22 @@ def _part(shape: Any, notices: list[str]) -> Part | None:
         raise InputError(f"asset: {name} has maps but no texture coordinates; unwrap its mesh first")
     if uv is not None and material.to_uv is not None:
         uv = (uv @ material.to_uv[:2, :2].T + material.to_uv[:2, 2]).astype(np.float32)
-    if normals is not None:  # a mirrored to_world reverses the winding, but not the normals
-        corners = vertices[faces]
-        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        if np.sum(across * normals[faces].sum(1)) < 0:
-            faces = np.ascontiguousarray(faces[:, ::-1])
+    faces, normals = _turned_to_front(shape, vertices, faces, normals)
     return Part(name, vertices, faces, normals, uv, replace(material, to_uv=None))
+
+
+def _turned_to_front(
+    shape: Any, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return faces and normals on the side of Mitsuba's shading normals, which a mirrored to_world and flip_normals may turn over."""
+    corners = vertices[faces].astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    ray, hit = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)), mi.PreliminaryIntersection3f()
+    hit.prim_index, hit.prim_uv = mi.UInt32(np.arange(len(faces), dtype=np.uint32)), mi.Point2f(1 / 3, 1 / 3)
+    front = np.array(shape.compute_surface_interaction(ray, hit, mi.RayFlags.All).sh_frame.n).T
+    if np.sum(across * front) < 0:
+        faces = np.ascontiguousarray(faces[:, ::-1])
+    return faces, -normals if normals is not None and np.sum(normals[faces].sum(1) * front) < 0 else normals
 
 
 def _geometry(shape: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
