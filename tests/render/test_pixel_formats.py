@@ -207,3 +207,18 @@ def test_a_loop_of_one_s_own_renders_luminance() -> None:
     renderer = ur.Renderer(lambda: scene("luminance"), [KEY], spp=4)
     image = np.array(renderer.render({KEY: np.array(TRUTH, np.float32)}))
     assert np.ptp(image, axis=2).max() == 0
+
+
+@pytest.mark.parametrize("pixel_format", ["luminance", "xyz", "rgb"])
+def test_an_exported_scene_is_compared_with_references_as_the_problem_is(pixel_format: str, tmp_path: Path) -> None:
+    """Later stages have exported scenes: an RGB film would compare every channel with a luminance, and XYZ with RGB."""
+    reference = rendered(pixel_format)
+    made = problem(pixel_format, reference)
+    scene_file = ur.app.export((made, made.initial_values()), tmp_path / "scene").scene
+    assert scene_file is not None
+    again = ur.Problem(scene_file, [ur.Parameter(KEY)], [ur.View(reference)])
+    for own in (made, again):
+        np.testing.assert_allclose(
+            ur.render(own, spp=1024), np.asarray(own.views[0].reference), atol=0.03, err_msg=pixel_format
+        )
+    np.testing.assert_array_equal(again.views[0].reference, made.views[0].reference)

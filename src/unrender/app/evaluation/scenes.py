@@ -65,6 +65,7 @@ def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray
     """Load a scene file, optionally with another light.
 
     Another light removes the shutter times of the sensors: these are the times of a turntable, and Mitsuba compiles a kernel for each.
+    Films become RGB.
 
     Args:
         path: a scene file of `export_scene`.
@@ -80,6 +81,8 @@ def load_scene(path: Path, light: np.ndarray | None = None, to_world: np.ndarray
         for name in ("shutter_open", "shutter_close"):
             for value in sensor.findall(f"float[@name='{name}']"):
                 sensor.remove(value)
+    for name in root.iterfind("sensor/film/string[@name='pixel_format']"):
+        name.set("value", "rgb")
     file = path.parent / "other-light.exr"
     images.write(light, file)
     emitter = Xml.SubElement(root, "emitter", type="envmap", id=LIGHT)

@@ -234,6 +234,9 @@ def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: i
     if renderer.light_paths.hide_emitters:
         integrator["hide_emitters"] = True
     films = {sensor.id(): sensor.film() for sensor in graph.sensors()}
+    formats = dict(
+        zip(films, renderer.formats(), strict=True)
+    )  # of the references, which stages compare with this scene
     for index in graph.of(mi.ObjectType.Sensor):
         graph.child(index, mi.ObjectType.Sampler, "independent")["sample_count"] = spp
         film = films[f"n{index}"]
@@ -245,7 +248,7 @@ def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: i
             props[size] = int(film.size()[axis])
             if tuple(film.size()) != tuple(film.crop_size()):
                 props[part], props[offset] = int(film.crop_size()[axis]), int(film.crop_offset()[axis])
-        props["pixel_format"], props["component_format"] = "rgb", "float32"
+        props["pixel_format"], props["component_format"] = formats[f"n{index}"].colour, "float32"
         props["sample_border"] = bool(film.sample_border())
         if rfilter is not None:
             props["rfilter"] = mi.Properties.ResolvedReference(rfilter)
