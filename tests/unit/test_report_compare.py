@@ -11,7 +11,8 @@ import pytest
 from report_folders import KEY, Page, write_run
 
 from unrender.app import report
-from unrender.app.report import curves, groups
+from unrender.app.report import curves, groups, tables
+from unrender.app.sweeps.trials import stated_error
 from unrender.core.errors import InputError
 from unrender.losses import metrics
 from unrender.runs.folder.reader import read
@@ -210,6 +211,24 @@ def test_equal_samples_have_their_closed_form(tmp_path):
     words = Page(tmp_path / "out" / "compare.html").words
     assert "after 800 paths" in words
     assert "At equal samples" in words
+
+
+def test_methods_that_start_elsewhere_are_relative_to_one_start(tmp_path):
+    """As `auto` does where the brightness tells of a better start: its own start would make the same end look five times worse."""
+    truth = {"a": np.zeros((2, 1)), "b": np.zeros((2, 1))}
+    far, near = ({"a": truth["a"] + 0.5, "b": truth["b"] + b} for b in (0.5, 0.05))
+    runs = [
+        write_run(tmp_path / "x", "x", truth=truth, initial=far),
+        write_run(tmp_path / "y", "y", truth=truth, initial=near),
+    ]
+    found = compared(tmp_path, runs)["metrics"][0]
+    assert found["name"] == "relative parameter error"
+    for method in ("x", "y"):
+        assert found["methods"][method]["moments"][-1]["error"]["median"] == pytest.approx(0.2)
+    chart = tables.charts_of_runs({"x": read(runs[0]), "y": read(runs[1])}, {"x": 0, "y": 1}, "seconds")[0]
+    assert chart.description == "x: from 1 to 0.2; y: from 0.55 to 0.2"
+    start = dict.fromkeys(truth, 0.5)
+    assert [stated_error(read(run), start)[0] for run in runs] == [pytest.approx(0.2)] * 2
 
 
 def test_pictures_are_measured(tmp_path):

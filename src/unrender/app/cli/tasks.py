@@ -21,7 +21,7 @@ from unrender.app.cli import arguments
 from unrender.app.cli.execute import RunOrder, execution, resumed
 from unrender.app.distributed.cluster import prepare_worker
 from unrender.app.sweeps.record import RunOutcome
-from unrender.app.sweeps.trials import RUNG_FILE, Pruning, read_rungs, stated_error
+from unrender.app.sweeps.trials import RUNG_FILE, Pruning, initial_errors, read_rungs, stated_error
 from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.display import formatting
@@ -115,12 +115,12 @@ def carry_out(
             )  # fmt: skip
             with execution(problem, order, folder, console, progress, listeners[1:]) as arguments_of_run:
                 optimize(**arguments_of_run)
-        return outcome(folder, task, time.perf_counter() - started)
-    return outcome(folder, task, 0.0)
+        return outcome(folder, task, initial_errors(problem), time.perf_counter() - started)
+    return outcome(folder, task, initial_errors(problem), 0.0)
 
 
-def outcome(folder: Path, task: RunTask, wall_seconds: float) -> RunOutcome:
-    """Return the outcome of a run from its folder. Raise `InputError`."""
+def outcome(folder: Path, task: RunTask, start: Mapping[str, float], wall_seconds: float) -> RunOutcome:
+    """Return the outcome of a run from its folder; `start`: see `stated_error`. Raise `InputError`."""
     run = reader.read(folder)
     record = run.record
     rungs = read_rungs(folder / RUNG_FILE)
@@ -131,7 +131,7 @@ def outcome(folder: Path, task: RunTask, wall_seconds: float) -> RunOutcome:
         error, standard_error = rungs[max(rungs)], None
     else:
         try:
-            error, standard_error = stated_error(run)
+            error, standard_error = stated_error(run, start)
         except InputError:
             error = standard_error = None
     return RunOutcome(

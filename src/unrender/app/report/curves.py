@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,18 +138,21 @@ def parameter_error(run: RunFolder, key: str) -> Series | None:
     return Series(seconds, samples, values) if len(values) else None
 
 
-def relative_error(run: RunFolder, keys: Sequence[str]) -> Series | None:
+def relative_error(run: RunFolder, keys: Sequence[str], start: Mapping[str, float] | None = None) -> Series | None:
     """Return the mean over the parameters of error / error at the start: 1 at the start, 0 at full recovery.
 
-    Parameters without truth, or with an initial error of 0 or infinity, are left out; None if no parameter remains.
+    Methods may start elsewhere, so runs are compared relative to the errors at one `start`; None for those of the run. Parameters without
+    truth, or with an error of 0 or infinity there, are left out; None if no parameter remains.
     """
-    known = [series for key in keys if (series := parameter_error(run, key)) is not None]
-    usable = [series for series in known if 0 < series.values[0] < np.inf]
-    if not usable:
+    known = {key: series for key in keys if (series := parameter_error(run, key)) is not None}
+    before = {key: float(series.values[0]) for key, series in known.items()} | dict(start or {})
+    scaled = [(known[key], before[key]) for key in known if 0 < before[key] < np.inf]
+    if not scaled:
         return None
+    usable = [series for series, _ in scaled]
     seconds = np.unique(np.concatenate([series.seconds for series in usable]))
     samples = usable[0].samples[np.maximum(np.searchsorted(usable[0].seconds, seconds, side="right") - 1, 0)]
-    return Series(seconds, samples, np.mean([series.at(seconds) / series.values[0] for series in usable], axis=0))
+    return Series(seconds, samples, np.mean([series.at(seconds) / first for series, first in scaled], axis=0))
 
 
 def image_error(run: RunFolder) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -163,8 +163,8 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
         compared.append(
             _metric(
                 "relative parameter error",
-                "Parameter error, relative to the start (mean over parameters)",
-                lambda run: curves.relative_error(run, keys),
+                "Parameter error, relative to the first run's start (mean over parameters)",
+                lambda run: curves.relative_error(run, keys, first_run.error_before),
                 groups,
                 ends,
             )
@@ -186,7 +186,7 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
         metric.name: {label: _spread([run[metric.name] for run in runs]) for label, runs in measured_images.items()}
         for metric in curves.available()
     }
-    representatives = {g.label: _median_run(g, keys) for g in groups}
+    representatives = {g.label: _median_run(g, keys, first_run.error_before) for g in groups}
     return Comparison(groups, end, ends["samples"], metrics, images, by_metric, representatives)
 
 
@@ -237,9 +237,9 @@ def _spread(values: Sequence[float | None]) -> Spread:
     return Spread(median(known), min(known), max(known)) if known else Spread(None, None, None)
 
 
-def _median_run(group: Group, keys: Sequence[str]) -> RunFolder:
+def _median_run(group: Group, keys: Sequence[str], start: Mapping[str, float]) -> RunFolder:
     def last(run: RunFolder) -> float:
-        relative_error = curves.relative_error(run, keys)
+        relative_error = curves.relative_error(run, keys, start)
         if relative_error is not None:
             return float(relative_error.values[-1])
         image = curves.image_error(run)

@@ -38,19 +38,20 @@ def charts(run: RunFolder, axis: str) -> list[Chart]:
 def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], axis: str) -> list[Chart]:
     """Return the charts of several runs, one line per run.
 
-    With several parameters, the error is the mean over the parameters of error / error at the start.
+    With several parameters, the error is the mean over the parameters of error / error at the start of the first run.
     """
     ends = [float(getattr(run.history, axis)[-1]) for run in runs.values() if len(run.history)]
     if not ends:
         return []
     keys = [key for run in runs.values() for key in run.known]
+    start = next(iter(runs.values())).error_before
     single = len(set(keys)) == 1
     measures = [run.measure(key) for run in runs.values() for key in run.known]
-    title = parameter_errors.title(measures) if single else "Parameter error, relative to the start"
+    title = parameter_errors.title(measures) if single else "Parameter error, relative to the first run's start"
     errors = {
         label: curves.parameter_error(run, run.known[0])
         if single and run.known
-        else curves.relative_error(run, run.known)
+        else curves.relative_error(run, run.known, start)
         for label, run in runs.items()
     }
     lines = {

@@ -75,15 +75,16 @@ def is_hopeless(errors: Mapping[float, float], limits: Mapping[float, float]) ->
     return math.log(errors[now]) + pace * (1 - now) > math.log(max(limits.get(1.0, 0.0), 1e-300))
 
 
-def stated_error(run: RunFolder) -> tuple[float, float | None]:
+def stated_error(run: RunFolder, start: Mapping[str, float]) -> tuple[float, float | None]:
     """Return the error that a sweep minimises, and its standard error if it has one.
 
     Parameters with a known truth have the error of their measure (`run.measure`), such as root mean square. With several of them, it is the
-    mean of the ratios to the initial errors. Without truth, it is the debiased root mean square error of the final pictures, the mean over
-    views. Raises `InputError` if neither the truth nor an error of pictures is known.
+    mean of the ratios to the errors `start` of the problem's initial values, since methods may start elsewhere. Without truth, it is the
+    debiased root mean square error of the final pictures, the mean over views. Raises `InputError` if neither the truth nor an error of
+    pictures is known.
     """
     if run.error_after:
-        return _combined(run.error_after, run.error_before), None
+        return _combined(run.error_after, start), None
     image_errors = [error for name, error in run.record.image_errors.items() if name.endswith("/result")]
     if not image_errors:
         raise InputError(f"run folder {run.path}: neither the truth nor an error of final pictures is known")
@@ -108,7 +109,7 @@ class Pruning(Callback):
 
     def on_start(self, run: Run) -> None:
         problem = run.problem
-        self._initial = problem.parameter_error(problem.start(0)) if problem.has_truth else {}
+        self._initial = initial_errors(problem)
         self._errors = {}
         if run.step:  # resumed
             self._errors = {share: error for share, error in read_rungs(self._path).items() if share <= run.progress()}
@@ -143,6 +144,11 @@ def read_rungs(path: Path) -> dict[float, float]:
         if share is not None and isinstance(value, (int, float)) and not isinstance(value, bool):
             errors[share] = float(value)
     return errors
+
+
+def initial_errors(problem: Problem) -> dict[str, float]:
+    """Return the errors of the initial values of the problem, see `Problem.parameter_error`."""
+    return problem.parameter_error(problem.initial()) if problem.has_truth else {}
 
 
 def _combined(errors: Mapping[str, float], initial: Mapping[str, float]) -> float:
