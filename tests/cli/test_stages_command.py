@@ -365,3 +365,21 @@ def test_a_prior_around_the_initial_value_is_refused_in_a_later_stage(staged: Pa
     )
     with pytest.raises(InputError, match=r'stage all: the prior of .* is near = "initial"'):
         StagedProblem.read(stages_file.read(staged / "stages.toml"))
+
+
+def test_a_resume_after_all_stages_have_ended_is_refused(
+    unrender: Unrender, staged: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would do nothing, whatever the new budget, and say nothing about that."""
+    out = staged / "result"
+    stages_file.write(stages_file.read(staged / "stages.toml"), out)
+    for folder in stages_file.run_folders(out):
+        folder.mkdir()
+        (folder / "run.json").touch()
+    monkeypatch.setattr(reader, "read_run_record", lambda _: SimpleNamespace(status="finished"))
+    before = (out / "stages.toml").read_text()
+    for words in ((), ("--steps", 600)):
+        answer = unrender("resume", "result", *words)
+        assert answer.refuses("result: all stages have ended; to continue the last one, give --steps or --seconds")
+        assert "unrender resume result/3-all" in answer.error
+    assert (out / "stages.toml").read_text() == before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shlex
 import shutil
 import time
 from collections.abc import Iterator, Mapping
@@ -135,12 +136,19 @@ def reopen(
 ) -> StagesRun:
     """Return an earlier run in stages. None, and a budget of two None, select the run's own values. Raise `InputError`."""
     from unrender.app.stages import stages_file
+    from unrender.runs.folder import schema
 
     file = folder / stages_file.FILE
     stages = stages_file.read(file)
     if not stages_file.is_of_run(file):
         raise InputError(
             f"{folder}: not a run in stages, since {file.name} has no absolute path of its problem; start one: unrender run {file}"
+        )
+    folders = [stages_file.folder_of(stages, index, folder) for index in range(len(stages.stages))]
+    if all(_status(each) in schema.ENDED for each in folders):
+        raise InputError(
+            f"{folder}: all stages have ended; to continue the last one, give --steps or --seconds, counted from its start: "
+            f"unrender resume {shlex.quote(str(folders[-1]))}"
         )
     if budget != (None, None):
         stages = replace(stages, steps=budget[0], seconds=budget[1])
