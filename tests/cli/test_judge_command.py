@@ -141,6 +141,29 @@ def test_formats_stand_beside_one_another(unrender, run: Path, mitsuba_variant: 
     assert unrender("export", "problem.toml", "--out", "begin", "--format", "obj", "--overwrite", *variant).status == 0
 
 
+def test_lights_that_turn_with_the_object_are_told(unrender, problem: Path, mitsuba_variant: str) -> None:
+    scene, variant = problem.with_name("wall.xml"), ["--variant", mitsuba_variant]
+    lamp = '<emitter type="point"><point name="position" x="0" y="0" z="3"/></emitter>'
+    scene.write_text(scene.read_text().replace("<shape", lamp + "<shape"))
+    answer = unrender("run", "problem.toml", "--steps", 1, "--out", "result", "--final-spp", 1, "-m", "plain", *variant)
+    assert answer.status in (0, 5), answer.error
+    answer = unrender("turntable", "result", "--frames", 1, "--size", 8, "--spp", 1, "--out", "frames", *variant)
+    assert answer.status == 0, answer.error
+    assert "note: PointLight: turns with the scene; only environment maps stand still, see --environment" in answer.out
+
+
+@pytest.mark.parametrize(("rate", "milliseconds"), [(24.0, 40), (35.0, 30), (50.0, 20), (0.5, 2000)])
+def test_frames_of_a_gif_last_the_nearest_hundredths(
+    tmp_path: Path, mitsuba_variant: str, rate: float, milliseconds: int
+) -> None:
+    assert mitsuba_variant
+    from unrender.app.evaluation.turntable import write_video
+
+    write_video(tmp_path / "a.gif", [np.full((8, 8, 3), grey, np.uint8) for grey in (0, 128, 255)], rate)
+    with Image.open(tmp_path / "a.gif") as picture:
+        assert (picture.n_frames, picture.info["duration"]) == (3, milliseconds)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -159,6 +182,11 @@ def test_formats_stand_beside_one_another(unrender, run: Path, mitsuba_variant: 
         (["turntable", ".", "--background", "pink"], "--background pink: expected light, black"),
         (["turntable", ".", "--elevation", 90], "--elevation 90: expected above -90"),
         (["turntable", ".", "--rate", "nan"], "--rate nan: expected above 0"),
+        (
+            ["turntable", ".", "--rate", 60, "--out", "x.gif"],
+            "--rate 60: expected 0.002 to 50 frames per second for a .gif",
+        ),
+        (["turntable", ".", "--rate", 1e-4, "--out", "x.gif"], "--rate 0.0001: expected 0.002 to 50 frames per second"),
         (["turntable", ".", "--out", "x.avi"], "--out x.avi: expected a name that ends in .mp4 or .gif"),
         (["turntable", ".", "--out", "photo.exr/x.gif"], "is not a folder that can be written to"),
         (["turntable", ".", "--out", "there.gif"], "--out there.gif: exists; give --overwrite"),

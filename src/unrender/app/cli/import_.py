@@ -37,7 +37,9 @@ _Scale = Annotated[float | None, typer.Option(help="Alternative to --resolution:
 _HoldOut = Annotated[
     int | None,
     typer.Option(
-        metavar="N", min=0, help="Hold out every Nth photograph, 0 for none. Default: the capture's split, or 8."
+        metavar="N",
+        min=0,
+        help="Hold out every Nth photograph, 0 for none. Default: the capture's split, or 8; 6 for lights.",
     ),
 ]
 _Kind = Annotated[

@@ -89,7 +89,7 @@ def turntable(
         Path | None, typer.Option(metavar="FILE", help="The light: a picture of all directions (.exr, .hdr).")
     ] = None,
     frames: Annotated[int, typer.Option(min=1, max=10_000, help="Number of frames.")] = 48,
-    rate: Annotated[float, typer.Option(help="Frames per second, at most 240.")] = 24.0,
+    rate: Annotated[float, typer.Option(help="Frames per second, at most 240, and 50 in a .gif.")] = 24.0,
     size: Annotated[int, typer.Option(help="Width and height in pixels, an even number.")] = 320,
     spp: Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Samples per pixel.")] = 64,
     elevation: Annotated[float, typer.Option(help="Elevation of the camera above the horizon in degrees.")] = 15.0,

@@ -34,6 +34,8 @@ BACKGROUNDS = {"light": None, "black": 0.0, "grey": 0.18, "white": 1.0}
 _ANGLE = 35.0
 _MARGIN = 1.05
 _MOST_FRAMES, _LARGEST = 10_000, 4096
+_STANDING = {"EnvironmentMapEmitter", "ConstantBackgroundEmitter"}
+"""Emitters whose light does not turn with the object."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def turntable(
 
     Args:
         run: a run folder.
-        out: a name that ends in .mp4 (needs imageio-ffmpeg) or .gif, or a folder for PNG files.
+        out: a name that ends in .mp4 (needs imageio-ffmpeg) or .gif (frames of whole hundredths of a second), or a folder for PNG files.
         environment: an environment map that replaces the lights of the scene; its upper edge is `up`.
         frames: number of frames, >= 1.
         rate: frames per second, > 0.
@@ -107,6 +109,8 @@ def turntable(
     _check(frames, rate, size, spp, elevation, background)
     axis = None if up is None else _axis(up)
     check_video(place, overwrite)
+    if place.suffix.lower() == ".gif":
+        _hundredths(rate)
     light = None if environment is None else scenes.read_light(Path(environment))
     problem, result = _opened(run, notify)
     with tempfile.TemporaryDirectory() as scratch:
@@ -118,6 +122,8 @@ def turntable(
             scene = scenes.load_scene(path, light, scenes.turned_up(axis))
         elif any(map(turntable_light.is_turntable, scene.emitters())):
             scene = scenes.load_scene(path, *read_environment(scene, []))
+        if notify is not None and (turning := sorted({each.class_name() for each in scene.emitters()} - _STANDING)):
+            notify(f"{', '.join(turning)}: turns with the scene; only environment maps stand still, see --environment")
         pictures = _frames(scene, table, frames, size, spp, elevation, problem.max_depth, BACKGROUNDS[background])
         write_video(place, pictures, rate)
     return place
@@ -249,9 +255,19 @@ def _write_frames(folder: Path, frames: Iterable[np.ndarray]) -> None:
         Image.fromarray(frame).save(folder / f"{index:04d}.png")
 
 
+def _hundredths(rate: float) -> int:
+    """Return the time of a frame in a .gif. Raise `InputError` for a rate that its files or browsers do not have."""
+    if not 0.002 <= rate <= 50:
+        raise InputError(
+            f"--rate {rate:g}: expected 0.002 to 50 frames per second for a .gif; write an .mp4 for others"
+        )
+    return round(100 / rate)
+
+
 def _write_gif(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     pictures = [Image.fromarray(frame).quantize(256) for frame in frames]
-    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=round(1000 / rate), loop=0)
+    time = 10 * _hundredths(rate)
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=time, loop=0)
 
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
