@@ -44,6 +44,8 @@ from unrender.runs.result import TERMINATED as BY_SIGTERM
 from unrender.scene.problem import Problem
 
 _SHOWN, _SHOWN_LIVE = 10, 5
+_MANY = 1e9
+"""Degrees of freedom of a standard error that is known."""
 
 
 def line(trial: TrialRecord) -> str:
@@ -75,24 +77,28 @@ def show(console: Console, record: SweepRecord) -> None:
         console.say(f"best: {record.best_line}")
         if others := equally_good(record):
             which = ", ".join(map(str, others[:_SHOWN])) + (", …" if len(others) > _SHOWN else "")
-            console.say(
-                f"not distinguished from it (two standard errors): trial {which}; more --final-spp or --seeds may decide"
-            )
+            console.say(f"not distinguished from it (5 %): trial {which}; more --final-spp or --seeds may decide")
         console.say(f"to run it: {run_command(record)}")
 
 
 def equally_good(record: SweepRecord) -> list[int]:
-    """Return the other finished trials whose error is within two standard errors of the difference from the best one's."""
+    """Return the other finished trials that Welch's t test at 5 % does not tell from the best one."""
     known = {t.number: t for t in record.trials if t.status == "finished" and t.error is not None}
     best = known.pop(record.best, None) if record.best is not None else None
-    if best is None:
-        return []
-    return [
-        number
-        for number, trial in known.items()
-        if (noise := math.hypot(best.standard_error or 0.0, trial.standard_error or 0.0)) > 0
-        and abs((trial.error or 0.0) - (best.error or 0.0)) <= 2 * noise
-    ]
+    return [] if best is None else [number for number, trial in known.items() if _is_alike(best, trial)]
+
+
+def _is_alike(*trials: TrialRecord) -> bool:
+    """Return whether two errors differ by no more than their noise. The standard error of few runs is itself uncertain."""
+    from scipy.special import stdtrit
+
+    one, other = (trial.error or 0.0 for trial in trials)
+    squares = [(trial.standard_error or 0.0) ** 2 for trial in trials]
+    if (total := sum(squares)) == 0.0:
+        return False
+    rest = sum(square**2 / (len(of.runs) - 1) for square, of in zip(squares, trials, strict=True) if len(of.runs) > 1)
+    degrees = min(total**2 / rest, _MANY) if rest > 0.0 else _MANY  # a single run's error is a mean over many pixels
+    return abs(one - other) <= float(stdtrit(degrees, 0.975)) * math.sqrt(total)
 
 
 def run_command(record: SweepRecord) -> str:
