@@ -251,6 +251,40 @@ def test_pictures_are_measured(tmp_path):
     assert ("FLIP ↓" in page) == metrics.has_flip()
 
 
+def test_pixels_that_a_mask_leaves_out_decide_nothing(tmp_path):
+    """One method is exact where the mask counts, and far off beside it; the other is a little off everywhere."""
+    reference = np.linspace(0.05, 0.6, 12 * 16 * 3).reshape(12, 16, 3)
+    mask = np.tile(np.where(np.arange(16) < 8, 0.0, 1.0), (12, 1))
+    mask[:, 8] = 0.5
+    runs = []
+    for method, picture in (("x", reference + 5.0 * (mask == 0)[..., None]), ("y", reference + 0.05)):
+        views = {
+            "view0/reference": reference,
+            "view0/result": picture,
+            "view0/initial": 0 * picture,
+            "view0/mask": mask,
+        }
+        runs.append(write_run(tmp_path / method, method, views=views))
+    exact, off = compared(tmp_path, runs)["methods"]
+    assert exact["image_error"]["median"] == exact["images"]["RMSE"]["median"] == 0.0
+    assert exact["images"]["relative MSE"]["median"] == 0.0
+    assert exact["images"]["SSIM"]["median"] == pytest.approx(1.0)
+    assert off["image_error"]["median"] == pytest.approx(0.05, rel=1e-4)
+    assert off["images"]["RMSE"]["median"] == pytest.approx(0.05, rel=1e-4)
+    assert off["images"]["SSIM"]["median"] < 1.0
+    if metrics.has_flip():
+        assert exact["images"]["FLIP"]["median"] == 0.0 < off["images"]["FLIP"]["median"]
+    weights = mask[..., None] / (3 * mask.sum())
+    before = float(np.sqrt(np.sum(weights * reference**2)))
+    (row,) = tables.view_rows(read(runs[0]))
+    assert (row.before, row.after) == (pytest.approx(before, rel=1e-5), 0.0)
+    np.savez(
+        runs[0] / "pictures.npz", **{"view0/reference": reference, "view0/result": reference, "view0/mask": 0 * mask}
+    )
+    with pytest.raises(InputError, match="view0/mask: expected numbers from 0 to 1, not all 0"):
+        read(runs[0])
+
+
 def test_metrics_of_some_views_only_are_said(tmp_path, monkeypatch):
     views = {
         f"view{view}/{kind}": np.full((8, 8, 3), 0.5 + view) for view in range(3) for kind in ("reference", "result")

@@ -3,6 +3,8 @@
 All but `distance` take linear RGB (H, W, 3). PSNR, SSIM and FLIP are computed on display images: both images are multiplied by
 `exposure(reference)`, clipped to [0, 1], and converted by the sRGB curve. NaN is black in display images. Radiance has no peak value for
 a peak signal-to-noise ratio, and a visible emitter would otherwise dominate.
+
+A mask (H, W), with values from 0 to 1 and not 0 everywhere, weights the pixels. Images are black where it is 0.
 """
 
 from __future__ import annotations
@@ -62,41 +64,46 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(x, 1 / 2.4) - 0.055)
 
 
-def displayed(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both images as displayed at the reference's exposure, with values in [0, 1]. Raises `InputError` for unequal shapes."""
-    image, reference = _pair(image, reference)
-    factor = exposure(reference)
+def displayed(
+    image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return both images as displayed at the reference's exposure, with values in [0, 1]. Raises `InputError` for unequal shapes.
+
+    They are black outside of a mask (H, W), and the exposure is that of the pixels inside.
+    """
+    image, reference = _pair(image, reference, mask)
+    factor = exposure(reference if mask is None else reference[mask > 0])
     with np.errstate(over="ignore"):
         return srgb(image * factor), srgb(reference * factor)
 
 
-def psnr(image: np.ndarray, reference: np.ndarray) -> float:
+def psnr(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the peak signal-to-noise ratio of the display images in dB, 10 log10(1 / MSE); infinite for equal images.
 
     Larger is better.
     """
-    shown, target = displayed(image, reference)
-    error = float(np.mean((shown - target) ** 2))
+    shown, target = displayed(image, reference, mask)
+    error = _mean((shown - target) ** 2, mask)
     return 10 * math.log10(1 / error) if error > 0 else math.inf
 
 
-def ssim(image: np.ndarray, reference: np.ndarray) -> float | None:
+def ssim(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float | None:
     """Return the structural similarity (Wang et al. 2004) of the display images, in [-1, 1], by scikit-image.
 
     The window has 7 pixels, or as many as fit. 1 for equal images. None for images with a side of less than 3 pixels.
     """
     from skimage.metrics import structural_similarity
 
-    shown, target = displayed(image, reference)
+    shown, target = displayed(image, reference, mask)
     side = min(_SSIM_WINDOW, *shown.shape[:2])
     if side < 3:
         return None
     window = side if side % 2 else side - 1
-    similarity: Any = structural_similarity(target, shown, data_range=1.0, channel_axis=2, win_size=window)
-    return float(similarity)
+    similarity: Any = structural_similarity(target, shown, data_range=1.0, channel_axis=2, win_size=window, full=True)
+    return float(similarity[0]) if mask is None else _mean(similarity[1], mask)
 
 
-def flip(image: np.ndarray, reference: np.ndarray) -> float:
+def flip(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the mean FLIP (Andersson et al. 2020) of the display images, in [0, 1], at 67 pixels per degree. Smaller is better.
 
     Raises `InputError` if the package flip-evaluator is missing.
@@ -105,40 +112,50 @@ def flip(image: np.ndarray, reference: np.ndarray) -> float:
         import flip_evaluator
     except ImportError as error:
         raise InputError("metrics: FLIP needs another package: pip install 'unrender[flip]'") from error
-    shown, target = (np.ascontiguousarray(x, np.float32) for x in displayed(image, reference))
-    _, mean, _ = flip_evaluator.evaluate(target, shown, "LDR", inputsRGB=True, applyMagma=False)
-    return float(mean)
+    shown, target = (np.ascontiguousarray(x, np.float32) for x in displayed(image, reference, mask))
+    errors, _, _ = flip_evaluator.evaluate(target, shown, "LDR", inputsRGB=True, applyMagma=False)
+    return _mean(np.asarray(errors, np.float64), mask)
 
 
-def relative_mse(image: np.ndarray, reference: np.ndarray) -> float:
+def relative_mse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the mean over pixels and channels of (I - R)² / (R² + 0.01), in linear values. Smaller is better.
 
     Infinite if a value is not finite. Raises `InputError` for images of different sizes.
     """
-    image, reference = _pair(image, reference)
+    image, reference = _pair(image, reference, mask)
     with np.errstate(over="ignore", invalid="ignore"):
-        error = float(np.mean((image - reference) ** 2 / (reference**2 + RELATIVE_EPSILON)))
+        error = _mean((image - reference) ** 2 / (reference**2 + RELATIVE_EPSILON), mask)
     return error if math.isfinite(error) else math.inf
 
 
-def rmse(image: np.ndarray, reference: np.ndarray) -> float:
+def rmse(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the root mean square difference in linear values. Smaller is better.
 
     Infinite if a value is not finite. Raises `InputError` for images of different sizes.
     """
-    image, reference = _pair(image, reference)
+    image, reference = _pair(image, reference, mask)
     with np.errstate(over="ignore", invalid="ignore"):
-        error = float(np.sqrt(np.mean((image - reference) ** 2)))
+        error = math.sqrt(_mean((image - reference) ** 2, mask))
     return error if math.isfinite(error) else math.inf
 
 
-def _pair(image: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _pair(image: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     image, reference = np.asarray(image, np.float64), np.asarray(reference, np.float64)
     if image.shape != reference.shape or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise InputError(
             f"metrics: expected two pictures (H, W, 3) of one size, got {image.shape} and {reference.shape}"
         )
-    return image, reference
+    if mask is None:
+        return image, reference
+    inside = mask[..., None] > 0
+    return np.where(inside, image, 0.0), np.where(inside, reference, 0.0)
+
+
+def _mean(values: np.ndarray, mask: np.ndarray | None) -> float:
+    """Return the mean of (H, W, ...) values, with the weights of a mask (H, W)."""
+    if mask is None:
+        return float(np.mean(values))
+    return float(np.average(values.reshape(*mask.shape, -1).mean(axis=2), weights=mask))
 
 
 def has_flip() -> bool:

@@ -198,6 +198,8 @@ def _pictures(
     for place, index in enumerate(views):
         reference = np.asarray(problem.views[index].reference, np.float32)
         pictures[f"view{index}/reference"] = reference
+        if (mask := problem.views[index].mask) is not None:
+            pictures[f"view{index}/mask"] = np.asarray(mask, np.float32)
         for done, (which, values) in enumerate((("initial", result.initial), ("result", result.parameters))):
             name = image_name(index, which)
             of = problem.remeshed_from or problem if which == "initial" else problem

@@ -278,7 +278,12 @@ def _stamp(path: Path) -> tuple[int, int, int] | None:
 
 def _references(run: Run) -> dict[str, np.ndarray]:
     views = run.problem.views[:_VIEWS]
-    return {f"view{i}/reference": reduced(np.asarray(view.reference), _PICTURE) for i, view in enumerate(views)}
+    masks = {
+        f"view{i}/mask": reduced(np.asarray(view.mask), _PICTURE)
+        for i, view in enumerate(views)
+        if view.mask is not None
+    }
+    return {f"view{i}/reference": reduced(np.asarray(view.reference), _PICTURE) for i, view in enumerate(views)} | masks
 
 
 def _images(run: Run) -> dict[str, np.ndarray]:

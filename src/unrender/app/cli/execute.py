@@ -18,6 +18,7 @@ from unrender.methods.plan import PlanFile
 from unrender.runs import watches
 from unrender.runs.callbacks import RUN_PHASES, Callback
 from unrender.runs.final_checks import image_name
+from unrender.runs.folder.reader import root_mean_square
 from unrender.runs.image_sensitivity import seen_cells
 from unrender.runs.live import Live
 from unrender.runs.metadata import RunAnnotations
@@ -105,21 +106,18 @@ def resumed(
     return result
 
 
-def image_error(result: Result, which: str = "result", masks: Sequence[np.ndarray | None] | None = None) -> str:
-    """Return the mean over views of the root mean square error against the reference as text, with noise removed if it is known.
-
-    `masks` are the views' pixel weights (H, W) if the noise is unknown; None for all pixels of all views.
-    """
+def image_error(result: Result, which: str = "result") -> str:
+    """Return the mean over views of the root mean square error against the reference as text, with noise removed if it is known."""
     views = [view for view in range(int(result.problem["views"])) if image_name(view, which) in result.pictures]
     known = [result.image_errors[name] for view in views if (name := image_name(view, which)) in result.image_errors]
     if len(known) == len(views):
         return formatting.with_error(*debiased.mean(known))
-    errors = []
-    for view in views:
-        difference = result.pictures[f"view{view}/{which}"] - result.pictures[f"view{view}/reference"]
-        squares, mask = np.square(difference, dtype=np.float64).mean(-1), None if masks is None else masks[view]
-        errors.append(float(np.sqrt(np.average(squares, weights=mask if mask is not None and mask.any() else None))))
-    return f"{formatting.number(float(np.mean(errors)))} with noise"
+    named = result.pictures
+    errors = [
+        root_mean_square(named[image_name(view, which)], named[f"view{view}/reference"], named.get(f"view{view}/mask"))
+        for view in views
+    ]
+    return f"{formatting.number(float(np.mean([error for error in errors if error is not None])))} with noise"
 
 
 def _error_line(problem: Problem, result: Result, key: str, before: float, after: float) -> str:
@@ -177,9 +175,8 @@ def summarise(console: Console, problem: Problem, result: Result, progress: Prog
     if result.resumed:
         table.add_row("resumed", f"at step {', '.join(map(str, result.resumed))}")
     if result.pictures:
-        masks = [None if view.mask is None else np.asarray(view.mask) for view in problem.views]
-        first, last = (image_error(result, which, masks) for which in ("initial", "result"))
-        where = " where masks count" if any(mask is not None for mask in masks) else ""
+        first, last = (image_error(result, which) for which in ("initial", "result"))
+        where = " where masks count" if any(view.mask is not None for view in problem.views) else ""
         removed = "" if last.endswith("noise") else ", noise removed"
         table.add_row("image error", f"{first} before, {last} after (root mean square{where}{removed})")
     if result.verification:

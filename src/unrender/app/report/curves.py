@@ -21,13 +21,13 @@ class ImageMetric:
     Attributes:
         description: the definition, for readers.
         larger_is_better: whether larger values are better.
-        compute: the function from (picture, reference) to a number, or None where the metric is undefined.
+        compute: the function from (picture, reference, mask or None) to a number, or None where the metric is undefined.
     """
 
     name: str
     description: str
     larger_is_better: bool
-    compute: Callable[[np.ndarray, np.ndarray], float | None]
+    compute: Callable[[np.ndarray, np.ndarray, np.ndarray | None], float | None]
 
 
 def available() -> list[ImageMetric]:
@@ -61,7 +61,7 @@ def measure_views(run: RunFolder) -> dict[int, dict[str, float | None]]:
     """Return {view: {name: value}} of the last pictures of `measured_views`."""
     views = {index: run.views[index] for index in measured_views(run)}
     return {
-        index: {metric.name: metric.compute(view.result, view.reference) for metric in available()}
+        index: {metric.name: metric.compute(view.result, view.reference, view.mask) for metric in available()}
         for index, view in views.items()
     }
 
@@ -156,8 +156,9 @@ def relative_error(run: RunFolder, keys: Sequence[str], start: Mapping[str, floa
 
 
 def image_error(run: RunFolder) -> float | None:
-    """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without pictures."""
-    return _mean([root_mean_square(view.result, view.reference) for view in run.views.values()])
+    """Return the error of the pictures of the result: root mean square over pixels and channels, mean over views; None without
+    pictures."""
+    return _mean([root_mean_square(view.result, view.reference, view.mask) for view in run.views.values()])
 
 
 def smoothed_loss(run: RunFolder, window: float) -> Series | None:

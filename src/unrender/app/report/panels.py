@@ -73,8 +73,8 @@ def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE
     """
     factor = metrics.exposure(shown.reference)
     what = name.lower()
-    error = tone_mapping.absolute_error(shown.result, shown.reference)
-    before = None if shown.initial is None else tone_mapping.absolute_error(shown.initial, shown.reference)
+    error = tone_mapping.absolute_error(shown.result, shown.reference, shown.mask)
+    before = None if shown.initial is None else tone_mapping.absolute_error(shown.initial, shown.reference, shown.mask)
     high = tone_mapping.colour_limit(error if before is None else before)
     result = encoder.colour(shown.result, factor, f"View {view}: the {what}")
     stacks: list[tuple[Slider | Figure, ...]] = [
@@ -117,7 +117,7 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures]) -> Panel:
     """
     reference = next(iter(shown.values())).reference
     factor = metrics.exposure(reference)
-    errors = {label: tone_mapping.absolute_error(of.result, of.reference) for label, of in shown.items()}
+    errors = {label: tone_mapping.absolute_error(of.result, of.reference, of.mask) for label, of in shown.items()}
     high = max(tone_mapping.colour_limit(error) for error in errors.values())
     stacks = tuple(
         (

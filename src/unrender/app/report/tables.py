@@ -153,7 +153,7 @@ def tiles(run: RunFolder) -> list[Tile]:
         all_tiles.append(measured)
     elif after is not None:
         views = run.views.values()
-        before = [root_mean_square(of.initial, of.reference) for of in views if of.initial is not None]
+        before = [root_mean_square(of.initial, of.reference, of.mask) for of in views if of.initial is not None]
         known = [error for error in before if error is not None]
         start = float(np.mean(known)) if len(known) == len(views) else None
         all_tiles.append(_tile("Image error", start, after, "RMSE"))
@@ -222,8 +222,8 @@ def view_rows(run: RunFolder) -> list[ViewRow]:
     return [
         ViewRow(
             view,
-            None if of.initial is None else root_mean_square(of.initial, of.reference),
-            root_mean_square(of.result, of.reference),
+            None if of.initial is None else root_mean_square(of.initial, of.reference, of.mask),
+            root_mean_square(of.result, of.reference, of.mask),
             measured.get(view, {}),
         )
         for view, of in run.views.items()

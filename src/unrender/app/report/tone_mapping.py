@@ -158,10 +158,11 @@ def colour_bar(low: float, high: float, label: str, name: str = VALUE_COLORMAP) 
     return ColourBar(tuple(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in stops), low, (low + high) / 2, high, label)
 
 
-def absolute_error(shown: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Return the mean of |shown - reference| over the channels: (H, W, C) -> (H, W)."""
+def absolute_error(shown: np.ndarray, reference: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+    """Return the mean of |shown - reference| over the channels: (H, W, C) -> (H, W); NaN where a mask (H, W) is 0."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.mean(np.abs(shown - reference), axis=-1)
+        error = np.mean(np.abs(shown - reference), axis=-1)
+    return error if mask is None else np.where(mask > 0, error, np.nan)
 
 
 def colour_limit(error: np.ndarray) -> float:

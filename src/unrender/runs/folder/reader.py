@@ -27,13 +27,14 @@ _MOST_LISTED = 1000
 
 @dataclass(frozen=True)
 class ViewPictures:
-    """Images of one view, each (H, W, 3), linear; and the sampling probability of pixels, (H, W)."""
+    """Images of one view, each (H, W, 3), linear; and the sampling probability of pixels and their weight in [0, 1], each (H, W)."""
 
     reference: np.ndarray
     result: np.ndarray
     initial: np.ndarray | None = None
     control_weight: np.ndarray | None = None
     pixel_probability: np.ndarray | None = None
+    mask: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -142,12 +143,18 @@ def read_record(path: Path, folder: Path) -> RunRecord:
     return schema.validate(RunRecord, bounded_files.read_object(path, folder), str(path))
 
 
-def root_mean_square(a: np.ndarray, b: np.ndarray) -> float | None:
-    """Return the root mean square difference; None if shapes differ (a refined parameter) or there are no elements."""
+def root_mean_square(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float | None:
+    """Return the root mean square difference of images (H, W, 3), with the weights of a mask (H, W).
+
+    None if shapes differ, or if there are no pixels.
+    """
     if a.shape != b.shape or a.size == 0:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.sqrt(np.mean((a - b) ** 2, dtype=np.float64)))
+        squares = np.asarray(np.mean((a - b) ** 2, axis=2, dtype=np.float64))
+        if mask is not None:
+            return float(np.sqrt(np.average(squares[mask > 0], weights=mask[mask > 0])))
+        return float(np.sqrt(np.mean(squares)))
 
 
 def _surface_error(values: np.ndarray, faces: np.ndarray, truth: Surface | None) -> float | None:
@@ -167,10 +174,12 @@ def pictures_by_view(arrays: dict[str, np.ndarray], path: Path) -> dict[int, Vie
         match = schema.PICTURE_NAME.fullmatch(name)
         if match is None:
             continue
-        if match[2] == "pixel_probability":
+        if match[2] in ("pixel_probability", "mask"):
             array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
             if array.ndim != 2 or 0 in array.shape:
                 raise InputError(f"{path}: {name}: expected shape (height, width), got {array.shape}")
+            if match[2] == "mask" and not (array.min() >= 0 and 0 < array.max() <= 1):
+                raise InputError(f"{path}: {name}: expected numbers from 0 to 1, not all 0")
         elif array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
             raise InputError(f"{path}: {name}: expected shape (height, width, 3), got {array.shape}")
         by_view.setdefault(int(match[1]), {})[match[2]] = array

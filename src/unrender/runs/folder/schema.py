@@ -11,7 +11,7 @@ A run writes what these models describe, and `reader` checks its input against t
 | `history.jsonl` | one JSON object per step, see `HISTORY_COLUMNS` |
 | `parameters.npz`, `initial.npz`, `truth.npz` | {key: array}, float32: the best verified, the initial, and the known true values |
 | `last.npz` | {key: array} after the last step, if `parameters.npz` contains better ones of an earlier step |
-| `pictures.npz` | {"view0/reference": (H, W, 3), ...}, linear: `reference`, `initial`, `result`, `control_weight` |
+| `pictures.npz` | {"view0/reference": (H, W, 3), ...}, linear: `reference`, `initial`, `result`, `control_weight`; `mask`, (H, W) |
 | `sensitivity.npz` | {key: array}: change of the images per unit of each element; where it is small, the value is noise or smoothing |
 | `standard_error.npz`, `data_share.npz` | {key: array} of textures: how certain each element is, see `Result` |
 | `meshes.npz`, `meshes/` | see `meshes.arrays_of`; PLY and OBJ files of the recovered meshes |
@@ -57,7 +57,7 @@ LIVE, LIVE_STATUS, LIVE_START, LIVE_VIEWS = "live", "status.json", "start.npz", 
 COMMANDS = ("run", "pause", "stop")
 """Commands of control.json."""
 
-PICTURE_NAME = re.compile(r"view([0-9]{1,6})/(reference|initial|result|control_weight|pixel_probability)")
+PICTURE_NAME = re.compile(r"view([0-9]{1,6})/(reference|initial|result|control_weight|pixel_probability|mask)")
 """Names of the arrays in pictures.npz, live/start.npz and live/views.npz."""
 
 HISTORY_AXES = ("seconds", "samples")
