@@ -108,9 +108,7 @@ def turntable(
     place = Path(out)
     _check(frames, rate, size, spp, elevation, background)
     axis = None if up is None else _axis(up)
-    check_video(place, overwrite)
-    if place.suffix.lower() == ".gif":
-        _hundredths(rate)
+    check_video(place, overwrite, rate)
     light = None if environment is None else scenes.read_light(Path(environment))
     problem, result = _opened(run, notify)
     with tempfile.TemporaryDirectory() as scratch:
@@ -214,8 +212,10 @@ def has_ffmpeg() -> bool:
     return importlib.util.find_spec("imageio_ffmpeg") is not None
 
 
-def check_video(path: Path, overwrite: bool) -> None:
-    """Raise `InputError` if a video cannot be written to `path`."""
+def check_video(path: Path, overwrite: bool, rate: float) -> None:
+    """Raise `InputError` if a video cannot be written to `path`, or cannot have the rate."""
+    if path.suffix.lower() == ".gif":
+        _hundredths(rate)
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"--out {path}: expected a name that ends in .mp4 or .gif, or the name of a folder")
     if path.suffix.lower() == ".mp4" and not has_ffmpeg():

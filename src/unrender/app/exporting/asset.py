@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import mitsuba as mi
 import numpy as np
@@ -123,7 +123,7 @@ def _turned_to_front(
     """Return faces and normals on the side of Mitsuba's shading normals, which a mirrored to_world and flip_normals may turn over."""
     corners = vertices[faces].astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    ray, hit = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)), mi.PreliminaryIntersection3f()
+    ray, hit = mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)), cast(Any, mi.PreliminaryIntersection3f())
     hit.prim_index, hit.prim_uv = mi.UInt32(np.arange(len(faces), dtype=np.uint32)), mi.Point2f(1 / 3, 1 / 3)
     front = np.array(shape.compute_surface_interaction(ray, hit, mi.RayFlags.All).sh_frame.n).T
     if np.sum(across * front) < 0:
