@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
 from unrender.core import arrays, memory
 from unrender.core.arrays import Array
@@ -26,18 +28,30 @@ def damping(residual: Array, variance: Array, tolerance: float) -> Array:
     return arrays.sqrt(square / (square + (tolerance * tolerance) * variance + 1e-20))
 
 
-def smoothed_variance(variance: Array) -> Array:
+def smoothed_variance(variance: Array, views: Sequence[tuple[slice, tuple[int, int]]] = ()) -> Array:
     """Return the variance (H, W, 3) averaged over neighbouring pixels, since the sample variance of few samples misses rare fireflies.
 
     Waits for the device.
+
+    Args:
+        views: slice and (height, width) of each view in a variance (N, 3) of pixels, which is 0 outside of them.
     """
+    values = arrays.numpy(variance)
+    if not views:
+        return arrays.like(_averaged(values), variance)
+    averaged = np.zeros_like(values)
+    for rows, size in views:
+        averaged[rows] = _averaged(values[rows].reshape(*size, 3)).reshape(-1, 3)
+    return arrays.like(averaged, variance)
+
+
+def _averaged(values: np.ndarray) -> np.ndarray:
     from scipy import ndimage
 
-    values = arrays.numpy(variance)
     for _ in range(2):
         for axis in (0, 1):
             values = ndimage.uniform_filter1d(values, _SIDE, axis, mode="nearest")
-    return arrays.like(values.clip(min=0.0), variance)
+    return values.clip(min=0.0)
 
 
 class GradientSum:

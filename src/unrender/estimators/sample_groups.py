@@ -20,11 +20,23 @@ from unrender.estimators import emitter_selection
 from unrender.estimators.emitter_selection import EmitterRequest
 from unrender.estimators.gradient_sum import GradientSum, damping, smoothed_variance
 from unrender.images.base import ImageEstimate, ImageEstimator, PairRequest, leave_one_out
+from unrender.images.plain import Plain
+from unrender.images.recursive_control_variate import RecursiveControlVariate, RecursiveControlVariateState
 from unrender.pixels.adaptive_counts import AdaptiveCounts
 from unrender.pixels.all import All
 from unrender.pixels.base import DrawStatistics, MiniBatch, PixelSampler
 from unrender.rendering.renderer import EmitterMoments, RenderSession, SampleRequest
-from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample, SampleCounts, full_views
+from unrender.scene.batches import (
+    Frame,
+    FullView,
+    ImagesOfViews,
+    JoinedViews,
+    PixelBatch,
+    PixelSample,
+    SampleCounts,
+    full_views,
+    joined_views,
+)
 from unrender.scene.problem import Problem
 
 PIXELS = 1 << 32
@@ -61,9 +73,9 @@ class GradientSample:
     fresh: Tree
     noise: Tree
     losses: list[Array]
-    images: dict[int, Array]
+    images: Mapping[int, Array]
     samples: int
-    info: dict[str, dict[int, Any]]
+    info: Mapping[str, Mapping[int, Any]]
     image: Any
     draws: DrawStatistics | None = None
     connections: EmitterMoments | None = None
@@ -115,7 +127,19 @@ class GradientRequest:
         sample, shares = (self.batch.sample, self.batch.shares) if self.batch else (None, None)
         likely = None if self.emitters is None else self.emitters.probabilities
         frames: Sequence[Frame] = [PixelBatch(problem, sample, likely)] if sample is not None else ()
-        return GatheredFrames(self, frames or full_views(problem, shares, self.spp, likely))
+        frames = frames or self._joined_views(problem) or full_views(problem, shares, self.spp, likely)
+        return GatheredFrames(self, frames)
+
+    def _joined_views(self, problem: Problem) -> list[JoinedViews]:
+        """Return frames of several views; [] if the request does not support them, or if the state is that of single views."""
+        shares = self.batch.shares if self.batch else None
+        known = isinstance(self.image, (Plain, RecursiveControlVariate))
+        one_set = leave_one_out_groups(self.spp, self.adjoint_spp) > 1 and self.pair_request is None
+        if not (known and one_set) or shares is not None or self.emitters is not None:
+            return []
+        frames = joined_views(problem, self.spp, self.key)
+        views = self.state.views if isinstance(self.state, RecursiveControlVariateState) else ()
+        return frames if len(views) in (0, len(frames)) else []
 
     def estimate_frame(self, problem: Problem, frame: Frame, key: Key) -> FrameGradient:
         """Return the contribution of one frame, computed in this process. `key` is the random key of the frame."""
@@ -197,22 +221,25 @@ class GatheredFrames:
     def result(self, problem: Problem) -> GradientSample:
         """Return the estimate of all frames."""
         batch, parts = self._request.batch, self._parts
-        info: dict[str, dict[int, Any]] = (
-            {"pixel_probability": batch.probability} if batch and batch.probability else {}
-        )
+        info: dict[str, Any] = {"pixel_probability": batch.probability} if batch and batch.probability else {}
         images: dict[int, Array] = {}
+        joined: dict[str, list[tuple[JoinedViews, Array]]] = {}
         for frame, part in zip(self.frames, parts, strict=True):
             if isinstance(frame, FullView):
                 images[frame.view] = part.image
                 for name, value in part.info.items():
                     info.setdefault(name, {})[frame.view] = value
+            elif isinstance(frame, JoinedViews):
+                for name, value in {"images": part.image, **part.info}.items():
+                    joined.setdefault(name, []).append((frame, value))
+        shown = {name: ImagesOfViews(of) for name, of in joined.items()}
         connections = [part.connections for part in parts if part.connections is not None]
         return GradientSample(
             **{name: total.result() for name, total in self._sums.items()},
             losses=[part.loss for part in parts],
-            images=images,
+            images=shown.pop("images", images),
             samples=(batch.samples if batch else 0) + sum(part.samples for part in parts),
-            info=info,
+            info=info | shown,
             image=_image_state(problem, self._request, batch.sample if batch else None, parts),
             draws=_concatenated([part.draws for part in parts if part.draws is not None]),
             connections=functools.reduce(operator.add, connections) if connections else None,
@@ -320,17 +347,10 @@ def _derivative(problem: Problem, frame: Frame, variance: Array | None, toleranc
         case FullView():
             around, reference = (frame.expand(x) for x in (smoothed_variance(variance), problem.reference(frame.view)))
         case PixelBatch(complete_views=complete) if complete:
-            around, reference = _variance_by_views(variance, complete), frame.targets[0]
+            around, reference = smoothed_variance(variance, complete), frame.targets[0]
         case _:
             return frame.loss_derivative
     return lambda images: frame.loss_derivative(images) * damping(images - reference, around, tolerance)
-
-
-def _variance_by_views(variance: Array, complete: Sequence[tuple[slice, tuple[int, int]]]) -> Array:
-    """Return `smoothed_variance` of the pixels (N, 3) of complete views; 0 for the padding pixels after them."""
-    parts = [arrays.rows(smoothed_variance(arrays.reshape(variance[rows], (*size, 3)))) for rows, size in complete]
-    rest = variance[complete[-1][0].stop :]
-    return arrays.concatenate([*parts, rest * 0.0] if int(arrays.shape(rest)[0]) else parts)
 
 
 def _noise_weights(derivative: Callable[[Array], Array], images: Array, others: Array, weights: Array) -> Array:
@@ -362,9 +382,10 @@ def fresh_weights(problem: Problem, frame: Frame, image: ImageEstimate, others: 
         weights: loss derivative at these; it must be damped (`tolerance`) if it is not linear, since the secant would be unbounded.
     """
     fresh = image.fresh_others()
-    if problem.loss.linear or not isinstance(frame, FullView):
+    if problem.loss.linear or not isinstance(frame, (FullView, JoinedViews)):
         return frame.loss_derivative(fresh)
-    reference = frame.expand(problem.reference(frame.view))
+    full = isinstance(frame, FullView)
+    reference = frame.expand(problem.reference(frame.view)) if full else frame.targets[0]
     residual = others - reference
     square = residual * residual
     return weights * residual * (fresh - reference) / (square + 1e-12)

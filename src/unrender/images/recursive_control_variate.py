@@ -20,10 +20,11 @@ from unrender.core.registry import register
 from unrender.core.trees import Tree
 from unrender.images.base import ImageEstimate, PairRequest, needs_whole_views, variance_of_mean
 from unrender.rendering.renderer import Rendering, Space
-from unrender.scene.batches import Frame, FullView, PixelBatch, PixelSample, SampleCounts
+from unrender.scene.batches import Frame, FullView, JoinedViews, PixelBatch, PixelSample
 from unrender.scene.problem import Problem
 from unrender.scene.upsampling import Upsampler
 from unrender.statistics import welford
+from unrender.statistics.paired_losses import slices_of_images
 from unrender.statistics.recursion import advance
 
 _MOST_PIXELS = 64
@@ -33,7 +34,7 @@ proportion to all pixels."""
 
 @dataclass(frozen=True)
 class ViewMemory:
-    """Control variate of one view and its statistics; every array is (H, W, 3).
+    """Control variate of a view and its statistics; every array is (H, W, 3), or (N, 3) for the pixels of several views.
 
     Attributes:
         image: the control variate ⟨F_n⟩_CV.
@@ -42,6 +43,7 @@ class ViewMemory:
         variance: variance of `image` by the recurrence in absolute units; 0 before statistics exist.
         current, previous, joint: running statistics of ⟨F_n⟩_n, of ⟨F_{n-1}⟩_n, and of both, per step or per sample as for
             `relative_variance`.
+        sizes: (height, width) of each of several views; () for one view.
     """
 
     image: Array
@@ -50,6 +52,22 @@ class ViewMemory:
     current: welford.State
     previous: welford.State
     joint: welford.State
+    sizes: tuple[tuple[int, int], ...] = ()
+
+    def of_views(self) -> tuple[ViewMemory, ...]:
+        """Return the memory of each view."""
+        if not self.sizes:
+            return (self,)
+        parts = [part for name, part in vars(self).items() if name != "sizes"]
+        cut = zip(slices_of_images(self.sizes), self.sizes, strict=True)
+        return tuple(ViewMemory(*(_of_view(part, rows, size) for part in parts)) for rows, size in cut)
+
+
+def _of_view(part: Any, rows: slice, size: tuple[int, int]) -> Any:
+    """Return one view of an array (N, 3), or of the arrays of statistics."""
+    if isinstance(part, welford.State):
+        return welford.State(**{name: _of_view(x, rows, size) for name, x in vars(part).items()})
+    return arrays.reshape(part[rows], (*size, 3)) if len(arrays.shape(part)) == 2 else part
 
 
 @dataclass(frozen=True)
@@ -73,7 +91,7 @@ class RecursiveControlVariateState:
 
     Attributes:
         parameters: parameters of the last step of full views; None before the first.
-        views: control variate and statistics of each view; empty before the first step.
+        views: control variate and statistics of each view, or of several views each; empty before the first step.
         snapshot: control variate for pixel mini-batches; None without them.
         step: number of steps of full views. `PairRequest.step` must equal it.
     """
@@ -87,9 +105,13 @@ class RecursiveControlVariateState:
         """Return the state with the previous parameters interpolated; images are unchanged."""
         return self if self.parameters is None else replace(self, parameters=upsampler.tree(self.parameters))
 
+    def of_views(self) -> tuple[ViewMemory, ...]:
+        """Return the memory of each view."""
+        return tuple(memory for joined in self.views for memory in joined.of_views())
+
     def control_variates(self) -> tuple[Tree, tuple[Array, ...]] | None:
         """Return the parameters of the control variates, and the control variate of each view; None before the first step."""
-        return None if self.parameters is None else (self.parameters, tuple(memory.image for memory in self.views))
+        return None if self.parameters is None else (self.parameters, tuple(memory.image for memory in self.of_views()))
 
 
 @register
@@ -202,8 +224,8 @@ class RecursiveControlVariate:
         if snapshot is None or not self.learn_from_draws:
             return memory
         sizes = [arrays.shape(other.image) for other in state.views]
-        first = sum(math.prod(size[:2]) for size in sizes[:view])
-        rows = slice(first, first + math.prod(sizes[view][:2]))
+        first = sum(math.prod(size[:-1]) for size in sizes[:view])
+        rows = slice(first, first + math.prod(sizes[view][:-1]))
         image, relative = (arrays.reshape(x[rows], sizes[view]) for x in (snapshot.image, snapshot.relative_variance))
         known = memory.relative_variance > 0
         shrunk = arrays.where(known, relative / arrays.where(known, memory.relative_variance, 1.0), 1.0)
@@ -243,18 +265,18 @@ class RecursiveControlVariate:
         if pair_request is not None and pair_request.batches:
             requested = session.image_pair(parameters, pair_request.previous, request, self.space)
         match frame:
+            case FullView() | JoinedViews():
+                if first:
+                    images, previous_images, counts = rendering.images, rendering.previous, frame.counts
+                    variance = variance_of_mean(images, counts)
+                    estimate = ImageEstimate(images, rendering.paths, {}, previous_images, variance, counts=counts)
+                    return estimate, self._start(estimate.mean(), frame)
+                return self._combine_view(self._with_mini_batches(state, frame.memory), rendering, requested, frame)
             case PixelBatch():
                 if first or state.snapshot is None:
                     raise InputError("RecursiveControlVariate: a pixel mini-batch needs an earlier step of full views")
                 contribution = arrays.mean_over_first(rendering.previous)
                 return self._combine_pixels(problem, state.snapshot, frame, rendering, requested), contribution
-            case FullView():
-                if first:
-                    images, previous_images, counts = rendering.images, rendering.previous, frame.counts
-                    variance = variance_of_mean(images, counts)
-                    estimate = ImageEstimate(images, rendering.paths, {}, previous_images, variance, counts=counts)
-                    return estimate, self._start(estimate.mean(), counts)
-                return self._combine_view(self._with_mini_batches(state, frame.view), rendering, requested, frame)
         raise InputError(f"RecursiveControlVariate: expected a full view or a pixel mini-batch, got {frame!r}")
 
     @staticmethod
@@ -275,7 +297,7 @@ class RecursiveControlVariate:
         return ImageEstimate(current, requested.paths, previous=previous, variance=variance)
 
     def _combine_view(
-        self, memory: ViewMemory, rendering: Rendering, requested: Rendering, frame: FullView
+        self, memory: ViewMemory, rendering: Rendering, requested: Rendering, frame: FullView | JoinedViews
     ) -> tuple[ImageEstimate, ViewMemory]:
         """Return both images of a view, (groups, H, W, 3) or samples (1, N, 3), and the next memory; `requested` renders the previous
         one."""
@@ -335,13 +357,14 @@ class RecursiveControlVariate:
         )
         return arrays.minimum(best, self.max_weight)
 
-    def _start(self, image: Array, counts: SampleCounts | None) -> ViewMemory:
+    def _start(self, image: Array, frame: FullView | JoinedViews) -> ViewMemory:
         """Return the memory after the first step, whose image is its own control variate (Eq. 7)."""
         empty = welford.init(image)
         relative = image * 0.0 + 1.0
-        if counts is not None:
-            relative = relative / counts.divisors
-        return ViewMemory(image, relative, image * 0.0, empty, empty, empty)
+        if frame.counts is not None:
+            relative = relative / frame.counts.divisors
+        sizes = tuple(size for _, size in frame.complete_views) if isinstance(frame, JoinedViews) else ()
+        return ViewMemory(image, relative, image * 0.0, empty, empty, empty, sizes)
 
     def _observe(self, memory: ViewMemory, F: Array, H: Array, number: Array | float) -> ViewMemory:
         return replace(

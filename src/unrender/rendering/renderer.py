@@ -116,6 +116,7 @@ class SampleRequest:
             samples as the full one. None if the chosen pixels are the full mini-batch.
         emitters: probability of each emitter in emitter sampling, (E,), sum 1, see `EmitterSession`; None for the scene's own.
         both_gradients: for a pair, whether `adjoint_pair` will be called, not `adjoint` alone. False saves memory and time.
+        seeds: seed of each chosen pixel in place of `seed`, with `sensors` and `positions`; for renderers with `joins_views` only.
     """
 
     sensor: int
@@ -127,6 +128,7 @@ class SampleRequest:
     positions: Array | None = None
     emitters: np.ndarray | None = None
     both_gradients: bool = False
+    seeds: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -11,8 +11,13 @@ import numpy as np
 
 from unrender.core import arrays
 from unrender.core.arrays import Array
+from unrender.core.random import Key
 from unrender.rendering.renderer import SampleRequest
 from unrender.scene.problem import Problem
+from unrender.statistics.paired_losses import slices_of_images
+
+_MOST_JOINED = 1 << 15
+"""Maximum number of paths of a launch of several views."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +162,11 @@ class FullView:
     emitters: np.ndarray | None = None
 
     @property
+    def memory(self) -> int:
+        """Index of this frame in its step."""
+        return self.view
+
+    @property
     def pixels(self) -> int:
         height, width = self.problem.renderer.resolutions()[self.problem.views[self.view].sensor]
         return height * width
@@ -231,6 +241,88 @@ class PixelBatch:
     def loss_derivative(self, image: Array) -> Array:
         reference, factor = self.targets
         return self.problem.loss.derivative(image, reference) * (factor * self.sample.weights)
+
+
+@dataclass(frozen=True)
+class JoinedViews(PixelBatch):
+    """All pixels of consecutive views in one launch. Each view has the random numbers of a launch of its own.
+
+    Attributes:
+        memory: index of this frame in its step.
+        views: indices of the views.
+        seeds: seed of each pixel, (N,), integers.
+    """
+
+    memory: int = 0
+    views: range = range(0)
+    seeds: Array = None
+    counts = None
+
+    @cached_property
+    def complete_views(self) -> tuple[tuple[slice, tuple[int, int]], ...]:
+        """Slice and (height, width) of each view, in order."""
+        sizes = self.problem.sizes[self.views.start : self.views.stop]
+        return tuple(zip(slices_of_images(sizes), sizes, strict=True))
+
+    def request(self, spp: int, seed: int, groups: int = 1) -> SampleRequest:
+        return replace(super().request(spp, seed, groups), seeds=self.seeds)
+
+    def expand(self, image: Array) -> Array:
+        """Return an image (N, C) unchanged."""
+        return image
+
+
+class ImagesOfViews(Mapping[int, Array]):
+    """{view: image (H, W, 3)}, cut from the images (N, 3) of frames when it is read."""
+
+    def __init__(self, joined: Sequence[tuple[JoinedViews, Array]]):
+        self._joined = {view: part for part in joined for view in part[0].views}
+
+    def __getitem__(self, view: int) -> Array:
+        frame, image = self._joined[view]
+        rows, size = frame.complete_views[view - frame.views.start]
+        return arrays.reshape(image[rows], (*size, 3))
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._joined)
+
+    def __len__(self) -> int:
+        return len(self._joined)
+
+
+def joined_views(problem: Problem, spp: int, key: Key) -> list[JoinedViews]:
+    """Return the full views of a step as frames of equally many views; [] if views should be rendered one by one.
+
+    A launch of few paths takes longer to start than to trace.
+
+    Args:
+        spp: samples per pixel.
+        key: random key of the step.
+    """
+    sizes, count = [height * width for height, width in problem.sizes], len(problem.views)
+    fitting = _MOST_JOINED // (spp * max(sizes))
+    several = max((n for n in range(1, fitting + 1) if count % n == 0), default=1)
+    if several == 1 or (several < count and len(set(sizes)) > 1) or not _supports_joined(problem):
+        return []
+    frames = []
+    for first in range(0, count, several):
+        views = range(first, first + several)
+        own, pixels, weights = problem.references.complete(views)
+        seeds = [np.full(sizes[view], key.fold(view).fold(0).uint32(), np.uint32) for view in views]
+        sample = PixelSample(own, pixels, weights, pixels)
+        joined = arrays.like_integers(np.concatenate(seeds), weights)
+        frames.append(JoinedViews(problem, sample, None, len(frames), views, joined))
+    return frames
+
+
+def _supports_joined(problem: Problem) -> bool:
+    """Return whether views can share launches: with a loss of pixels, several sensors, and nothing that moves."""
+    if not getattr(problem.renderer, "joins_views", False) or not problem.loss.pixelwise:
+        return False
+    known = problem.renderer.parameters()
+    moves = any(info.rigid or info.viewpoint or info.moving_mesh for info in (known[key] for key in problem.shapes()))
+    several = len({view.sensor for view in problem.views}) > 1
+    return several and not moves and not problem.references.in_host_memory
 
 
 def full_views(

@@ -46,6 +46,7 @@ class References:
         self._sizes = [_size(view.reference) for view in views]
         self._factors = [view.weight / size for view, size in zip(views, self._sizes, strict=True)]
         self.in_host_memory = 4 * sum(self._sizes) > on_device
+        self._complete: dict[range, tuple[Array, Array, Array]] = {}
 
     @cached_property
     def sensors(self) -> Array:
@@ -66,6 +67,16 @@ class References:
         if self._all_masks is not None:
             factors = factors * arrays.gather_rows(self._all_masks, row)
         return arrays.gather_rows(self._all_references, row), factors
+
+    def complete(self, views: range) -> tuple[Array, Array, Array]:
+        """Return view and index of each pixel of these views in order, (N,), integers, and ones (N, 1). The result is stored."""
+        if views not in self._complete:
+            counts = [self._sizes[view] // 3 for view in views]
+            ones = self._array(np.ones((sum(counts), 1)))
+            pixels = np.concatenate([np.arange(count) for count in counts])
+            integers = [arrays.like_integers(x, ones) for x in (np.repeat(views, counts), pixels)]
+            self._complete[views] = (integers[0], integers[1], ones)
+        return self._complete[views]
 
     def rows(self, views: Array, pixels: Array) -> Array:
         """Return the index of these pixels in the concatenation of all views, (N,)."""

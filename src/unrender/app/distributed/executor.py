@@ -198,7 +198,8 @@ class DistributedExecutor:
             return None
         if isinstance(state.views, Memory):
             return state.views
-        packed = (pack(tuple(state.views[view] for view in share)) for share in self._shares)
+        views = state.of_views()
+        packed = (pack(tuple(views[view] for view in share)) for share in self._shares)
         return self._memories.stored(tuple(packed))
 
     def _call(self, request: GradientRequest, memory: Memory | None) -> tuple[Call, dict[int, Sent]]:

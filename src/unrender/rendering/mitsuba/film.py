@@ -182,11 +182,12 @@ def camera_samples_of_many(
     Args:
         sensors: `mitsuba.SensorPtr`, all sensors of the scene.
         films: data of all films, with the index of each pixel's sensor.
-        sampler, seed, spp, pixels, count: see `camera_samples`.
+        seed: see `camera_samples`, or the seed of each pixel.
+        sampler, spp, pixels, count: see `camera_samples`.
     """
     lanes = count * spp
-    _seed(sampler, seed, lanes)
     pixel, which = (per_sample(of_pixel, spp, count) for of_pixel in (pixels, films.which))
+    _seed(sampler, seed if dr.width(seed) == 1 else per_sample(seed, spp, count), lanes)
     width, height = dr.gather(mi.UInt32, films.widths, which), dr.gather(mi.UInt32, films.heights, which)
     # LLVM pads its vectors with lanes that read 0. A division by this 0 would abort the process.
     y = pixel // dr.maximum(width, 1)

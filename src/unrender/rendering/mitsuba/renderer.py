@@ -65,12 +65,15 @@ class MitsubaRenderer:
 
     Attributes:
         light_paths: settings of the light paths.
+        joins_views: whether requests may have the seeds of several views.
         max_depth: maximum path length in segments.
         requested_depth: the argument `max_depth`.
         notices: one line for each setting of the scene that is not used.
 
     Raises `InputError` if Mitsuba refuses the description.
     """
+
+    joins_views = True
 
     def __init__(
         self,

@@ -374,7 +374,7 @@ class MitsubaSession:
         outside = not are_recordable(pair.current.sensors()[request.sensor], several)
         # Each resolution of a texture or grid needs its own recording, since a replay with another one would fail.
         shapes = pair.loaded().shapes()
-        absent = tuple(part is None for part in (request.pixels, request.positions, request.emitters))
+        absent = tuple(part is None for part in (request.pixels, request.positions, request.emitters, request.seeds))
         key = (task, size, request.groups, several, outside, shapes, *absent)
         posed = None if isinstance(task, PosesPass) else self._posed_scene(task.previous)
         if key not in self._functions:
@@ -385,7 +385,9 @@ class MitsubaSession:
         tables = task.tables(pair, self._delta_table, None if several else request.sensor) | self._rough.tables
         if request.emitters is not None and len(self.emitters()) > 1:
             tables |= pair.emitter_tables(task.previous, request.emitters)
-        seeds = dr.opaque(mi.UInt32, request.seed), request.positions  # a constant would record each kernel again
+        # A constant would record each kernel again.
+        seed = dr.opaque(mi.UInt32, request.seed) if request.seeds is None else request.seeds
+        seeds = seed, request.positions
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
         prepare: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
