@@ -1041,3 +1041,18 @@ def test_arrays_of_an_earlier_end_do_not_outlast_it(tmp_path: Path) -> None:
     result.save(tmp_path)
     gone = names - {path.name for path in tmp_path.iterdir()}
     assert gone == {"sensitivity.npz", "standard_error.npz", "data_share.npz", "pictures.npz"}
+
+
+@pytest.mark.mitsuba
+@pytest.mark.parametrize("folder", [False, True])
+def test_no_reference_differs_from_pictures_whose_loss_has_none(folder: bool, tmp_path: Path) -> None:
+    """The references of a function of the image alone are placeholders."""
+    import drjit as dr
+
+    problem = smooth(0.0, 0, known=False)
+    views = [replace(view, reference=np.zeros_like(np.asarray(view.reference))) for view in problem.views]
+    problem = problem.replaced(views=views, loss=lambda image: dr.square(dr.mean(image, axis=None) - 1.0))
+    directory = tmp_path if folder else None
+    result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.05), steps=300, run_directory=directory)
+    assert (result.status, result.misfit, result.warnings) == ("finished", None, [])
+    assert not any("least-squares" in line for line in result.undetermined)

@@ -16,7 +16,7 @@ from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements
 from unrender.runs.numbers import MOST_ELEMENTS
 from unrender.runs.result import Result
-from unrender.runs.verification import LOST, Misfit, residuals_of_views
+from unrender.runs.verification import LOST, Misfit, compares, residuals_of_views
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
@@ -307,7 +307,7 @@ def with_lost(
         remaining: function that returns the remaining seconds. The test ends before an unknown for which they do not suffice.
     """
     remeshed = problem.remeshed_from is not None  # the initial values are then those of another mesh
-    if not keys or remeshed or len(ends[0]) < 2 or result.verification.get("best") != "end":
+    if not keys or remeshed or len(ends[0]) < 2 or not compares(problem) or result.verification.get("best") != "end":
         return difference
     residuals, references, weights, _ = residuals_of_views(problem, range(len(ends)), ends)
     products = (residuals[0::2].mean(axis=0) * residuals[1::2].mean(axis=0)).sum(axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 
 from unrender.core.errors import InputError
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
-from unrender.runs.verification import STEPS, STEPS_OF_FEW, Misfit, misfit, prior_cause
+from unrender.runs.verification import STEPS, STEPS_OF_FEW, Misfit, compares, misfit, prior_cause
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import difference
 
@@ -143,6 +143,8 @@ def no_improvement(
         residuals: differences of K >= 2 independent images from the references, (K, N, 3).
         references, weights, sizes: see `misfit`.
     """
+    if not compares(problem):
+        return None
     step, fall = change.get("step", 0), change.get("loss", (None, None))
     still = None not in fall and stays(loss, step, *fall)
     of = residuals[0::2], residuals[1::2], references, weights, sizes
@@ -188,7 +190,7 @@ def not_converged(problem: Problem, last: EarlierImage, earlier: EarlierImage) -
     residuals, pictures = last.residuals, last.pictures
     weights = pictures.weights_of(last.picture.images)
     of = residuals, residuals, pictures.references, weights, pictures.sizes
-    differs = misfit(*of, _OF_PICTURE_FALLING)
+    differs = misfit(*of, _OF_PICTURE_FALLING) if compares(problem) else None
     if differs is None:
         return None
     value, error = last.change(earlier, _FALLS)

@@ -15,7 +15,7 @@ from unrender.runs.determination import changed
 from unrender.runs.earlier_image import no_improvement
 from unrender.runs.folder.schema import MISFIT
 from unrender.runs.result import Result
-from unrender.runs.verification import PRIOR, STEPS, Misfit, misfit, residuals_of_views, without_prior
+from unrender.runs.verification import PRIOR, STEPS, Misfit, compares, misfit, residuals_of_views, without_prior
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import mean_square, slices_of_images
 
@@ -163,7 +163,7 @@ def renderings_of_check(problem: Problem) -> int:
     known, count = [problem.renderer.parameters()[key] for key in problem.unknowns], len(problem.unknowns)
     anywhere = any((of.rigid and of.light) or of.viewpoint or of.welded for of in known)
     priors = sum(unknown.prior is not None for unknown in problem.unknowns.values())
-    return 0 if anywhere or count > _MOST_KEYS else 1 + count + priors
+    return 0 if anywhere or count > _MOST_KEYS or not compares(problem) else 1 + count + priors
 
 
 def unexplained_pixels(

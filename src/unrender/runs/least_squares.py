@@ -24,6 +24,7 @@ from unrender.estimators.hybrid import HybridGradient, HybridState
 from unrender.runs.field_directions import add_field_directions, fields_of
 from unrender.runs.numbers import Differences, Numbers
 from unrender.runs.numbers_check import NumbersCheck
+from unrender.runs.verification import compares
 from unrender.scene.problem import Problem
 from unrender.statistics import scores
 
@@ -84,7 +85,7 @@ def check_numbers(
             A fit with other weights has another solution, and the distance from it would count as an error of the run.
     """
     numbers = Numbers.of(problem, values, start)
-    if numbers is None:
+    if numbers is None or not compares(problem):
         return NumbersCheck()
     numbers = replace(numbers, weights=weights)
     until = time.perf_counter() + seconds

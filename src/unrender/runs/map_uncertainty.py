@@ -26,7 +26,7 @@ from unrender.runs.image_sensitivity import (
 )
 from unrender.runs.least_squares import check_numbers, checked_keys
 from unrender.runs.result import Result
-from unrender.runs.verification import misfit_of_views
+from unrender.runs.verification import compares, misfit_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render, selected_views
 
@@ -181,6 +181,8 @@ def of_residuals(
     infos = problem.renderer.parameters()
     shapes = problem.shapes()
     reasons = {key: _refusal(infos[key], known, key) for key, shape in shapes.items() if len(shape) >= MAP_AXES}
+    if not compares(problem):
+        reasons = dict.fromkeys(reasons, "the loss does not compare pictures with the references")
     keys = [key for key, reason in reasons.items() if not reason]
     if not keys:
         return Uncertainty(missing=no_maps(reasons))

@@ -13,6 +13,7 @@ from unrender.core.arrays import Array
 from unrender.core.trees import Tree
 from unrender.display import formatting
 from unrender.estimators.fresh_pictures import FreshPictures, Picture
+from unrender.losses import FunctionLoss
 from unrender.methods.rules.starts import exchangeable_lights
 from unrender.runs.folder.schema import MISFIT
 from unrender.runs.folder.state import parts
@@ -171,6 +172,8 @@ def misfit_of_numbers(
         improved: whether the images are better than at the start.
         at_truth: see `Misfit.is_references_noise`.
     """
+    if not compares(problem):
+        return None
     infos = [problem.renderer.parameters()[key] for key in problem.shapes()]
     lights = all(info.rigid and info.light for info in infos)
     few = sum(math.prod(info.shape) for info in infos) <= _FEW_NUMBERS
@@ -218,6 +221,11 @@ def residuals_of_views(
     finite = np.isfinite(residuals.sum(axis=(0, 2)))
     weights = np.concatenate([np.ravel(x) for x in weights]) * finite
     return np.where(finite[:, None], residuals, 0.0), pixels, weights, sizes
+
+
+def compares(problem: Problem) -> bool:
+    """Return whether the loss compares pictures with the references, which a user's function of the picture alone does not."""
+    return not isinstance(problem.loss, FunctionLoss) or problem.loss.takes_reference
 
 
 def prior_cause(problem: Problem) -> tuple[str, tuple[str, ...]]:

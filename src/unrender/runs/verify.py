@@ -35,6 +35,7 @@ from unrender.runs.verification import (
     Memory,
     Misfit,
     compare_memory,
+    compares,
     control_variates,
     fit_status,
     misfit,
@@ -280,7 +281,7 @@ class Verify(Callback):
         # Averages over steps lower the loss without progress, so the comparison with an earlier step is of the last step itself.
         last = EarlierImage(result.steps, unaveraged, small)
         change = {"change": {"step": earlier.step, "loss": _numbers(*last.change(earlier, 1.0))}}
-        if not last.is_still(earlier):
+        if not (compares(problem) and last.is_still(earlier)):
             return not_converged(problem, last, earlier), change
         if averages:
             last = replace(last, picture=end if small is pictures else small.picture(result.parameters))
