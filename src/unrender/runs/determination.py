@@ -13,7 +13,7 @@ import numpy as np
 from unrender.core.errors import InputError
 from unrender.core.text import listed
 from unrender.runs.field_directions import TOO_SHORT
-from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements
+from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements, shown_elsewhere
 from unrender.runs.numbers import MOST_ELEMENTS
 from unrender.runs.result import Result
 from unrender.runs.verification import LOST, Misfit, compares, residuals_of_views
@@ -98,10 +98,9 @@ def undetermined(
         sensitivities: {key: array}, see `unrender.runs.sensitivity`.
         errors: {key: array}, standard errors of the values.
     """
-    known, lines = problem.renderer.parameters(), []
+    known, lines, longest, began = problem.renderer.parameters(), [], 0.0, time.perf_counter()
     unseen = {key for key, sensitivity in sensitivities.items() if not sensitivity.any()}
-    started, longest = time.perf_counter(), 0.0
-    until = {True: started + max(seconds, most), False: started + seconds}
+    until = {True: began + max(seconds, most), False: began + seconds}
     for key in sorted(problem.unknowns, key=lambda key: key not in unseen):
         info, (low, high) = known[key], problem.unknowns[key].bounds
         own, initial = np.asarray(values[key], np.float32), problem.unknowns[key].initial
@@ -121,7 +120,8 @@ def undetermined(
         first, last, detailed = ({**values, key: array} for array in (*ends, details))
         try:
             change = change_of_images(problem, first, last, spp, per_pass)
-            hidden = change.is_below(_LEAST)
+            of_all = sensitivities.get(key), np.subtract(*ends), _LEAST * math.sqrt(change.scale)
+            hidden = change.is_below(_LEAST) and not shown_elsewhere(problem, *of_all)
             if hidden and is_map and ranged:
                 change = change_of_images(problem, first, detailed, spp, per_pass)
         except InputError:  # the renderer rejects a value at the end of the range

@@ -249,7 +249,7 @@ def _undetermined(
     slow = min(slowdown(), MOST_SLOWDOWN)
     allowed = min(slow * max(_NUMBERS_SHARE * result.seconds, _LEAST_SECONDS), 2.0 * most)
     numbers = check_numbers(problem, result.parameters, result.initial, allowed, sensitivities, weights)
-    deviations = _without(result.standard_error, numbers.unchecked)
+    deviations = _without(result.standard_error, (*numbers.unchecked, *numbers.elsewhere))
     deviations |= numbers.standard_errors(result.parameters, deviations, complete)
     lines += undetermined(problem, result.parameters, spp, seconds, per_pass, most, sensitivities, deviations)
     text = "\n".join(line for line in lines if TOO_SHORT not in line)  # lines about what was tested

@@ -17,7 +17,7 @@ from unrender.core.trees import Tree
 from unrender.rendering.renderer import RenderSession
 from unrender.scene.bounds import off_ends
 from unrender.scene.problem import Problem
-from unrender.scene.render import as_tree, view_request
+from unrender.scene.render import as_tree, selected_views, view_request
 
 _PROBES, _MOST_SPP, _PATHS = 32, 4, 1 << 20
 MAP_AXES = 3
@@ -151,6 +151,19 @@ def curvature(
         for sums in (squares, noisy)
     )
     return Curvature(means, overlap, smooth, made, variances)
+
+
+def shown_elsewhere(problem: Problem, sensitivity: np.ndarray | None, step: np.ndarray | float, least: float) -> bool:
+    """Return whether a view beside those of `selected_views` may change by a root mean square of `least`.
+
+    Args:
+        sensitivity: change of all views per unit of each element, see `sensitivity`; None if it is unknown.
+        step: change of the elements.
+    """
+    if sensitivity is None or len(selected_views(problem)) == len(problem.views):
+        return False
+    largest = max(height * width for height, width in problem.sizes)
+    return float(np.sum(np.square(sensitivity * step, dtype=np.float64))) > 3 * largest * least**2
 
 
 def _overlap(squares: np.ndarray, probes: int, stored: list[tuple[np.ndarray, np.ndarray]]) -> float:

@@ -22,6 +22,7 @@ from unrender.estimators.derivative_images import noise_weights
 from unrender.estimators.gauss_newton import GaussNewton, GaussNewtonState
 from unrender.estimators.hybrid import HybridGradient, HybridState
 from unrender.runs.field_directions import add_field_directions, fields_of
+from unrender.runs.image_sensitivity import shown_elsewhere
 from unrender.runs.numbers import Differences, Numbers
 from unrender.runs.numbers_check import NumbersCheck
 from unrender.runs.verification import compares
@@ -90,7 +91,7 @@ def check_numbers(
     numbers = replace(numbers, weights=weights)
     until = time.perf_counter() + seconds
     try:
-        return _check(numbers, sensitivities, until)
+        return _of_tested_views(_check(numbers, sensitivities, until), numbers, sensitivities)
     except (InputError, np.linalg.LinAlgError):  # a value that the renderer rejects, or matrices without eigenvalues
         return NumbersCheck()
 
@@ -162,6 +163,19 @@ def _check(numbers: Numbers, sensitivities: Mapping[str, np.ndarray], until: flo
         directions, length = _directions(again, numbers.limits, change)
     check = _checked(numbers, _Fit.of(numbers, *_repeated(numbers, directions, key, until - 2.0 * longest)), widths)
     return replace(check, errors={}, unchecked=numbers.keys, fixed=fixed) if fixed else check
+
+
+def _of_tested_views(check: NumbersCheck, numbers: Numbers, sensitivities: Mapping[str, np.ndarray]) -> NumbersCheck:
+    """Return a check without what it says of numbers that only other views show."""
+    least, places = _FLAT * _SHIFT * numbers.slope(), numbers.places()
+    keys = tuple(
+        key
+        for key in check.undetermined
+        if shown_elsewhere(numbers.problem, sensitivities.get(key), float(numbers.limits[places[key]].max()), least)
+        and not np.isfinite(check.errors.get(key, np.inf)).any()
+    )
+    undetermined, errors = ({k: x for k, x in of.items() if k not in keys} for of in (check.undetermined, check.errors))
+    return replace(check, undetermined=undetermined, errors=errors, elsewhere=keys)
 
 
 def _repeated(

@@ -116,22 +116,22 @@ def uncertainty(
     """
     values, weights = (values.parameters, values.pixel_weights) if isinstance(values, Result) else (values, ())
     as_tree(problem, values)  # refuses other keys and shapes
-    until = time.perf_counter() + seconds
-    known, maps = Curvature(), Uncertainty()
-    keys = checked_keys(problem, values, problem.initial_values())
-    mapped = map_keys(problem)
+    known, maps, until = Curvature(), Uncertainty(), time.perf_counter() + seconds
+    keys, mapped = checked_keys(problem, values, problem.initial_values()), map_keys(problem)
     if mapped or keys:
         views = range(len(problem.views)) if mapped else selected_views(problem)
         halves = _halves(problem, values, views, seed)
         if differs := misfit_of_views(problem, views, list(zip(*halves, strict=True))):
             return Uncertainty(missing=(differs.line,))
+        if mapped or len(views) < len(problem.views):
+            noise = pixel_noise(problem, halves) if mapped else ()
+            known = curvature(problem, values, seconds=seconds, seed=seed, noise=noise)
         if mapped:
-            known = curvature(problem, values, seconds=seconds, seed=seed, noise=pixel_noise(problem, halves))
             maps = of_residuals(problem, values, halves, known, seed)
     left = until - time.perf_counter()
     numbers = check_numbers(problem, values, problem.initial_values(), left, known.sensitivity(), weights)
     errors = {**numbers.standard_errors(values), **maps.standard_error}
-    others = _others(problem, keys, {*mapped, *errors, *numbers.unchecked, *numbers.fixed})
+    others = _others(problem, keys, {*mapped, *errors, *numbers.unchecked, *numbers.elsewhere, *numbers.fixed})
     return Uncertainty(errors, maps.data_share, (*maps.missing, *numbers.missing(), *others), maps.limited)
 
 

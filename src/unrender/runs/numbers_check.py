@@ -26,6 +26,7 @@ class NumbersCheck:
         noise: {key: standard errors of the steps by the noise of this check}.
         unchecked: keys of the numbers whose standard errors are unknown.
         blind: keys of the numbers whose influence on the pictures is hidden by the noise of this check.
+        elsewhere: keys of the numbers that only other views show than the tested ones.
         fixed: {key: reason} of unknowns that trade off against the numbers in directions that the test leaves out; {} if there was no
             time for the test.
     """
@@ -37,17 +38,18 @@ class NumbersCheck:
     noise: Mapping[str, np.ndarray] = field(default_factory=dict)
     unchecked: tuple[str, ...] = ()
     blind: tuple[str, ...] = ()
+    elsewhere: tuple[str, ...] = ()
     fixed: Mapping[str, str] = field(default_factory=dict)
 
     def missing(self, reported: Collection[str] = ()) -> list[str]:
-        """Return at most one line: why the standard errors of the unchecked numbers are unknown.
+        """Return lines: why the standard errors of the unchecked numbers, and of those of other views, are unknown.
 
         Args:
             reported: keys to leave out, since other lines are about them.
         """
         keys = [key for key in self.unchecked if key not in reported]
         if not keys:
-            return []
+            return [f"{key}: no standard error: the views that are tested do not show it" for key in self.elsewhere]
         if not self.fixed:
             return [f"whether {listed(keys)} converged: {TOO_SHORT}"]
         others = listed([f"{key} ({reason})" for key, reason in self.fixed.items()])
