@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from tiers import quick
 from unrender.core.errors import InputError
 from unrender.gallery import meshes
 from unrender.rendering.mitsuba.integrators.boundary_sampling import EmitterPoints
@@ -50,6 +51,14 @@ def off_centre() -> dict[str, Any]:
     described["sensor"] |= {"principal_point_offset_x": 0.12, "principal_point_offset_y": -0.08}
     described["sensor"]["film"] |= {**film, "crop_offset_x": 3, "crop_offset_y": 2}
     return described
+
+
+def screened() -> dict[str, Any]:
+    """A sheet before the near clipping plane, which nobody sees, hides half of the block from the camera itself."""
+    described = block()
+    sheet = mi.ScalarTransform4f().translate([-0.25, 0, 3.4]).scale([0.25, 0.5, 1])
+    described["sensor"]["near_clip"] = 1.0
+    return described | {"sheet": {"type": "rectangle", "to_world": sheet, "bsdf": {"type": "diffuse"}}}
 
 
 def receiver() -> dict[str, Any]:
@@ -219,6 +228,7 @@ def test_points_on_emitters_span_the_solid_angle_that_each_emitter_has() -> None
     [
         (block, "moving.rotation.x", 2),
         (off_centre, "moving.translation.z", 2),
+        (screened, "moving.translation.z", 2),
         (block, "moving.scale", 3),
         (block, "moving.translation.y", 4),
         (block, "moving.translation.z", 6),
@@ -287,3 +297,34 @@ def test_moving_mirrors_and_glass_have_no_path_gradient(kind: str, key: str) -> 
     assert not renderer.parameters()[key].differentiable
     renderer.prepare([key], None, derivatives=False)
     assert MitsubaRenderer(block, 3).parameters()[key].differentiable
+
+
+def others() -> dict[str, tuple[dict[str, Any], str]]:
+    """{name: (objects beside the moving block, key)} of parameters whose derivatives Mitsuba's `prb` lacks."""
+    before = mi.ScalarTransform4f().translate([0.1, -0.2, 0.8]).scale(0.4)
+    grey = {"type": "rgb", "value": 0.5}
+    mask = {"type": "mask", "opacity": 0.5, "inner": {"type": "twosided", "inner": {"type": "diffuse"}}}
+    mirror = {"type": "twosided", "inner": {"type": "conductor", "specular_reflectance": grey}}
+    return {
+        "mask": ({"sheet": {"type": "rectangle", "to_world": before, "bsdf": mask}}, "sheet.bsdf.opacity.value"),
+        "mirror": (
+            {"sheet": {"type": "rectangle", "to_world": before, "bsdf": mirror}},
+            "sheet.bsdf.brdf_0.specular_reflectance.value",
+        ),
+        "sky": (sky(), "sky.rotation"),
+    }
+
+
+@pytest.mark.parametrize("name", quick(("mask", "mirror", "sky"), "mask"))
+def test_other_gradients_beside_a_moving_shape_are_those_without_it(name: str) -> None:
+    more, key = others()[name]
+    found = []
+    for keys in ([key], [key, "moving.translation"]):
+        renderer = MitsubaRenderer(more if "moving" in more else block() | more, 3, keys)
+        session, values = renderer.prepare(keys, None), renderer.values(keys)
+        weight = renderer.array(weights()[None])
+        runs = [session.image(values, SampleRequest(0, 64, run + 100 * len(keys))).paths for run in range(RUNS)]
+        found.append(np.stack([np.array(session.adjoint(values, paths, weight)[key]).reshape(-1) for paths in runs]))
+    alone, beside_it = (x.astype(float) for x in found)
+    assert np.abs(scores(beside_it, alone)).max() < LIMIT, (beside_it.mean(axis=0), alone.mean(axis=0))
+    assert np.abs(scores(0.0 * beside_it, alone)).max() > LIMIT, "a lost derivative went unseen"

@@ -94,7 +94,7 @@ class MitsubaSession:
             raise InputError(
                 f"parameter {moving}: it moves geometry, which cannot be combined with the pose {next(iter(poses))}"
             )
-        self._boundary, self._camera, self._geometric, self._replays = None, None, False, True
+        self._boundary, self._camera, self._apart, self._geometric, self._replays = None, None, None, False, True
         moved = {key: moved_shape(scene, key) for key in (*keys, *poses) if key not in cameras}
         moved |= {key: "" for key in keys if key in scene.poses and key not in derivatives}
         self._moving, self._still_sensors = frozenset(moved.values()) - {""}, not cameras
@@ -103,7 +103,6 @@ class MitsubaSession:
         self._only_meshes = not any(key in poses or traits[key].geometric for key, shape in moved.items() if not shape)
         fixed = {key: pose for key, pose in poses.items() if key not in derivatives}
         if derivatives:
-            # Path gradients move the shapes and sensors of the scene itself.
             everything = [key for key in (*keys, *poses) if key in derivatives]
             cameras = [key for key in cameras if key in derivatives]
             if fixed and (other := next((key for key in everything if key in poses or key in cameras), None)):
@@ -117,14 +116,16 @@ class MitsubaSession:
             self._geometric = any(key in poses or traits[key].geometric for key in everything if key not in cameras)
             self._replays = len(cameras) < len(everything)
             keys = [*keys, *(key for key in poses if key in derivatives)]
+            own = [key for key, of in traits.items() if key in derivatives and (of.changes_delta or of.turns)]
+            if self._geometric and own and not paths.aov:  # derivatives that `prb` lacks
+                self._apart = MitsubaSession(pair, keys, {}, frozenset(own), paths, sampler)
         self._pair, self._keys, self._poses, self._attached = pair, keys, fixed, frozenset(derivatives)
-        if fixed:  # restore shapes that an earlier session has moved
-            scene.set_parameters({})
         self._attributed = scene.graph.attributed({pose.target for pose in fixed.values()})
-        self._posed = PosedScene(pair.current, fixed, self._attributed) if fixed else None
-        if self._posed is not None:
+        self._posed, self._posed_previous = None, None
+        if fixed:
+            scene.set_parameters({})  # restore shapes that an earlier session has moved
+            self._posed = PosedScene(pair.current, fixed, self._attributed)
             share_addresses(self._posed.scenes())
-        self._posed_previous: PosedScene | None = None
         self._at: dict[bool, mi.Float] = {}
         self._light, self._sampler = paths, sampler
         self._traits = [trait for key, trait in traits.items() if key in derivatives]
@@ -247,7 +248,7 @@ class MitsubaSession:
             self.kernel(AdjointPass(), paths.request)(paths.radiance, weights)
         else:
             self._pair.clear_gradients()
-        return self._gradients(paths.request, weights)
+        return self._gradients(parameters, paths.request, weights)
 
     def adjoint_pair(
         self, current: Tree, previous: Tree, paths: Paths, weights: mi.TensorXf, weights_previous: mi.TensorXf
@@ -267,7 +268,7 @@ class MitsubaSession:
                 self.kernel(AdjointPass(previous=True), request)(radiance, weights_previous)
             else:
                 self._pair.clear_gradients()
-            return gradient, self._gradients(request, weights_previous, previous=True)
+            return gradient, self._gradients(previous, request, weights_previous, previous=True)
         states = (paths.radiance, weights, paths.radiance_previous, weights_previous)
         self.kernel(AdjointPairPass(), request)(*states)
         return self._pair.loaded().take_gradients(), self._pair.loaded(previous=True).take_gradients()
@@ -319,13 +320,14 @@ class MitsubaSession:
         dr.eval(counts)
         return self.develop(counts, request)[0]
 
-    def _gradients(self, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
-        """Return the gradients of the last adjoint pass plus the boundary term of moving shapes and the derivatives by sensors."""
+    def _gradients(self, at: Tree, request: SampleRequest, weights: mi.TensorXf, previous: bool = False) -> Tree:
+        """Return the gradients of the last adjoint pass plus the boundary term of moving shapes, the derivatives by sensors and those that
+        `prb` lacks: of specular lobes, masks and rotated skies, on other paths of the same groups of samples."""
         scene = self._pair.loaded(previous)
-        for term in (self._boundary, self._camera):
-            if term is not None:
-                term.accumulate(scene, request, weights)
-        return scene.take_gradients()
+        for term in filter(None, (self._boundary, self._camera)):
+            term.accumulate(scene, request, weights)
+        gradients, apart = scene.take_gradients(), self._apart
+        return gradients | apart.adjoint(at, apart.image(at, request).paths, weights) if apart else gradients
 
     # ------------------------------------------------------------------ launches
 
@@ -386,8 +388,7 @@ class MitsubaSession:
         if request.emitters is not None and len(self.emitters()) > 1:
             tables |= pair.emitter_tables(task.previous, request.emitters)
         # A constant would record each kernel again.
-        seed = dr.opaque(mi.UInt32, request.seed) if request.seeds is None else request.seeds
-        seeds = seed, request.positions
+        seeds = (dr.opaque(mi.UInt32, request.seed) if request.seeds is None else request.seeds), request.positions
         rays = task.camera_rays(pair, self._sampler, size, seeds, request.pixels, films) if outside else None
         prepare: Callable[[], None] = (lambda: None) if task.needs_tangents else pair.clear_gradients
         scene = task.scene(pair) if posed is None else (posed.scenes(), self._at[task.previous])
