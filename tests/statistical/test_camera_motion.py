@@ -44,6 +44,14 @@ def glowing() -> dict[str, Any]:
     }
 
 
+def screened() -> dict[str, Any]:
+    """A sheet before the near clipping plane, which nobody sees, hides half of the pictures from the camera itself."""
+    described = glowing()
+    described["sensor"]["near_clip"] = 1.0
+    sheet = transform().translate([-0.25, 0, 3.4]).scale([0.25, 0.5, 1])
+    return described | {"sheet": {"type": "rectangle", "to_world": sheet}}
+
+
 def sunlit(**more: Any) -> dict[str, Any]:
     """A block in half a room, seen from aslant."""
     described = block()
@@ -100,6 +108,7 @@ def test_a_camera_that_turns_and_a_planted_fault_of_three_per_cent() -> None:
     ("description", "key", "depth", "step"),
     [
         (glowing, "sensor.translation", 1, 0.01),
+        (screened, "sensor.translation", 1, 0.01),
         (glowing, "sensor.x_fov", 1, 0.2),
         (glowing, "sensor.principal_point_offset_x", 1, 0.01),
         (round_things, "sensor.translation.x", 2, 0.01),

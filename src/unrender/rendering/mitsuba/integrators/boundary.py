@@ -124,9 +124,10 @@ class BoundaryIntegrator:
             along = picture.project_motion(point, uv, edge.end - edge.start)
             length = dr.norm(along)
             normal = mi.Vector2f(-along.y, along.x) / dr.maximum(length, 1e-20)
-            active = (pmf > 0) & (length > 1e-12) & (depth > 0) & picture.stencil.is_sampled(uv)
-            towards = mi.Point3f(dr.detach(point)) - camera
-            ray = mi.Ray3f(camera, dr.normalize(towards))
+            start, beyond = picture.near_point(camera, dr.detach(point), depth)
+            active = (pmf > 0) & (length > 1e-12) & beyond & picture.stencil.is_sampled(uv)
+            towards = mi.Point3f(dr.detach(point)) - start
+            ray = mi.Ray3f(start, dr.normalize(towards))
             ray.maxt = dr.norm(towards) * (1 - _NEAR)
             active &= ~scene.ray_test(ray, active)
             jump = self._picture_jump(picture, uv, normal, dr.norm(towards), active, seed ^ 0x9E3779B9)

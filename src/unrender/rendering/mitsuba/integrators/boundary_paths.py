@@ -27,6 +27,7 @@ class Picture:
         # Opaque, since the number of samples in a mini-batch varies between steps and would change the kernels.
         self.scale = dr.opaque(mi.Float, self.width * self.height / samples)
         self.time: Any = dr.opaque(mi.Float, float(sensor.shutter_open()))
+        self._near: Any = dr.opaque(mi.Float, float(sensor.near_clip()))
         with dr.suspend_grad():
             matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(
                 sensor.world_transform().inverse().matrix
@@ -48,6 +49,12 @@ class Picture:
         w = self._row(3, p, 1.0)
         uv = mi.Vector2f(self._row(0, p, 1.0), self._row(1, p, 1.0)) / w - self._shift
         return mi.Point2f(uv), w
+
+    def near_point(self, camera: Any, point: Any, depth: Any) -> tuple[Any, Any]:
+        """Return where the ray from the camera to a point of this depth begins, on the near clipping plane, and whether the point is
+        beyond it."""
+        start = camera + (mi.Point3f(point) - camera) * (self._near / dr.maximum(depth, self._near))
+        return mi.Point3f(start), depth > self._near
 
     def project_motion(self, point: Any, uv: Any, motion: Any) -> Any:
         """Return the motion on the film of points at `uv` that move in space."""
@@ -180,7 +187,8 @@ class EyePath:
             walk = _walk(scene, si, sampler, self.bounces, most, active)
             ds, importance = picture.sensor.sample_direction(walk.si, mi.Point2f(0.5), walk.active)
             active = walk.active & (ds.pdf > 0) & dr.any(importance > 0)
-            active &= ~scene.ray_test(walk.si.spawn_ray_to(ds.p), active)
+            to_sensor = walk.si.spawn_ray_to(picture.near_point(ds.p, walk.si.p, picture.project(walk.si.p)[1])[0])
+            active &= ~scene.ray_test(to_sensor, active)
             wo = walk.si.to_local(ds.d)
             bsdf = walk.si.bsdf()
             value = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), walk.si, wo, active)

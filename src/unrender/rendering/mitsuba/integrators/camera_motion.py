@@ -329,8 +329,9 @@ class CameraMotion:
             along = picture.project_motion(point, uv, along)
             length = dr.norm(along)
             normal = mi.Vector2f(-along.y, along.x) / dr.maximum(length, 1e-20)
-            active = (pmf > 0) & jumps & (length > 1e-12) & (depth > 0) & picture.stencil.is_sampled(uv)
-            active &= self._mirrors.sees(scene, film.origin, real, point, mirror, active)
+            start, beyond = picture.near_point(film.origin, point, depth)
+            active = (pmf > 0) & jumps & (length > 1e-12) & beyond & picture.stencil.is_sampled(uv)
+            active &= self._mirrors.sees(scene, start, real, point, mirror, active)
             factor = dr.select(active, length / pmf * picture.scale, 0)
             # Evaluate both sides of the curve with equal random numbers.
             number = dr.arange(mi.UInt32, 2 * count)
