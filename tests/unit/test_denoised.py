@@ -136,6 +136,16 @@ def test_what_is_not_finite_is_seen() -> None:
     assert np.isnan(found.others()[1]).any()
 
 
+def test_negative_pixels_are_denoised_as_positive_ones_are() -> None:
+    """Pictures of normals, and those of films whose filters have negative lobes."""
+    asked = problem()
+    filtered = Denoised(by="variation")._filter(asked)
+    noise = np.random.default_rng(0).normal(0.0, 0.1, (SIZE, SIZE, 3))
+    picture = (0.6 + noise).astype(np.float32)
+    np.testing.assert_allclose(filtered(-picture), -np.asarray(filtered(picture)), rtol=1e-5)
+    assert np.mean(filtered(picture - 0.6)) == pytest.approx(np.mean(picture - 0.6), abs=1e-3)
+
+
 def test_what_makes_no_sense_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ur.InputError, match="groups"):
         Denoised(groups=1)

@@ -244,6 +244,8 @@ class Denoised(WithoutSnapshot):
             noisy = arrays.numpy(image)
             if not arrays.all_finite(noisy):
                 return image  # the loop then skips the step
-            return problem.renderer.array(denoise(noisy, by=self.by))
+            positive = denoise(noisy, by=self.by)
+            # Pixels of a film with negative lobes, or of a property such as normals, may be negative.
+            return problem.renderer.array(positive - denoise(-noisy, by=self.by) if (noisy < 0).any() else positive)
 
         return filtered
