@@ -16,6 +16,7 @@ from tests.analytic import AnalyticRenderer
 from tiers import slow
 from unrender.estimators.base import Estimate
 from unrender.estimators.coordinates import by_coordinates
+from unrender.estimators.penalties import penalized
 
 SIDE = 6
 N = SIDE * SIDE
@@ -124,3 +125,22 @@ def test_newtons_steps_recover_the_smooth_part(case: Case) -> None:
     optimizer = ur.optimizers.NewtonCG(trust_radius=6.0, iterations=4, line=True)
     result = ur.optimize(case.problem, estimator, optimizer, steps=40)
     assert result.history[-1]["loss"] < 0.05 * result.history[0]["loss"]
+
+
+def test_priors_are_by_the_coordinates_of_the_descent(case: Case) -> None:
+    """The prior of a texture S v, as products and losses of an estimate by v add it."""
+    problem = case.made(preconditioner=SMOOTH, prior={"near": 0.2, "std": 0.1})
+    start, v = np.full(N, 0.5), np.random.default_rng(3).standard_normal(N)
+    found = ur.estimate(problem, ur.SmoothedDerivatives(SIGMA, 64, order="hvp"))
+    total = penalized(found, problem, problem.initial())
+    assert found.hvp is not None
+    assert found.losses is not None
+    assert total.hvp is not None
+    assert total.losses is not None
+    along = {"x": v.reshape(SIDE, SIDE, 1).astype(np.float32)}
+    product = np.ravel(total.hvp(along)["x"]) - np.ravel(found.hvp(along)["x"])
+    scale = problem.prior_scale / 0.1**2
+    np.testing.assert_allclose(product, scale * case.S @ (case.S @ v), rtol=1e-3, atol=1e-3 * scale)
+    points = np.stack([start, start + 0.1 * v])
+    values = [0.5 * scale * np.sum((start + 0.1 * t * case.S @ v - 0.2) ** 2) for t in (0.0, 1.0)]
+    np.testing.assert_allclose(total.losses(points) - found.losses(points), values, rtol=1e-4)

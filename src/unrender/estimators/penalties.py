@@ -19,7 +19,7 @@ from unrender.estimators.capabilities import (
     HessianProduct,
     LossFunction,
 )
-from unrender.estimators.coordinates import restricted
+from unrender.estimators.coordinates import PreconditionedPerturbations, restricted
 from unrender.scene.problem import Problem
 
 
@@ -31,7 +31,7 @@ def penalty(problem: Problem, parameters: Mapping[str, Array | np.ndarray]) -> f
 def penalized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
     """Return the estimate with priors and regularizers added to the loss and its derivatives; the estimate itself if there are none.
 
-    Second derivatives of `estimate` must be with respect to the parameters. They do not include the regularizers of meshes.
+    Second derivatives do not include the regularizers of meshes.
     """
     if not (keys := _keys(problem)):
         return estimate
@@ -39,7 +39,9 @@ def penalized(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimat
     added = {key: arrays.like(gradient.astype(np.float32), parameters[key]) for key, (_, gradient) in terms.items()}
     if estimate.preconditioned:
         added = problem.coordinates.pull_back(added, problem.coordinates.slopes(parameters))
-    capabilities = tuple(_added(one, added, problem, parameters) for one in estimate.capabilities)
+    capabilities = tuple(
+        _added(one, added, problem, parameters, estimate.preconditioned) for one in estimate.capabilities
+    )
     return replace(
         estimate,
         loss=estimate.loss + sum(value for value, _ in terms.values()),
@@ -68,17 +70,17 @@ def _sum(gradient: Tree, added: Tree) -> Tree:
     return {key: g + added[key] if key in added else g for key, g in gradient.items()}
 
 
-def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tree) -> Capability:
-    """Return a capability of the data term as one of the total loss."""
+def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tree, preconditioned: bool) -> Capability:
+    """Return a capability of the data term as one of the total loss, in the coordinates of the estimate."""
     match capability:
         case FreshGradient(values):
             return FreshGradient(_sum(values, added))
         case Hessian(matrix):
-            product, shape = _product(problem, parameters), parameters
+            product, shape = _product(problem, parameters, preconditioned), parameters
             rows = [trees.ravel(product(trees.parts(row, shape))) for row in np.eye(len(arrays.numpy(matrix)))]
             return Hessian(arrays.numpy(matrix).astype(np.float64) + np.stack(rows))
         case HessianProduct(apply):
-            product = _product(problem, parameters)
+            product = _product(problem, parameters, preconditioned)
 
             def total(v: Tree) -> Tree:
                 return _sum(apply(v), {key: arrays.like(x, v[key]) for key, x in product(v).items()})
@@ -86,20 +88,24 @@ def _added(capability: Capability, added: Tree, problem: Problem, parameters: Tr
             return HessianProduct(total)
         case LossFunction(evaluate):
 
-            def losses(points: np.ndarray) -> np.ndarray:
-                split = [trees.parts(point, parameters) for point in points]
-                return evaluate(points) + np.array([penalty(problem, x) for x in split])
+            def penalties(points: np.ndarray) -> np.ndarray:
+                return np.array([penalty(problem, trees.parts(point, parameters)) for point in points])
 
-            return LossFunction(losses)
+            smooth = PreconditionedPerturbations(problem, parameters) if preconditioned else None
+            added_at = smooth.by_coordinates(penalties) if smooth else penalties
+            return LossFunction(lambda points: evaluate(points) + added_at(points))
         case BlockEstimate(keys, estimate) if estimate is not None:
             own = {key: parameters[key] for key in keys}
             return BlockEstimate(keys, penalized(estimate, restricted(problem, keys), own))
     return capability
 
 
-def _product(problem: Problem, parameters: Tree) -> Callable[[Mapping[str, Array | np.ndarray]], dict[str, np.ndarray]]:
-    """Return a function from v to the product of the priors' Hessian with v."""
-    unknowns, scale = problem.unknowns, problem.prior_scale
+def _product(
+    problem: Problem, parameters: Tree, preconditioned: bool
+) -> Callable[[Mapping[str, Array | np.ndarray]], dict[str, np.ndarray]]:
+    """Return a function from v to the product of the priors' Hessian with v, with respect to the parameters, or to the coordinates of a
+    preconditioned estimate."""
+    unknowns, scale, coordinates = problem.unknowns, problem.prior_scale, problem.coordinates
     points = {key: arrays.numpy(x) for key, x in parameters.items()}
 
     def product(v: Mapping[str, Array | np.ndarray]) -> dict[str, np.ndarray]:
@@ -109,4 +115,18 @@ def _product(problem: Problem, parameters: Tree) -> Callable[[Mapping[str, Array
             products[key] = np.zeros(points[key].shape) if prior is None else scale * prior.product(points[key], values)
         return products
 
-    return product
+    if not preconditioned:
+        return product
+    slopes, curvatures = coordinates.slopes(points), coordinates.curvatures(points)
+
+    def product_by_coordinates(v: Mapping[str, Array | np.ndarray]) -> dict[str, np.ndarray]:
+        moved = {
+            key: np.asarray(x if isinstance(x, np.ndarray) else arrays.numpy(x), np.float32) for key, x in v.items()
+        }
+        products = product(coordinates.push_forward(moved, slopes))
+        result = coordinates.pull_back({key: x.astype(np.float32) for key, x in products.items()}, slopes)
+        for key, bend in curvatures.items():
+            result[key] = result[key] + _terms(problem, key, points[key])[1] * bend * moved[key]
+        return result
+
+    return product_by_coordinates
