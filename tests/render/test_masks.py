@@ -88,3 +88,13 @@ def test_segments_that_a_volumetric_integrator_does_not_count_are_told(kind: str
     assert images["volpath"] < 0.9 * images["their volpath"]
     assert not notices["prb"]
     assert len(notices["volpath"]) == 1
+
+
+def test_a_mask_around_a_mask_has_no_path_gradient() -> None:
+    """A path that the inner mask lets pass would count as one that the outer one lets pass."""
+    described = scene(0.5)
+    described["sheet"]["bsdf"]["bsdf"] = {"type": "mask", "opacity": 0.5, "bsdf": {"type": "diffuse"}}
+    known = MitsubaRenderer(described, 2).parameters()[KEY]
+    assert not known.differentiable
+    assert known.perturbable
+    assert MitsubaRenderer(scene(0.5), 2).parameters()[KEY].shares_paths

@@ -14,7 +14,7 @@ import mitsuba as mi
 from unrender.rendering.mitsuba import poses
 from unrender.rendering.mitsuba.integrators.specular import DELTA_MASK, DELTA_SIMPLE
 from unrender.rendering.mitsuba.mesh_layout import FACES, NORMALS, POSITIONS, TEXCOORDS
-from unrender.rendering.mitsuba.scene_graph import ObjectGraph
+from unrender.rendering.mitsuba.scene_graph import ObjectGraph, children
 from unrender.rendering.parameter_errors import Role
 
 # BSDFs whose delta lobes have directions that do not depend on the parameter. Sampling that lobe alone gives its value in the
@@ -170,7 +170,8 @@ def _bsdf_traits(bsdfs: list[Any], chain: list[Any]) -> ParameterTraits:
     if not mi.has_flag(bsdfs[0].flags(), mi.BSDFFlags.Delta):
         return ParameterTraits(False, "")  # mirrors elsewhere in the nest do not change
     names = [b.class_name() for b in bsdfs if b.class_name() not in _WRAPPERS]
-    if names == ["MaskBSDF"] and not is_mirror_or_glass(outer):
+    passes = any(isinstance(x, mi.BSDF) and mi.has_flag(x.flags(), mi.BSDFFlags.Null) for _, x in children(bsdfs[0]))
+    if names == ["MaskBSDF"] and not passes and not is_mirror_or_glass(outer):
         return ParameterTraits(False, "", delta_lobes=((outer, DELTA_MASK),))
     inner = names[0]
     if inner in _SIMPLE_DELTA and all(name in _NORMAL_PERTURBATIONS for name in names[1:]):
