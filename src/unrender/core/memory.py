@@ -7,8 +7,9 @@ is therefore set by the largest number of arrays of each size that were alive at
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import drjit as dr
@@ -20,6 +21,8 @@ LARGE = 1 << 20
 """Number of elements of a large array (4 MB). For smaller arrays, separate kernel launches cost more than they save."""
 
 _PARTS = 16
+_ARRAY, _MAPPING, _SEQUENCE = ("array",), ("mapping",), ("sequence",)
+"""Contents of values that are no dataclasses, see `_members`."""
 
 
 def trim_cache(*parts: Any) -> None:
@@ -42,8 +45,9 @@ def evaluate_in_turn(*parts: Any) -> None:
 
     An expression that several large arrays share is computed once for each. Accepts nested lists, tuples, dicts and dataclasses.
     """
-    arrays.evaluate(small_parts(*parts))
-    large = [array for array in _flatten(parts) if is_large(array)]
+    found = _flatten(parts)
+    large = [array for array in found if is_large(array)]
+    arrays.evaluate([array for array in found if not is_large(array)] if large else found)
     while large:
         array = large.pop(0)
         arrays.evaluate(array)
@@ -95,17 +99,32 @@ def square(x: Array) -> Array:
     return inner_products([(x, x)])[0]
 
 
-def _flatten(value: Any) -> Iterator[Array]:
-    if arrays.is_drjit(value):
-        yield value
-    elif isinstance(value, Mapping):
-        yield from _flatten_all(value.values())
-    elif isinstance(value, (list, tuple)):
-        yield from _flatten_all(value)
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        yield from _flatten_all(getattr(value, each.name) for each in dataclasses.fields(value))
+def _flatten(parts: Iterable[Any]) -> list[Array]:
+    """Return the Dr.Jit arrays of nested structures, in order."""
+    found: list[Array] = []
+    for value in parts:
+        members = _members(type(value))
+        if members is _ARRAY:
+            found.append(value)
+        elif members is _MAPPING:
+            found += _flatten(value.values())
+        elif members is _SEQUENCE:
+            found += _flatten(value)
+        elif members:
+            found += _flatten([getattr(value, name) for name in members])
+    return found
 
 
-def _flatten_all(values: Iterable[Any]) -> Iterator[Array]:
-    for value in values:
-        yield from _flatten(value)
+@functools.cache
+def _members(kind: type) -> tuple[str, ...]:
+    """Return the names of a dataclass's fields, or what else values of a type contain; () for nothing.
+
+    It is looked up once for each type, since a step flattens hundreds of values.
+    """
+    if dr.is_array_v(kind):
+        return _ARRAY
+    if issubclass(kind, Mapping):
+        return _MAPPING
+    if issubclass(kind, (list, tuple)):
+        return _SEQUENCE
+    return tuple(each.name for each in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else ()

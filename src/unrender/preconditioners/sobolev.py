@@ -81,17 +81,21 @@ class Sobolev:
         self.check("parameter", shape)
         if (around := self._around(shape)) is not None:
             return around.apply(x)
-        if (pyramid := self._pyramid(shape)) is not None:
-            return pyramid.apply(x, self.strength_of(shape), 0.5)
-        solver = grid.solver(self.strength_of(shape), shape[:-1], self._wraps(shape), 0.5)
-        return arrays.like(solver.solve(arrays.numpy(x)), x)
+        return self._solved(x, 0.5)
 
     def apply_twice(self, x: Array) -> Array:
         """Return S² x."""
+        if self._spectrum is not None or self._around(arrays.shape(x)) is not None:
+            return self.apply(self.apply(x))
+        return self._solved(x, 1.0)
+
+    def _solved(self, x: Array, power: float) -> Array:
+        """Return (I + λ L)^-power x of a texture or grid."""
         shape = arrays.shape(x)
         if (pyramid := self._pyramid(shape)) is not None:
-            return pyramid.apply(x, self.strength_of(shape), 1.0)
-        return self.apply(self.apply(x))
+            return pyramid.apply(x, self.strength_of(shape), power)
+        solver = grid.solver(self.strength_of(shape), shape[:-1], self._wraps(shape), power)
+        return arrays.like(solver.solve(arrays.numpy(x)), x)
 
     def strength_of(self, shape: tuple[int, ...]) -> float:
         """Return λ for a texture or grid of this shape, or for the mesh if there is one."""

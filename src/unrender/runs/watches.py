@@ -66,10 +66,14 @@ class InfluenceWatch(Callback):
     These are five, or more if steps draw some of the views. Parameters of a block that is not estimated yet are excluded.
     """
 
+    def __init__(self) -> None:
+        self._steps = 0  # unknown before the first step
+
     def on_update(self, run: Run, estimate: Estimate, applied: bool) -> None:
-        zero, steps = run.state.zero_gradient, max(_STEPS, _draws(run))
-        if not applied or run.step > steps:
+        self._steps = self._steps or max(_STEPS, _draws(run))
+        if not applied or run.step > self._steps:
             return
+        zero, steps = run.state.zero_gradient, self._steps
         block = estimate.get(BlockEstimate)
         waiting = block.keys if block is not None and block.estimate is None else ()
         for key, gradient in estimate.gradient.items():

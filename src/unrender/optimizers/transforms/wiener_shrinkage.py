@@ -108,8 +108,7 @@ def signal_share(
     parts = [arrays.numpy(x).astype(np.float64).reshape(cells) for x in (product, square)]
     means = np.stack([part.mean(axis=-1) for part in parts], axis=-1)
     flat = means.reshape(-1) if vertices else means
-    for _ in range(2):
-        flat = np.asarray(smooth.apply(flat))
+    flat = np.asarray(smooth.apply_twice(flat) if isinstance(smooth, Sobolev) else smooth.apply(smooth.apply(flat)))
     means = flat.reshape(means.shape)
     signal, squares = means[..., :1] * confirmed, means[..., 1:]
     share = np.where(squares > 0, signal / np.where(squares > 0, squares, 1.0), 1.0)
