@@ -12,7 +12,7 @@ import pytest
 from unrender.core import tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import FreshGradient
+from unrender.estimators.capabilities import AtBounds, FreshGradient
 from unrender.optimizers import Adam, ScheduleFree
 from unrender.optimizers.transforms import agreement_rate, fitted_sobolev, lasting_agreement
 from unrender.optimizers.transforms.agreement_rate import Agreement
@@ -390,3 +390,18 @@ def test_refuses_parameters_that_do_not_suit():
         ScheduleFree(preconditioner=Sobolev(), preconditioned=("x",)).init(x)
     with pytest.raises(InputError, match='unknown parameter "y"'):
         ScheduleFree({"*": 0.1, "y": 0.2}).init(x)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_texels_beside_saturated_ones_are_not_led_astray(known: bool):
+    """A square whose minimum is above the upper bound. Its gradient remains, and smoothing spreads it where bounds are unknown."""
+    wanted = np.full((16, 16, 1), 0.5)
+    wanted[4:9, 4:9] = 1.6
+    optimizer, x = ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("x",)), np.full(wanted.shape, 0.4)
+    state = optimizer.init({"x": x})
+    for _ in range(60):
+        at = AtBounds(lambda x=x: {"x": np.where(x >= 1.0, 1.0, np.where(x <= 0.0, -1.0, 0.0))})
+        step, state = optimizer.update(Estimate(0.0, {"x": x - wanted}, (at,) if known else ()), state, {"x": x})
+        x = np.clip(x + step["x"], 0.0, 1.0)
+    error = float(np.abs(x - np.minimum(wanted, 1.0)).max())
+    assert error < 0.02 if known else error > 0.2

@@ -7,10 +7,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+from unrender.core import arrays
+from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import Capability
+from unrender.estimators.capabilities import AtBounds, Capability
 from unrender.preconditioners.base import Preconditioner
 from unrender.scene.upsampling import SQUARES, Upsampler
 
@@ -28,6 +30,7 @@ class SmoothingChange:
         inflation: Variance of the sum of many steps' noise, relative to that of independent noise of the same size, >= 1.
         growth: Factor of the learning rate, because gradients of much later steps agree, >= 1.
         vertices: Number of mesh vertices that carry the parameter; 0 for textures, grids and numbers.
+        held: Mask of the elements that stay at their bounds; None for none.
     """
 
     preconditioner: Preconditioner | None = None
@@ -38,6 +41,14 @@ class SmoothingChange:
     inflation: float = 1.0
     growth: float = 1.0
     vertices: int = 0
+    held: Array | None = None
+
+    def smoothed(self, x: Array) -> Array:
+        """Return P S P x, where P sets elements that stay at their bounds to 0."""
+        for part in (None, self.preconditioner):
+            x = x if part is None else part.apply(x)
+            x = x if self.held is None else arrays.where(self.held, 0.0 * x, x)
+        return x
 
 
 SMOOTHING_UNCHANGED = SmoothingChange()
@@ -143,6 +154,22 @@ class TransformState:
         """Interpolate the fields, and scale them by their metadata."""
         powers = {each.name: each.metadata["power"] for each in fields(self) if "power" in each.metadata}
         return replace(self, **{name: upsampler.tree(getattr(self, name), power) for name, power in powers.items()})
+
+
+def held_at_bounds(update: StepUpdate, mean: Tree) -> Tree:
+    """Return {key: mask of the elements at a bound beyond which the loss falls}, from the mean of earlier gradients.
+
+    Smoothing would spread the gradient of these elements, which cannot move, over their neighbours. The present gradient does not
+    decide, because its noise would then no longer have mean 0.
+    """
+    bounds = update.estimate.get(AtBounds)
+    sides = {} if bounds is None else bounds.sides()
+    return {key: sides[key] * x < 0.0 for key, x in mean.items() if key in sides}
+
+
+def without(gradient: Tree, held: Tree) -> Tree:
+    """Return a gradient with 0 for the elements that stay at their bounds."""
+    return {key: arrays.where(held[key], 0.0 * g, g) if key in held else g for key, g in gradient.items()}
 
 
 def checked_keys(owner: str, keys: Any) -> tuple[str, ...]:

@@ -23,6 +23,8 @@ from unrender.optimizers.transforms.base import (
     StepUpdate,
     TransformState,
     checked_keys,
+    held_at_bounds,
+    without,
 )
 from unrender.preconditioners import Sobolev
 from unrender.preconditioners.base import Preconditioner, bound_to
@@ -248,6 +250,9 @@ def _share(sums: np.ndarray) -> float:
 
 # ------------------------------------------------------------------------------------------------------ transforms
 
+_MEMORY = 0.9
+"""Decay of the mean gradient that decides which elements stay at their bounds."""
+
 
 @dataclass(frozen=True)
 class FittedSobolevState(TransformState):
@@ -256,10 +261,12 @@ class FittedSobolevState(TransformState):
     Attributes:
         gradient: Preconditioned gradient of the last step; zeros before the first.
         strengths: {key: fit of the strength} of the parameters whose preconditioner is a `Sobolev`.
+        mean: Exponentially weighted mean of earlier gradients of the preconditioned parameters, without preconditioning.
     """
 
     gradient: Tree = field(metadata=GRADIENTS)
     strengths: dict[str, StrengthFit] = field(default_factory=dict)
+    mean: Tree = field(default_factory=dict, metadata=GRADIENTS)
 
     def upsampled(self, upsampler: Upsampler) -> FittedSobolevState:
         """Interpolate the gradient, and restart the fit of refined parameters."""
@@ -311,30 +318,33 @@ class FittedSobolev(StepTransform):
             if self.preconditioner is not None:
                 self._smooth(key).check(key, arrays.shape(parameters[key]))
         fitted = self.preconditioned if isinstance(self.preconditioner, Sobolev) else ()
-        return FittedSobolevState(trees.zeros_like(parameters), dict.fromkeys(fitted, StrengthFit()))
+        mean = {key: arrays.zeros_like(parameters[key]) for key in self.preconditioned}
+        return FittedSobolevState(trees.zeros_like(parameters), dict.fromkeys(fitted, StrengthFit()), mean)
 
     def update(self, update: StepUpdate, state: FittedSobolevState) -> tuple[StepUpdate, FittedSobolevState]:
         """Precondition the gradient. Waits for the device if a strength is fitted."""
-        raw = update.gradient
+        held = held_at_bounds(update, state.mean)
+        mean = {k: _MEMORY * m + (1.0 - _MEMORY) * update.gradient[k] for k, m in state.mean.items()}
+        arrays.evaluate(held, mean)
+        raw = without(update.gradient, held)
         if update.made == 0:
             strengths = {key: fit.begun(self._sobolev(key), raw[key]) for key, fit in state.strengths.items()}
         else:
             fresh_gradient = update.estimate.get(FreshGradient)
-            fresh: Mapping[str, Array] = {} if fresh_gradient is None else fresh_gradient.values
+            fresh: Mapping[str, Array] = {} if fresh_gradient is None else without(fresh_gradient.values, held)
             strengths = {
                 key: fit.after(self._sobolev(key), state.gradient[key], raw[key], fresh.get(key))
                 for key, fit in state.strengths.items()
             }
-        smoothing = (
-            {} if self.preconditioner is None else {k: self._smoothing(k, strengths) for k in self.preconditioned}
-        )
+        keys = () if self.preconditioner is None else self.preconditioned
+        smoothing = {key: replace(self._smoothing(key, strengths), held=held.get(key)) for key in keys}
         gradient = dict(raw)
         for key, change in smoothing.items():
-            if key in raw and change.preconditioner is not None:
-                gradient[key] = change.preconditioner.apply(raw[key])
+            if key in raw:
+                gradient[key] = change.smoothed(raw[key])
         stronger = frozenset(key for key, change in smoothing.items() if change.gain < 1.0)
         update = replace(update, previous=state.gradient, smoothing=smoothing, restarted=update.restarted | stronger)
-        following = replace(state, gradient=gradient, strengths=strengths)
+        following = replace(state, gradient=gradient, strengths=strengths, mean=mean)
         return replace(update, gradient=gradient, direction=gradient), following
 
     def choices(self, state: FittedSobolevState, made: int) -> tuple[str, ...]:
@@ -376,6 +386,6 @@ class ApplyPreconditioner(StepTransform):
         del state
         direction = dict(update.direction)
         for key, change in update.smoothing.items():
-            if key in direction and change.preconditioner is not None:
-                direction[key] = change.preconditioner.apply(direction[key])
+            if key in direction:
+                direction[key] = change.smoothed(direction[key])
         return replace(update, direction=direction), None
