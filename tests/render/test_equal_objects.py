@@ -80,6 +80,19 @@ def test_nothing_is_said_of_what_differs_is_shared_or_known() -> None:
     assert notices(scene(matte(), matte(), lamp=lamp), "lamp.emitter.radiance.value") == []
 
 
+def test_a_texture_that_equal_materials_share_is_one(tmp_path: Path) -> None:
+    """Its key was said to change one of the materials only."""
+    mi.Bitmap(np.full((4, 4, 3), 0.5, np.float32)).write(str(tmp_path / "a.exr"))
+    shared = {"type": "diffuse", "reflectance": {"type": "ref", "id": "paint"}}
+    described = scene(shared, {"type": "twosided", "inner": shared})
+    paint = {"type": "bitmap", "filename": str(tmp_path / "a.exr")}
+    key = "first.bsdf.reflectance.data"
+    assert notices({"type": "scene", "paint": paint, **described}, key) == []
+    third = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": paint}}
+    (line,) = notices({"type": "scene", "paint": paint, **described, "third": third}, key)
+    assert "third.bsdf.reflectance.data are separate" in line
+
+
 def test_files_tell_the_same(tmp_path: Path) -> None:
     material = '<bsdf type="diffuse" id="{}"><rgb name="reflectance" value=".5"/></bsdf>'
     (tmp_path / "scene.xml").write_text(

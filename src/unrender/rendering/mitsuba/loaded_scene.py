@@ -140,7 +140,7 @@ class LoadedScene:
         scene: the `mitsuba.Scene`.
         variant: Mitsuba's variant that it was loaded in.
         source: what was loaded: the file's path, or the dictionary without the data of grids and bitmaps.
-        equal: names of objects that are equal (`equal_objects`).
+        equal: names of objects, by sets of equal ones (`equal_objects`).
         meshed: ids of spheres that became meshes.
         readers: slots that read the parameters' values.
         colours: parameters whose values are RGB although the scene holds coefficients of spectra.

@@ -47,7 +47,7 @@ def is_loaded(description: SceneDescription) -> bool:
     return type(description).__module__.partition(".")[0] == "mitsuba" and type(description).__name__ == "Scene"
 
 
-def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict, tuple[tuple[str, ...], ...]]:
+def load_resolved(description: SceneDescription) -> tuple[mi.Scene, Path | dict, tuple[Equal, ...]]:
     """Return a Mitsuba scene, what it was loaded from, and its `equal_objects`.
 
     The second item is the file's path, or the dictionary without data (`_outline`). It is empty for a scene that the user has loaded.
@@ -266,27 +266,34 @@ _MERGED = ("BSDF", "Texture", "Volume", "Medium", "PhaseFunction")
 _NUMBERS = ("Float", "Integer", "Bool", "Vector", "Color")
 
 
-def equal_objects(nodes: Sequence[Any]) -> tuple[tuple[str, ...], ...]:
-    """Return the names of equal objects, one tuple per set. An object that is held by reference counts once.
+Equal = tuple[tuple[str, ...], ...]
+"""The names of each of several equal objects."""
+
+
+def equal_objects(nodes: Sequence[Any]) -> tuple[Equal, ...]:
+    """Return the objects that Mitsuba merges with equal ones, one tuple per set. An object that is held by reference counts once.
+
+    Each object is the tuple of its names: the one of `_name`, and one for each slot that holds it.
 
     Args:
         nodes: nodes of `mitsuba.parser.ParserState`, references resolved.
     """
     contents: dict[int, Any] = {}
-    names = {0: ""}
     order = _from_scene(nodes)
+    names = {index: [name] for index, name in order}
     for index, name in order:
-        names.setdefault(index, name)
+        for prop, child in references(nodes[index].props):
+            names[child].append(f"{name}.{prop}" if name else prop)
     for index, _ in reversed(order):
         contents[index] = _content(nodes[index], contents, index)
-    groups: dict[Any, list[str]] = {}
-    for index, name in names.items():
+    groups: dict[Any, list[tuple[str, ...]]] = {}
+    for index, own in names.items():
         if _kind(nodes[index]) in _MERGED:
-            groups.setdefault(contents[index], []).append(name)
-    return tuple(tuple(sorted(equal)) for equal in groups.values() if len(equal) > 1)
+            groups.setdefault(contents[index], []).append(tuple(dict.fromkeys(own)))
+    return tuple(tuple(sorted(equal)) for equal in groups.values())
 
 
-def merge_notices(keys: Iterable[str], equal: Iterable[Sequence[str]]) -> list[str]:
+def merge_notices(keys: Iterable[str], equal: Sequence[Equal]) -> list[str]:
     """Return one notice for each parameter whose object has equal objects; parameters that equal one another share it.
 
     Args:
@@ -296,18 +303,20 @@ def merge_notices(keys: Iterable[str], equal: Iterable[Sequence[str]]) -> list[s
     notices: list[str] = []
     named: set[str] = set()
     for key in keys:
-        for names in equal:
-            own = next((name for name in names if key.startswith(f"{name}.")), None)
-            if own is None or key in named:
-                continue
-            named.update(f"{name}{key.removeprefix(own)}" for name in names)
-            other = next(name for name in names if name != own)
-            more = f" and {len(names) - 2} more" if len(names) > 2 else ""
-            notices.append(
-                f"{key}: {own} equals {other}{more}, and Mitsuba merges equal objects, so that one key changes them all. Here {key} and "
-                f"{other}{key.removeprefix(own)} are separate; load the scene of references with optimize=False"
-            )
-            break
+        holders = [
+            (name, objects) for objects in equal for names in objects for name in names if key.startswith(f"{name}.")
+        ]
+        own, objects = max(holders, key=lambda holder: len(holder[0]), default=("", ()))
+        others = [names[0] for names in objects if own not in names]
+        if not others or key in named:
+            continue
+        rest = key.removeprefix(own)
+        named.update(f"{name}{rest}" for names in objects for name in names)
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        notices.append(
+            f"{key}: {own} equals {others[0]}{more}, and Mitsuba merges equal objects, so that one key changes them all. Here {key} and "
+            f"{others[0]}{rest} are separate; load the scene of references with optimize=False"
+        )
     return notices
 
 
