@@ -127,6 +127,16 @@ def test_gradients_by_unknowns_are_sums_over_the_parameters(image: str) -> None:
     assert gradients[0]["strength"] != pytest.approx([1.03 * expected], rel=1e-4)
 
 
+def test_a_view_that_knows_what_an_expression_sets_adds_nothing() -> None:
+    """The derivative of that view ended a run, since Dr.Jit drops products with 0."""
+    views = [ur.View(picture()), ur.View(picture(), known={LEFT: 0.0, RIGHT: 0.0})]
+    unknown = ur.Parameter("strength", 1.5)
+    alone, both = (ur.Problem(scene, [unknown], seen, expressions=LAMPS) for seen in (views[:1], views))
+    one, other = (ur.estimate(made, ur.PathGradient(spp=8)).gradient["strength"] for made in (alone, both))
+    assert one != 0
+    np.testing.assert_array_equal(one, other)
+
+
 def test_tangents_are_carried_through_functions() -> None:
     """The squared derivative by the strength along 1 is that by both lamps along the functions' derivatives."""
     reference, tint = picture(), np.array([1, 0.8, 0.6], np.float32)

@@ -306,7 +306,8 @@ class _ExpressionSession(SessionWrapper):
             dr.sum(x * dr.detach(inner_gradient[key]), axis=None) for key, x in values.items() if key in inner_gradient
         ]
         total: Any = sum(products[1:], products[0])
-        dr.backward(total)
+        if dr.grad_enabled(total):  # Dr.Jit drops factors of 0, such as those of a value that a view knows
+            dr.backward(total)
         own_gradient = {key: type(leaf)(dr.grad(leaf)) for key, leaf in leaves.items()}
         arrays.evaluate(own_gradient)
         return gradient | trees.zeros_like(fixed) | own_gradient
