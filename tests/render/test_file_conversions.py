@@ -112,6 +112,11 @@ def renderer(folder: Path) -> MitsubaRenderer:
             "to_world": turned,
             "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_paint"}},
         },
+        "group": {
+            "type": "shapegroup",
+            "leaf": {"type": "ply", "filename": str(folder / "block.ply"), "to_world": turned, "bsdf": diffuse},
+        },
+        "tree": {"type": "instance", "group": {"type": "ref", "id": "group"}},
         "fog": {
             "type": "cube",
             "bsdf": {"type": "null"},
@@ -144,6 +149,7 @@ KEYS = {
     "sheet.vertex_normals": "block.ply",
     "sheet.vertex_paint": "block.ply",
     "sheet.face_paint": "block.ply",
+    "group.leaf.vertex_paint": "block.ply",
 }
 
 

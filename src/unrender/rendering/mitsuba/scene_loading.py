@@ -243,7 +243,9 @@ def read_vertices(description: SceneDescription, key: str, path: Path) -> np.nda
             f"{path}: a loaded scene does not expose the transforms of its shapes; give the .xml file or an array"
         )
     parsed = loading.parse(Path(resolved) if isinstance(resolved, (str, Path)) else resolved)
-    shape = next((node.props for node in parsed.state.nodes if node.props.id() == owner), None)
+    # A shape of a group has the key "group.shape", and its own id alone in XML.
+    known = [[n.props for n in parsed.state.nodes if n.props.id() == i] for i in (owner, owner.rpartition(".")[2])]
+    (shape,) = next((found for found in known if len(found) == 1), [None])
     if shape is None:
         raise InputError(f"{path}: the scene's description has no shape named {owner}; give an array")
     plugin = path.suffix.lower().removeprefix(".")
