@@ -96,10 +96,13 @@ def test_drops_alpha_and_keeps_grey_as_one_channel(tmp_path: Path):
 
 
 def test_takes_the_colours_of_a_file_of_many_layers(tmp_path: Path):
-    layers = np.concatenate([COLOURS, np.full((6, 8, 1), 9, np.float32)], axis=2)
-    names = ["R", "G", "B", "depth.T"]
+    layers = np.concatenate([COLOURS, np.full((6, 8, 1), 9, np.float32), COLOURS[..., :1]], axis=2)
+    names = ["R", "G", "B", "depth.T", "A"]
     mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(tmp_path / "a.exr"))
-    np.testing.assert_array_equal(images.read(tmp_path / "a.exr").values, COLOURS)
+    picture = images.read(tmp_path / "a.exr")
+    np.testing.assert_array_equal(picture.values, COLOURS)
+    np.testing.assert_array_equal(np.asarray(picture.alpha), COLOURS[..., 0])
+    assert picture.premultiplied
 
 
 @pytest.mark.parametrize(("pixel_format", "stores"), [("rgb", False), ("rgba", True), ("luminance_alpha", True)])
@@ -118,6 +121,10 @@ def test_says_which_channels_a_file_without_colours_has(tmp_path: Path):
     mi.Bitmap(layers, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(tmp_path / "a.exr"))
     with pytest.raises(InputError, match=r"a\.exr: has the channels .*a\.X.*, but not R, G and B; save colour alone"):
         images.read(tmp_path / "a.exr")
+    names = ["diffuse.R", "diffuse.G", "diffuse.B"]
+    mi.Bitmap(COLOURS, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(tmp_path / "b.exr"))
+    with pytest.raises(InputError, match=r"b\.exr: has the channels diffuse\.R, diffuse\.G, diffuse\.B, but not"):
+        images.read(tmp_path / "b.exr")
 
 
 def test_refuses_what_is_no_picture(tmp_path: Path):

@@ -181,9 +181,10 @@ def _read(path: Path, linearise: bool, alpha: bool) -> Picture:
 
     try:
         with variant.two_threads():
-            bitmap = mi.Bitmap(str(path))
-        if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
-            return _colour_channels(bitmap)
+            bitmap: Any = mi.Bitmap(str(path))
+        names = [field.name for field in bitmap.struct_()]
+        if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel or not {*names} <= {*"RGBAXYZ"}:
+            return _colour_channels(np.array(bitmap), names)
         encoded = bool(bitmap.srgb_gamma())
         stored = np.array(bitmap)
         bits = 8 * stored.itemsize
@@ -219,14 +220,12 @@ def _opacity(alpha: np.ndarray) -> np.ndarray | None:
     return values if values.min() < OPAQUE else None
 
 
-def _colour_channels(bitmap: Any) -> Picture:
-    """Return R, G, B and A of an EXR file of many channels, such as those of Mitsuba's `aov` integrator."""
-    names = [field.name for field in bitmap.struct_()]
+def _colour_channels(stored: np.ndarray, names: list[str]) -> Picture:
+    """Return R, G, B and A of an EXR file of named channels, such as those of Mitsuba's `aov` integrator."""
     if not {"R", "G", "B"} <= set(names):
         raise InputError(
             f"has the channels {', '.join(names)[:200]}, but not R, G and B; save colour alone, such as mi.Bitmap(image[:, :, :3])"
         )
-    stored = np.array(bitmap)
     opacity = _opacity(stored[..., names.index("A")]) if "A" in names else None
     values = stored[..., [names.index(name) for name in "RGB"]].astype(np.float32)
     return Picture(values, alpha=opacity, premultiplied=opacity is not None)
