@@ -105,6 +105,24 @@ def test_under_another_light(unrender, run: Path, mitsuba_variant: str) -> None:
 
 
 @pytest.mark.slow
+def test_a_film_of_luminance_under_another_light(unrender, problem: Path, mitsuba_variant: str) -> None:
+    """The photograph is grey, and so is the rendering that is compared with it."""
+    scene, weights = problem.with_name("wall.xml"), np.array([0.2126, 0.7152, 0.0722])
+    scene.write_text(scene.read_text().replace("<rfilter", '<string name="pixel_format" value="luminance"/><rfilter'))
+    mi.Bitmap(np.full((4, 6, 1), 0.4 * weights @ TRUTH, np.float32)).write(str(problem.with_name("photo.exr")))
+    words = ["--variant", mitsuba_variant]
+    answer = unrender("run", "problem.toml", "--steps", 1, "--out", "result", "-m", "plain", "--final-spp", 1, *words)
+    assert answer.status in (0, 5), answer.error
+    np.savez(problem.parent / "result" / "parameters.npz", **{KEY: FOUND})  # pyright: ignore[reportArgumentType]
+    words += ["--environment", sky(problem.with_name("sky.exr"), 0.4), "--held-out", "problem.toml", "--spp", 4096]
+    answer = unrender("judge", "result", *words)
+    assert answer.status == 0, answer.error
+    record = json.loads((problem.parent / "result" / "judge" / "judge.json").read_text())
+    expected = -20 * np.log10(abs(srgb(0.4 * weights @ FOUND) - srgb(0.4 * weights @ TRUTH)))
+    assert record["mean"]["psnr"] == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.slow
 def test_a_turntable_turns(unrender, run: Path, mitsuba_variant: str) -> None:
     """The wall is seen from the front, then from behind, where it is black."""
     words = ["--frames", 4, "--size", 16, "--spp", 16, "--elevation", 0, "--background", "black"]

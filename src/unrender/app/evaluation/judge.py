@@ -34,12 +34,14 @@ from unrender.core import arrays, phases
 from unrender.core.errors import InputError
 from unrender.core.exclusive import exclusive
 from unrender.io import files
+from unrender.io.images import luminance
 from unrender.io.images import write as write_image
 from unrender.losses import metrics
 from unrender.rendering.camera_poses import POSES
 from unrender.rendering.exposure import EXPOSURE, VIGNETTING, falloff
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.photographs import OF_PHOTOGRAPHS, member_values, scene_renderer
+from unrender.rendering.picture_format import format_of
 from unrender.rendering.response import RESPONSE, curve
 from unrender.runs import reopen
 from unrender.runs.folder import reader as folders
@@ -121,7 +123,7 @@ def judge(
         with tempfile.TemporaryDirectory() as scratch:
             images, relit, albedo = _render(target, values, truth, light, not measured, spp, Path(scratch), folder)
         if measured and light is not None:
-            images, relit = relit, []
+            images, relit = _as_films(target, relit), []
         if measured:
             images = _photographed(target, images, of_camera, exposed)
         measures = _measure(target, images) if measured else []
@@ -136,6 +138,12 @@ def judge(
     if not measured:
         notices.append("nothing is measured: the photographs show another light; see --held-out")
     return Judgement(place, tuple(names_of(target)), tuple(measures), albedo, tuple(notices))
+
+
+def _as_films(problem: Problem, images: list[np.ndarray]) -> list[np.ndarray]:
+    """Return RGB images as the films of the views store them, which their photographs contain: those of luminance are grey."""
+    grey = [format_of(problem.renderer, view.sensor).colour == "luminance" for view in problem.views]
+    return [np.repeat(luminance(x), 3, axis=2) if of else x for x, of in zip(images, grey, strict=True)]
 
 
 def _recovered(run: Path, problem: Problem, result: RunFolder) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:

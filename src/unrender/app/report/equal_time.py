@@ -163,7 +163,7 @@ def compare_groups(groups: tuple[Group, ...]) -> Comparison:
         compared.append(
             _metric(
                 "relative parameter error",
-                "Parameter error, relative to the first run's start (mean over parameters)",
+                "Mean parameter error, relative to the first run's start",
                 lambda run: curves.relative_error(run, keys, first_run.error_before),
                 groups,
                 ends,

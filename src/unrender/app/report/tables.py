@@ -47,7 +47,7 @@ def charts_of_runs(runs: Mapping[str, RunFolder], colours: Mapping[str, int], ax
     start = next(iter(runs.values())).error_before
     single = len(set(keys)) == 1
     measures = [run.measure(key) for run in runs.values() for key in run.known]
-    title = parameter_errors.title(measures) if single else "Parameter error, relative to the first run's start"
+    title = parameter_errors.title(measures) if single else "Mean parameter error, relative to the first run's start"
     errors = {
         label: curves.parameter_error(run, run.known[0])
         if single and run.known
