@@ -37,7 +37,7 @@ from unrender.statistics import debiased
 _PICTURE_PATHS = 1 << 22
 _FEWEST, _MOST = 16, 512
 _SHARE, _LEAST_SECONDS = 0.05, 1.0
-"""Time limit of final images relative to the time of the steps, and its minimum in seconds."""
+"""Time limit of final images relative to the time of the steps, and its minimum in seconds of an idle machine."""
 _SENSITIVITY_SHARE = 0.5
 """Additional time limit of the sensitivity relative to that; it takes at least one probe."""
 _LOOK_SHARE, _LOOK_SECONDS = 0.01, 0.25
@@ -339,7 +339,8 @@ def _affordable(problem: Problem, result: Result, most_seconds: float) -> int:
         render(problem, result.parameters, 0, trial, seed, per_pass=trial)
         seconds = time.perf_counter() - started
     check = min(_cost_of_check(problem), _MOST_CHECK)
-    allowed = min(max(_SHARE * result.seconds, _LEAST_SECONDS), most_seconds / (1.0 + check))
+    least = _LEAST_SECONDS * min(slowdown(), MOST_SLOWDOWN)
+    allowed = min(max(_SHARE * result.seconds, least), most_seconds / (1.0 + check))
     paths = allowed / max(seconds, 1e-6) * trial * sizes[0]
     return max(2, 2 * trial, power_of_two(int(min(most, max(paths, 0.0) / (2 * sum(sizes))))))
 
