@@ -38,8 +38,9 @@ _BLOCK, _ELSEWHERE = 8, 0.25
 """Side of the blocks of pixels, and share of them that does not count beside unknown poses: the object may belong there."""
 _OF_POSE = "the pose needs more steps or another start, or "
 """Words about the cause that a larger object belongs in these pixels."""
-_LEAST = 0.02
-"""Smallest difference relative to these pixels of the references."""
+_LEAST, _LEAST_OF_CAUSE = 0.02, 0.25
+"""Smallest difference relative to these pixels of the references, and factor of it for one that looks like a distorted reference, which
+silhouettes hold."""
 _SEED = 7
 _SURE, _OF_FILTER, _OF_NOISE, _MOSTLY, _DISTINCT = 4.5, 1.8, 1.2, 0.8, 1.3
 """Standard errors from which a residual looks like a distorted reference; factor of these for noise that neighbouring pixels share;
@@ -198,7 +199,8 @@ def unexplained_pixels(
     random = change({key: changed(problem, key, x, signs.choice((-1.0, 1.0), x.shape)) for key, x in result.items()})
     weights = weights * np.isfinite(random).all(axis=1)
     little = _is_little(residuals[0] + references, np.where(weights[:, None] > 0, random, 0.0), weights)
-    little &= _around(little, sizes) >= _OF_AROUND
+    # Changes do not cancel where no path meets an unknown, such as in a dark background beside an object.
+    little &= (_around(little, sizes) >= _OF_AROUND) | ~random.any(axis=1)
     if np.count_nonzero(little * weights) < _FEWEST:
         return None
     explained = [_joined([np.mean(b, axis=0) - np.mean(a, axis=0) for a, b in zip(starts, ends, strict=True)])]
@@ -211,7 +213,7 @@ def unexplained_pixels(
     least = _LEAST * max(1.0, everywhere / max(size, 1e-300))
     differs = misfit(rest[0::2], rest[1::2], references, weights * little, sizes, least)
     cause, shared, sure = _as_if(rest, residuals + references, weights * little, sizes)
-    if differs is None and sure and shared > least * size:
+    if differs is None and sure and shared > _LEAST_OF_CAUSE * least * size:
         total = mean_square(rest.mean(axis=0), weights * little)
         differs = Misfit(shared, size, math.sqrt(max(total - shared**2, 0.0)))
     total = math.sqrt(mean_square(residuals.mean(axis=0), weights))
@@ -223,7 +225,7 @@ def unexplained_pixels(
         f" in the {share:.0%} of its pixels that the unknowns hardly change{cause}: {_OF_POSE if moves else ''}light, depth, alignment or "
         "something else that is not among the unknowns is wrong"
     )
-    return replace(differs, explanation=explanation, causes=(STEPS,) if moves else ())
+    return replace(differs, size=max(size, everywhere), explanation=explanation, causes=(STEPS,) if moves else ())
 
 
 def _around(little: np.ndarray, sizes: Sequence[tuple[int, int]]) -> np.ndarray:
