@@ -697,6 +697,24 @@ def test_gradient_noise_is_the_scatter_of_gradients() -> None:
     assert (np.abs(0.5 * ratio - 1.0) > 4.5 * error).all()
 
 
+@pytest.mark.parametrize("loss", [ur.losses.L1(), ur.losses.Huber(0.05)], ids=["L1", "Huber"])
+def test_means_of_models_of_other_losses_average_noise(loss: Any) -> None:
+    """The gradient's noise is known to a factor of two; by that of derivative images alone it would be a thirtieth. Without it, models
+    would be forgotten as those of another scene."""
+    made, estimator = problem(loss), ur.GaussNewton(16, 16)
+    state = module.GaussNewtonState({"a": 0.02, "b": 0.03})
+    found = [estimator.estimate(made, START, state, Key(seed))[0] for seed in range(100)]
+    gradients = np.stack([np.concatenate([one.gradient[key] for key in START]) for one in found])
+    told = np.mean([np.diag(one.require("test", GradientNoise).matrix) for one in found], axis=0)
+    ratio = told / gradients.var(axis=0, ddof=1)
+    assert (ratio > 0.3).all()
+    assert (ratio < 1.5).all()
+    result = ur.optimize(made, estimator, AveragedNewton(), steps=60)
+    errors = {key: result.parameters[key] - TRUTH[key] for key in TRUTH}
+    assert max(np.abs(error).max() for error in errors.values()) < 0.01
+    assert all((np.abs(error) < 5.0 * result.standard_error[key]).all() for key, error in errors.items())
+
+
 @pytest.mark.parametrize("remember", [True, False])
 def test_derivatives_of_many_steps_leave_the_gradient_less_noise(remember: bool) -> None:
     """An element that hardly changes the picture, with ten times as much noise in its differences."""

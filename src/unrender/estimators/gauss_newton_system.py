@@ -212,7 +212,12 @@ class Point:
             second = problem.loss_derivative(view, image + 1.0) - derivative
             halves = (problem.loss_derivative(view, half) for half in (images.one, images.other))
             return LossWeights(*map(arrays.numpy, (derivative, second, *halves)))
-        residual = image - problem.reference(view)
-        damped = derivative * damping(residual, smoothed_variance(images.variance), self.options.tolerance)
-        secant = damped * residual / (residual * residual + 1e-12)
-        return LossWeights(*map(arrays.numpy, (damped, secant, damped, damped)))
+        reference, variance = problem.reference(view), smoothed_variance(images.variance)
+
+        def damped(of: Array) -> Array:
+            factor = damping(of - reference, variance, self.options.tolerance)
+            return problem.loss_derivative(view, of) * factor
+
+        first, residual = damped(image), image - reference
+        secant = first * residual / (residual * residual + 1e-12)
+        return LossWeights(*map(arrays.numpy, (first, secant, damped(images.one), damped(images.other))))
