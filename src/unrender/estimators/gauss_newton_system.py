@@ -189,7 +189,7 @@ class Point:
 
     def _states(self, points: np.ndarray, view: int, key: Key, spp: int) -> np.ndarray:
         """Render images (B, H, W, 3) at points (B, n) with half of the samples, all with the same random numbers."""
-        request = SampleRequest(self.problem.views[view].sensor, spp // 2, key.uint32())
+        request = SampleRequest(self.problem.views[view].sensor, spp // 2, key.uint32(), stratified=True)
         stacked = {key: x.astype(np.float32) for key, x in trees.parts(points, self.parameters).items()}
         for name, x in stacked.items():
             if (x == x[:1]).all():  # shared by all, see `RenderSession.image_batch`

@@ -117,6 +117,8 @@ class SampleRequest:
         emitters: probability of each emitter in emitter sampling, (E,), sum 1, see `EmitterSession`; None for the scene's own.
         both_gradients: for a pair, whether `adjoint_pair` will be called, not `adjoint` alone. False saves memory and time.
         seeds: seed of each chosen pixel in place of `seed`, with `sensors` and `positions`; for renderers with `joins_views` only.
+        stratified: whether the random numbers of each group of a pixel are stratified, which has less noise. Pixels and groups remain
+            independent. Renderers may ignore it, and mini-batches do.
     """
 
     sensor: int
@@ -129,6 +131,7 @@ class SampleRequest:
     emitters: np.ndarray | None = None
     both_gradients: bool = False
     seeds: Array | None = None
+    stratified: bool = False
 
 
 @dataclass(frozen=True)

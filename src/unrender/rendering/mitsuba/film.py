@@ -21,59 +21,6 @@ from unrender.rendering.mitsuba.pixel_filter import PixelFilters
 from unrender.rendering.renderer import SampleRequest
 
 
-@dataclass
-class RepeatingSampler:
-    """Sampler of independent numbers that are equal in every copy of an image: lane i shares its numbers with lane i + period.
-
-    It replaces a `mitsuba.Sampler`. It is mutable, as that is, since it is state of the path tracer's loop.
-
-    Attributes:
-        period: number of lanes of one image.
-        rng: `mitsuba.PCG32`, once seeded.
-        lanes: `mi.UInt32`, for each lane the lane whose numbers it uses; None for its own.
-    """
-
-    period: int
-    rng: Any = None
-    lanes: Any = None
-
-    def seed(self, seed: Any, lanes: int) -> None:
-        """Seed the generator for `lanes` lanes."""
-        lane = dr.arange(mi.UInt32, lanes) % self.period if self.lanes is None else self.lanes
-        state, sequence = mi.sample_tea_32(seed, lane)  # pyright: ignore[reportCallIssue, reportArgumentType]
-        self.rng = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
-
-    def clone(self) -> RepeatingSampler:
-        """Return a sampler with the same future numbers."""
-        return RepeatingSampler(self.period, mi.PCG32(self.rng), self.lanes)  # pyright: ignore[reportCallIssue]
-
-    def wavefront_size(self) -> int:
-        """Return the number of lanes."""
-        return dr.width(self.rng)
-
-    def next_1d(self, active: Any = True) -> Any:
-        """Return a uniform number per lane, including inactive lanes."""
-        del active
-        return self.rng.next_float32()
-
-    def next_2d(self, active: Any = True) -> Any:
-        """Return two uniform numbers per lane, including inactive lanes."""
-        del active
-        first = self.rng.next_float32()
-        return mi.Point2f(first, self.rng.next_float32())
-
-
-def independent(sampler: Any, lanes: int) -> RepeatingSampler:
-    """Return a sampler independent of the path's sampler, whose state does not change. A replay of the path sees the same numbers."""
-    copy: Any = sampler.clone()
-    bits: Any = dr.reinterpret_array(mi.UInt32, copy.next_1d())
-    lanes_of_path = copy.lanes if isinstance(copy, RepeatingSampler) else None
-    lane: Any = dr.arange(mi.UInt32, lanes) if lanes_of_path is None else lanes_of_path
-    state, sequence = mi.sample_tea_32(bits, lane)
-    rng: Any = mi.PCG32(1, mi.UInt64(state), mi.UInt64(sequence))  # pyright: ignore[reportCallIssue]
-    return RepeatingSampler(lanes, rng)
-
-
 def _seed(sampler: Any, seed: Any, lanes: int) -> None:
     """Seed a sampler. Raise `InputError` for more lanes than Dr.Jit supports."""
     if lanes >= 1 << 32:
@@ -234,17 +181,6 @@ def _past_emitters(scene: Any, ray: Any, weight: Any) -> tuple[Any, Any]:
     loop: Any = dr.while_loop
     ray.o, _, meets = loop(state, passing, step, label="past emitters")
     return ray, dr.select(meets, weight, 0)
-
-
-def sampler_at(positions: Any, spp: int, count: int) -> RepeatingSampler:
-    """Return the sampler of a part of an image, in which each pixel has the same numbers as in the full image.
-
-    Args:
-        positions: `mi.UInt32`, index of each pixel in the full image.
-        spp, count: samples per pixel and number of pixels of the part.
-    """
-    sample = dr.arange(mi.UInt32, count * spp) % spp
-    return RepeatingSampler(count * spp, lanes=per_sample(positions, spp, count) * spp + sample)
 
 
 def per_sample(of_pixel: Any, spp: int, count: int) -> Any:

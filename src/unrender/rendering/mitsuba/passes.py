@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba import film
+from unrender.rendering.mitsuba import film, samplers
 from unrender.rendering.mitsuba.camera_paths import CameraPaths, Kernel, Tables, dropped_together
 from unrender.rendering.mitsuba.film_response import FilmResponse, response_table
 from unrender.rendering.mitsuba.integrators.base import PathContext
@@ -32,12 +32,14 @@ class LaunchSize:
         sensor: index of the sensor; ignored if each pixel has its own.
         spp: samples per pixel.
         hiding: whether emitters are invisible to camera rays.
+        strata: number of adjacent samples whose random numbers are stratified together; 1 for independent numbers.
     """
 
     sensor: int
     spp: int
     pixels: int
     hiding: bool = False
+    strata: int = 1
 
 
 class Pass:
@@ -58,8 +60,10 @@ class Pass:
 
     def numbers(self, sampler: mi.Sampler, size: LaunchSize, positions: mi.UInt32 | None) -> Any:
         """Return the unseeded sampler."""
+        if size.strata > 1 and positions is None:
+            return samplers.StratifiedSampler(size.pixels * size.spp, size.strata)
         # Clone the sampler: a seeded one would be destroyed, and free memory, while the next kernel is recorded.
-        return sampler.clone() if positions is None else film.sampler_at(positions, size.spp, size.pixels)
+        return sampler.clone() if positions is None else samplers.sampler_at(positions, size.spp, size.pixels)
 
     def camera_rays(
         self, pair: ScenePair, sampler: mi.Sampler, size: LaunchSize, seeds: Any, pixels: Any, films: Any
@@ -199,7 +203,7 @@ class MovedPairPass(Pass):
                     numbers: Any = self.numbers(sampler, size, positions)
                     samples = _camera_samples(scene, numbers, size, seed, pixels, films)
                     generated.append(film.rays(samples) if rays is None else rays[state])
-                choices = film.independent(numbers, size.pixels * size.spp)
+                choices = samplers.independent(numbers, size.pixels * size.spp)
                 radiance = self.tracer.sample(scenes, tables, numbers, choices, (generated[0][0], generated[-1][0]))
                 return dropped_together(radiance[0] * generated[0][1], radiance[1] * generated[-1][1])
 
@@ -316,8 +320,9 @@ class PosesPass(Pass):
 
     def numbers(self, sampler: mi.Sampler, size: LaunchSize, positions: mi.UInt32 | None) -> Any:
         """Return a sampler whose numbers are equal for every pose."""
-        del sampler, positions
-        return film.RepeatingSampler(size.pixels * size.spp)
+        if size.strata > 1:
+            return super().numbers(sampler, size, positions)
+        return samplers.RepeatingSampler(size.pixels * size.spp)
 
     def function(
         self, kernel: Kernel, sampler: mi.Sampler, size: LaunchSize, posed: PosedScene | None = None

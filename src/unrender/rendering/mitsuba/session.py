@@ -372,7 +372,8 @@ class MitsubaSession:
         if not (self._geometric or self._poses):
             request = for_every_sensor(request, pair.current.sensors(), count)
         several = request.sensors is not None
-        size = LaunchSize(0 if several else request.sensor, request.spp, count, self._light.hide_emitters)
+        strata = request.spp // request.groups if request.stratified else 1
+        size = LaunchSize(0 if several else request.sensor, request.spp, count, self._light.hide_emitters, strata)
         outside = not are_recordable(pair.current.sensors()[request.sensor], several)
         # Each resolution of a texture or grid needs its own recording, since a replay with another one would fail.
         shapes = pair.loaded().shapes()

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.edges import EdgePoints
-from unrender.rendering.mitsuba.film import RepeatingSampler
+from unrender.rendering.mitsuba.samplers import RepeatingSampler
 
 _AREA, _POINT, _DISTANT = 0, 1, 2
 """Kinds of emitters: area, point, and distant."""

@@ -14,7 +14,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.film import independent
 from unrender.rendering.mitsuba.integrators import emitters, specular
 from unrender.rendering.mitsuba.integrators.base import (
     KEEP,
@@ -31,6 +30,7 @@ from unrender.rendering.mitsuba.integrators.base import (
     while_loop,
 )
 from unrender.rendering.mitsuba.integrators.differential_bsdf import BranchVertex, DifferentialBsdf, RoughLobe
+from unrender.rendering.mitsuba.samplers import independent
 
 ROULETTE_FLOOR = 0.25
 """Minimum survival probability of Russian roulette, which depends on the current throughput only, so that the adjoint can replay it

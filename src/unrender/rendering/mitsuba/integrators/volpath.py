@@ -13,7 +13,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.film import independent
 from unrender.rendering.mitsuba.integrators import emitters, specular, tracking
 from unrender.rendering.mitsuba.integrators.base import (
     KEEP,
@@ -39,6 +38,7 @@ from unrender.rendering.mitsuba.integrators.volume_path import (
     VolumePathState,
     connect,
 )
+from unrender.rendering.mitsuba.samplers import independent
 
 
 class VolumePair:
