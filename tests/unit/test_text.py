@@ -16,7 +16,7 @@ from rich.table import Table
 from unrender.app.report import html
 from unrender.core.errors import InputError, VariantError
 from unrender.core.text import LONGEST_LINE, did_you_mean, grouped, listed, one_line, printable, shorten, visible
-from unrender.display.terminal import Console, echo
+from unrender.display.terminal import Console, columns, echo
 
 EVIL = {
     "ESC": "\x1b]0;owned\x07\x1b[2J",
@@ -133,3 +133,15 @@ def test_long_lists_of_names_are_cut():
     assert listed(eight) == ", ".join(eight)
     assert listed([*eight, "lamp8"]) == "lamp0, lamp1, lamp2, lamp3 and 5 more"
     assert grouped({"wall": "0.1", "roughness": "0.05", "floor": "0.1"}) == "0.1 (wall, floor), 0.05 (roughness)"
+
+
+@pytest.mark.parametrize(("key", "width"), [("wall.bsdf.reflectance.data", 30), (f"{'mesh.' * 17}data", 80)])
+def test_a_table_has_its_values_beside_keys_of_any_length(key: str, width: int) -> None:
+    """Where the output is no terminal, it has 80 columns, and the keys of nested materials may be as long."""
+    table = columns()
+    table.add_row(key, "error 0.3366 before")
+    printed = Console(file=io.StringIO(), width=width)
+    printed.print(table)
+    text = "".join(printed.file.getvalue().split())  # pyright: ignore[reportAttributeAccessIssue]
+    assert "0.3366" in text
+    assert sorted(text) == sorted(f"{key}error0.3366before")

@@ -53,7 +53,7 @@ def columns(*headings: str) -> Table:
     for heading in headings:
         table.add_column(Text(visible(heading)), overflow="fold")
     if not headings:
-        table.add_column(style="bold", no_wrap=True)
+        table.add_column(style="bold", overflow="fold")
         table.add_column(overflow="fold")
     return table
 

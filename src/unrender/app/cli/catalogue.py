@@ -178,8 +178,8 @@ def _method_options(one: Method) -> Table:
     from rich.markup import escape
 
     table = _table()
-    table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    table.add_column(overflow="fold")
     table.add_column(overflow="fold")
     for name, field in one.options.model_fields.items():
         default = "none" if field.default is None else str(field.default)
