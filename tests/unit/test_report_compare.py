@@ -11,11 +11,11 @@ import pytest
 from report_folders import KEY, Page, write_run
 
 from unrender.app import report
-from unrender.app.report import curves, groups, tables
+from unrender.app.report import curves, groups, panels, tables
 from unrender.app.sweeps.trials import stated_error
 from unrender.core.errors import InputError
 from unrender.losses import metrics
-from unrender.runs.folder.reader import read
+from unrender.runs.folder.reader import ViewPictures, read
 
 
 def compared(tmp_path: Path, runs: list[Path]) -> dict[str, Any]:
@@ -278,6 +278,8 @@ def test_pixels_that_a_mask_leaves_out_decide_nothing(tmp_path):
     before = float(np.sqrt(np.sum(weights * reference**2)))
     (row,) = tables.view_rows(read(runs[0]))
     assert (row.before, row.after) == (pytest.approx(before, rel=1e-5), 0.0)
+    pictures = [ViewPictures(np.where(mask[..., None] > 0, reference, x), reference, mask=mask) for x in (0.0, 50.0)]
+    assert len({panels.view_of_run(0, of).note for of in pictures}) == 1, "the exposure"
     np.savez(
         runs[0] / "pictures.npz", **{"view0/reference": reference, "view0/result": reference, "view0/mask": 0 * mask}
     )

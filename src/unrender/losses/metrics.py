@@ -43,12 +43,13 @@ _WHITE = 0.7
 _SSIM_WINDOW = 7
 
 
-def exposure(reference: np.ndarray) -> float:
+def exposure(reference: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the factor that maps the reference's 95th percentile of luminance to 0.7; 1 for a black reference.
 
     A percentile, unlike the maximum, is not affected by a small visible emitter. If it is 0, the maximum replaces it. Pixels that are not
-    finite are ignored.
+    finite, or where a mask (H, W) is 0, are ignored.
     """
+    reference = reference if mask is None else reference[mask > 0]
     luminance = reference @ np.array([0.2126, 0.7152, 0.0722])
     finite = luminance[np.isfinite(luminance)]
     if finite.size == 0:
@@ -72,7 +73,7 @@ def displayed(
     They are black outside of a mask (H, W), and the exposure is that of the pixels inside.
     """
     image, reference = _pair(image, reference, mask)
-    factor = exposure(reference if mask is None else reference[mask > 0])
+    factor = exposure(reference, mask)
     with np.errstate(over="ignore"):
         return srgb(image * factor), srgb(reference * factor)
 

@@ -286,7 +286,7 @@ def _pictures(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
     if not first.views:
         return []
     view, of = next(iter(first.views.items()))
-    factor = metrics.exposure(of.reference)
+    factor = metrics.exposure(of.reference, of.mask)
     row = [("reference", of.reference)] + ([("start", of.initial)] if of.initial is not None else [])
     row += [(label, run.views[view].result) for label, run in comparison.representatives.items()]
     return [(title, tone_mapping.srgb(picture * factor)) for title, picture in row]

@@ -71,7 +71,7 @@ def view_of_run(view: int, shown: ViewPictures, encoder: PictureEncoder = INLINE
         shown: pictures of the view.
         name: name of the result, "Current" while the run continues.
     """
-    factor = metrics.exposure(shown.reference)
+    factor = metrics.exposure(shown.reference, shown.mask)
     what = name.lower()
     error = tone_mapping.absolute_error(shown.result, shown.reference, shown.mask)
     before = None if shown.initial is None else tone_mapping.absolute_error(shown.initial, shown.reference, shown.mask)
@@ -115,8 +115,8 @@ def view_of_methods(view: int, shown: Mapping[str, ViewPictures]) -> Panel:
 
     It compares the result of each method with the reference and shows its error. All methods share one exposure and one error scale.
     """
-    reference = next(iter(shown.values())).reference
-    factor = metrics.exposure(reference)
+    first = next(iter(shown.values()))
+    reference, factor = first.reference, metrics.exposure(first.reference, first.mask)
     errors = {label: tone_mapping.absolute_error(of.result, of.reference, of.mask) for label, of in shown.items()}
     high = max(tone_mapping.colour_limit(error) for error in errors.values())
     stacks = tuple(
