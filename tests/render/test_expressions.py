@@ -342,3 +342,12 @@ def test_a_texture_that_an_expression_turns_into_a_roughness_has_no_map(text: st
     of = ur.Problem(made, [ur.Parameter("bumps", initial=start)], [ur.View(picture())], expressions={alpha: text})
     assert of.renderer.parameters()["bumps"].curved
     assert not of.renderer.parameters()[passed].curved
+
+
+def test_a_bounded_unknown_of_expressions_is_resumed(tmp_path: Path) -> None:
+    """Its projection was not evaluated before the functions of it, which gave it their size."""
+    unknown = ur.Parameter("strength", initial=1.0, bounds=(0.1, 10.0))
+    made, parts = problem(picture(strength=3.0), LAMPS, unknown), (ur.PathGradient(spp=4), ur.optimizers.Adam(0.1))
+    whole = ur.optimize(made, *parts, steps=4)
+    ur.optimize(made, *parts, steps=2, run_directory=tmp_path)
+    assert ur.resume(tmp_path, made, steps=4).parameters["strength"] == pytest.approx(whole.parameters["strength"])

@@ -62,6 +62,7 @@ def begin_at(run: Run, parameters: Tree) -> None:
     """Set parameters, and initial states of estimator and optimizer."""
     problem = run.problem
     run.parameters = {k: problem.unknowns[k].project(x) for k, x in parameters.items()}
+    arrays.evaluate(run.parameters)  # Dr.Jit resizes an unevaluated number in place where it meets an array
     run.state.estimator = run.estimator.init(problem, run.parameters)
     run.state.optimizer = run.optimizer.init(problem.coordinates.of(run.parameters), problem.learning_rates)
 
