@@ -662,19 +662,21 @@ def test_trust_regions_are_as_wide_as_the_smoothing(optimizer):
     parameters = {"a": np.zeros(2), "b": np.zeros(1)}
     gradient = {"a": np.array([3e3, -1e3]), "b": np.array([2e3])}
 
-    def first(sigma: dict[str, float] | None) -> np.ndarray:
+    def first(sigma: dict[str, float] | None, own: dict[str, float] | None = None) -> np.ndarray:
         scale = np.array([sigma["a"], sigma["a"], sigma["b"]]) if sigma else np.ones(3)
         hessian = np.diag(1 / scale**2)
         products = HessianProduct(lambda v: trees.unravel(hessian @ trees.ravel(v), parameters))
         smoothing = () if sigma is None else (Smoothing(sigma),)
         found = Estimate(0.0, gradient, (Hessian(hessian), products, *smoothing))
-        return trees.ravel(optimizer.update(found, optimizer.init(parameters), parameters)[0])
+        return trees.ravel(optimizer.update(found, optimizer.init(parameters, own), parameters)[0])
 
     for sigma in ({"a": 0.2, "b": 0.2}, {"a": 0.01, "b": 0.5}):
         step = first(sigma)
         reach = np.linalg.norm(step / np.array([sigma["a"], sigma["a"], sigma["b"]]))
         assert reach == pytest.approx(0.05 if isinstance(optimizer, LBFGS) else 0.5)
     assert np.linalg.norm(first(None)) == pytest.approx(0.05 if isinstance(optimizer, LBFGS) else 0.5)
+    # a parameter's own rate is in its units, and no multiple of σ
+    np.testing.assert_array_equal(first({"a": 0.01, "b": 0.5}, {"b": 0.01}), first({"a": 0.01, "b": 0.5}))
 
 
 @pytest.mark.parametrize(

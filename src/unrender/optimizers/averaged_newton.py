@@ -98,8 +98,7 @@ class AveragedNewton:
     the largest. A damped direction takes more steps to the same solution.
 
     Parameters that A does not connect take separate steps, each in its own trust region: the minimum of the model for ‖s‖ <= Δ. Lengths
-    are in coordinates x / η with each parameter's learning rate η, times the σ of smoothed derivatives or the widths of differences
-    (`Estimate.sigma`).
+    are in coordinates x / η, see `Newton`. The widths of differences are its σ (`Estimate.sigma`).
 
     Where images are linear in a parameter (`linear`), a model is exact at any distance, so Δ hardly limits its steps.
 
@@ -168,7 +167,7 @@ class AveragedNewton:
             _finite(estimate.get(kind)) for kind in (HessianNoise, GradientNoise, ScoreCovariance)
         )
         added, fluctuation = (np.zeros_like(hessian) if x is None else x for x in (added, fluctuation))
-        scale = coordinate_scales(estimate, state, parameters)
+        scale = coordinate_scales(estimate, state, parameters, self.learning_rate)
         reaches = {key: _OF_LINEAR if key in self.linear else 1.0 for key in parameters}
         region = scale * trees.repeat_per_element(reaches, parameters)
         step, matrix, target = np.zeros_like(x), state.matrix.copy(), state.target.copy()

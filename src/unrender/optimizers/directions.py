@@ -93,10 +93,13 @@ def init_state(
     return NewtonState(0, own, adam)
 
 
-def coordinate_scales(estimate: Estimate, state: Scaled, parameters: Tree) -> np.ndarray:
-    """Return the unit of each element's coordinate u, (n,): its learning rate times the σ of smoothed derivatives."""
+def coordinate_scales(estimate: Estimate, state: Scaled, parameters: Tree, common: float) -> np.ndarray:
+    """Return the unit of each element's coordinate u, (n,): its learning rate, or σ of smoothed derivatives times the `common` one.
+
+    A parameter's own rate is in its units, as for Adam, and no multiple of σ.
+    """
     smoothing = estimate.get(Smoothing)
-    scales = {key: η * (smoothing.sigma[key] if smoothing else 1.0) for key, η in state.learning_rates.items()}
+    scales = {key: common * smoothing.sigma[key] if smoothing else η for key, η in state.learning_rates.items()}
     return trees.repeat_per_element(scales, parameters)
 
 

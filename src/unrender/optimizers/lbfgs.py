@@ -56,7 +56,7 @@ class LBFGS:
     no line search: a step costs one gradient. Without any pair (s, y) the step is −g with a tenth of the trust radius. Memory is 2
     `history` n numbers.
 
-    Scales: as in `Newton`, everything, including Δ, is in coordinates u = x / η with each parameter's learning rate η, times its σ.
+    Scales: as in `Newton`, everything, including Δ, is in coordinates u = x / η.
 
     Noise: y is the difference of two gradients with independent noise, which does not shrink with s. A pair with sᵀy below `curvature`
     ‖s‖ ‖y‖, such as one with negative curvature or mostly noise, is skipped. The noise of the others stays for `history` steps. Noise in
@@ -96,7 +96,7 @@ class LBFGS:
 
     def update(self, estimate: Estimate, state: LBFGSState, parameters: Tree) -> tuple[Tree, LBFGSState]:
         """Return the steps and the next state. Computed on the host."""
-        scale = coordinate_scales(estimate, state.newton, parameters)
+        scale = coordinate_scales(estimate, state.newton, parameters, self.learning_rate)
         here, gradient = trees.ravel(parameters), trees.ravel(estimate.gradient)
         if state.newton.step:
             state = self._remember(state, here - state.parameters, gradient - state.gradient, scale)

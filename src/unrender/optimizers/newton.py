@@ -61,9 +61,10 @@ class Newton:
     direction is dominated by the eigenvectors of least curvature, whose estimates are the noisiest.) If H is zero, the step is −g with
     length Δ. If H is not finite, there is no step.
 
-    Scales: coordinates are u = x / η, where η is each parameter's learning rate times the σ of smoothed derivatives (`Estimate.sigma`),
-    which contain no information beyond it. Δ and `damping` are in units of u: a position in metres and an angle in radians with η of 0.05
-    and 0.5 may move by 0.05 Δ and 0.5 Δ. Inside the trust region and without damping, the step does not depend on η.
+    Scales: coordinates are u = x / η, where η is each parameter's learning rate. For smoothed derivatives, η is `learning_rate` times σ
+    (`Estimate.sigma`), whatever a parameter's own rate, since they contain no information beyond σ. Δ and `damping` are in units of u: a
+    position in metres and an angle in radians with η of 0.05 and 0.5 may move by 0.05 Δ and 0.5 Δ. Inside the trust region and without
+    damping, the step does not depend on η.
 
     Noise: the step is a product of two estimates, so it is biased even if they are not (an inverse is convex). Noise that reduces a small
     eigenvalue causes a long step along its eigenvector. Noise of a tenth of H needs `damping` of about 0.03, noise as large as H needs
@@ -104,7 +105,7 @@ class Newton:
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
         """Return the steps and the next state. Computed on the host."""
         matrix = estimate.require("Newton", Hessian).matrix
-        scale = coordinate_scales(estimate, state, parameters)
+        scale = coordinate_scales(estimate, state, parameters, self.learning_rate)
         hessian = scale[:, None] * arrays.numpy(matrix).astype(np.float64) * scale
         step, gradient = np.zeros_like(scale), scale * trees.ravel(estimate.gradient)
         free = np.flatnonzero(free_elements(estimate, parameters))
@@ -135,7 +136,7 @@ class NewtonCG:
     a few vectors; no n × n matrix is built. As many iterations as dimensions solve a well-conditioned positive definite system exactly,
     without tolerance and damping.
 
-    Scales: as in `Newton`, everything, including Δ, is in coordinates u = x / η with each parameter's learning rate η, times its σ.
+    Scales: as in `Newton`, everything, including Δ, is in coordinates u = x / η.
     Products are requested for η v.
 
     Noise: the estimated products need not belong to one symmetric matrix. So the iteration stops before it follows noise: at a v whose
@@ -186,7 +187,7 @@ class NewtonCG:
     def update(self, estimate: Estimate, state: NewtonState, parameters: Tree) -> tuple[Tree, NewtonState]:
         """Return the steps and the next state. On the host, between products."""
         hvp = estimate.require("NewtonCG", HessianProduct).apply
-        scale = coordinate_scales(estimate, state, parameters) * free_elements(estimate, parameters)
+        scale = coordinate_scales(estimate, state, parameters, self.learning_rate) * free_elements(estimate, parameters)
 
         def product(v: np.ndarray) -> np.ndarray:
             return scale * trees.ravel(hvp(trees.unravel(scale * v, parameters)))
