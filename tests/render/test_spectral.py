@@ -336,6 +336,15 @@ def test_a_parameter_that_is_not_supported_is_one_line(key: str, message: str):
     assert "\n" not in str(error.value)
 
 
+def test_a_colour_in_half_precision_is_not_recovered() -> None:
+    """Colours were off by .03 and changed in such steps."""
+    wall = _picture_wall("bitmap", mi.Bitmap(np.full((2, 2, 3), [0.8, 0.3, 0.1], np.float32)))
+    wall["bsdf"]["reflectance"]["format"] = "fp16"
+    info = MitsubaRenderer(lambda: scene(wall=wall), DEPTH).parameters()["wall.bsdf.reflectance.data"]
+    assert not info.perturbable
+    assert "set its format to variant" in info.reason
+
+
 def test_aovs_are_refused(renderer: MitsubaRenderer):
     with pytest.raises(ur.InputError, match="depth: spectral variants render radiance only"):
         renderer.with_aov("depth")

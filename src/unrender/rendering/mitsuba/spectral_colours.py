@@ -106,8 +106,11 @@ class SpectralColours:
 
     def obstacle(self, key: str) -> str:
         """Return the reason why a spectral variant does not support a parameter; "" if it does, and in RGB variants."""
-        if not is_spectral() or key in self.keys:
+        if not is_spectral():
             return ""
+        if key in self.keys:
+            half = dr.type_v(self._parameters[key]) == dr.VarType.Float16
+            return "half precision is too coarse for coefficients of spectra; set its format to variant" if half else ""
         node, leaf, value = self._parameters.properties[key][2], key.rpartition(".")[2], self._parameters[key]
         name = class_name(node)
         if not dr.is_array_v(value) or isinstance(node, (mi.BSDF, mi.Sensor)) or _DIRECT.get(name) == leaf:
