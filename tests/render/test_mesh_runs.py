@@ -76,3 +76,31 @@ def test_a_mesh_with_values_at_its_vertices_is_not_remeshed(tmp_path: Path) -> N
     unknown = ur.Parameter("box.vertex_positions", remeshing={"steps": [5], "method": "subdivide"})
     with pytest.raises(ur.InputError, match="remeshing: its mesh has vertex_color, and new triangles would have none"):
         ur.Problem(scene, [unknown], [ur.View(np.zeros((4, 4, 3)))])
+
+
+def test_views_know_their_values_after_a_change_of_triangles() -> None:
+    """Their sensors were those behind the scene's, which `Problem.replaced` and a second change did not find."""
+    scene = {
+        "type": "scene",
+        "camera": {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 6], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 6, "height": 6},
+        },
+        "box": {"type": "cube"},
+        "lamp": {"type": "point", "position": [1, 2, 5], "intensity": 9.0},
+    }
+    key, lamp, reference = "box.vertex_positions", "lamp.intensity.value", np.full((6, 6, 3), 0.1)
+    unknown = ur.Parameter(key, remeshing={"steps": [5], "method": "subdivide"})
+    made = ur.Problem(scene, [unknown], [ur.View(reference), ur.View(reference, known={lamp: 1.0})])
+    before, again = [ur.render(made, view=view, spp=64) for view in (0, 1)], made
+    for _ in range(2):
+        old = again.unknowns[key]
+        assert old.remeshing is not None
+        assert old.faces is not None
+        points, uv = old.initial.reshape(-1, 3), again.texture_coordinates(key)
+        again = remeshed(again, {key: old.remeshing.apply(points, old.faces, uv)})
+        assert again.original_views[1].known == {lamp: 1.0}
+        for view in (0, 1):
+            np.testing.assert_allclose(ur.render(again, view=view, spp=64), before[view], atol=0.02)
+    assert before[0].mean() > 5 * before[1].mean()

@@ -126,10 +126,11 @@ def remeshed(problem: Problem, meshes: Mapping[str, ReplacedMesh]) -> Problem:
     renderer = problem.renderer.with_meshes(shapes, [p.key for p in schedules])
     # Checked views are RGB; films of other formats would misinterpret them.
     plain = all(format_of(renderer, view.sensor).colour == "rgb" for view in problem.views)
+    pairs = zip(problem.original_views, problem.views, strict=True)
     made = Problem(
         renderer,
         schedules,
-        problem.views if plain else problem.original_views,
+        [replace(own, reference=read.reference, mask=read.mask) if plain else own for own, read in pairs],
         problem.loss,
         problem.max_depth,
         truth={key: value for key, value in problem.truth.items() if key not in meshes},

@@ -45,10 +45,10 @@ def of_views(
     scenes: list[tuple[Any, Renderer]] = []
     worlds: dict[int, World] = {}
     for index, view in enumerate(views):
-        if not view.own_world:
-            check_sensor(index, view, len(renderer.resolutions()))
-            continue
         own = scene_renderer(renderer)
+        if not view.own_world:
+            check_sensor(index, view, len(own.resolutions()))
+            continue
         if view.scene is not None:
             own = next((made for scene, made in scenes if scene is view.scene or _equal(scene, view.scene)), None)
             if own is None:
