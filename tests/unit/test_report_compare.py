@@ -231,6 +231,20 @@ def test_methods_that_start_elsewhere_are_relative_to_one_start(tmp_path):
     assert [stated_error(read(run), start)[0] for run in runs] == [pytest.approx(0.2)] * 2
 
 
+def test_environment_maps_are_compared_without_their_repeated_columns(tmp_path):
+    """They would count twice in the mean error."""
+    truth = {"sky.data": np.full((4, 6, 3), 0.5)}
+    found = truth["sky.data"] + 0.1
+    found[:, [0, -1]] = 9.0
+    of = {"parameters": ["sky.data"], "views": 1, "measures": {"sky.data": {"role": "value", "repeated": 1}}}
+    runs = [write_run(tmp_path / m, m, truth=truth, parameters={"sky.data": found}, problem=of) for m in ("x", "y")]
+    report.compare(runs, tmp_path / "out")
+    page = Page(tmp_path / "out" / "compare.html")
+    assert "4 × 4 × 3; in sRGB" in page.words
+    assert page.words.count("mean 0.1 ") == 2
+    assert page.picture("sky.data : error of x").shape == (4, 4, 3)
+
+
 def test_pictures_are_measured(tmp_path):
     """The medians over seeds of measures that are known by themselves."""
     reference = np.linspace(0.05, 0.6, 12 * 16 * 3).reshape(12, 16, 3).astype(np.float32)

@@ -294,13 +294,15 @@ def _pictures(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
 
 def _maps(comparison: Comparison) -> list[tuple[str, np.ndarray]]:
     first = next(iter(comparison.representatives.values()))
-    key = next((key for key, truth in first.truth.items() if panels.is_map(truth)), None)
-    if key is None:
+    if not (truths := panels.maps_of(first, first.truth)):
         return []
-    row = [(f"truth: {key}", first.truth[key]), ("start", first.initial[key])]
-    row += [(label, run.parameters[key]) for label, run in comparison.representatives.items()]
-    show = panels.ColourScale(first.truth[key])
-    return [(title, show.colours(plane)) for title, array in row if (plane := pictures.plane(array)) is not None]
+    key, truth = next(iter(truths.items()))
+    row = [(f"truth: {key}", truth), ("start", panels.maps_of(first, first.initial).get(key))]
+    row += [(label, panels.maps_of(run, run.parameters).get(key)) for label, run in comparison.representatives.items()]
+    show = panels.ColourScale(truth)
+    return [
+        (title, show.colours(plane)) for title, x in row if x is not None and (plane := pictures.plane(x)) is not None
+    ]
 
 
 def _draw(axes: Axes, metric: Metric, axis: str) -> None:

@@ -116,7 +116,9 @@ def write_comparison(comparison: Comparison, notices: list[str], out: str | Path
 def _page(comparison: Comparison, notices: list[str]) -> bytes:
     representatives = comparison.representatives
     first = next(iter(representatives.values()))
-    maps = [key for key, truth in first.truth.items() if panels.is_map(truth)]
+    truths = panels.maps_of(first, first.truth)
+    found = {name: panels.maps_of(run, run.parameters) for name, run in representatives.items()}
+    maps = list(truths)
     views = list(first.views)
     return html.render(
         "compare.html",
@@ -133,7 +135,7 @@ def _page(comparison: Comparison, notices: list[str]) -> bytes:
         ],
         more_views=max(0, len(views) - _COMPARED_VIEWS),
         maps=[
-            panels.map_of_methods(k, {name: run.parameters[k] for name, run in representatives.items()}, first.truth[k])
+            panels.map_of_methods(k, {name: of[k] for name, of in found.items() if k in of}, truths[k])
             for k in maps[:_COMPARED_MAPS]
         ],
         more_maps=max(0, len(maps) - _COMPARED_MAPS),

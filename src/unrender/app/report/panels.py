@@ -185,6 +185,12 @@ def map_of_run(run: RunFolder, key: str, encoder: PictureEncoder = INLINE) -> Pa
     return Panel(key, note, tuple(stacks), len(planes) == 1, len(planes) > 1)
 
 
+def maps_of(run: RunFolder, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays that are displayed as images, without the repeated columns of environment maps."""
+    inner = {key: periodic.interior(x, run.measure(key).repeated) for key, x in arrays.items() if is_map(x)}
+    return {key: x for key, x in inner.items() if is_map(x)}
+
+
 def map_of_methods(key: str, results: Mapping[str, np.ndarray], truth: np.ndarray) -> Panel:
     """Return the panel of a map of several methods.
 
