@@ -56,9 +56,16 @@ def off_centre() -> dict[str, Any]:
 def screened() -> dict[str, Any]:
     """A sheet before the near clipping plane, which nobody sees, hides half of the block from the camera itself."""
     described = block()
-    sheet = mi.ScalarTransform4f().translate([-0.25, 0, 3.4]).scale([0.25, 0.5, 1])
+    sheet = mi.ScalarTransform4f().translate([0.25, 0, 3.4]).scale([0.25, 0.5, 1])
     described["sensor"]["near_clip"] = 1.0
     return described | {"sheet": {"type": "rectangle", "to_world": sheet, "bsdf": {"type": "diffuse"}}}
+
+
+def veiled() -> dict[str, Any]:
+    """Half of the picture is seen through a mask, which lets half of the light pass."""
+    mask = {"type": "mask", "opacity": 0.5, "inner": {"type": "twosided", "inner": {"type": "diffuse"}}}
+    sheet = mi.ScalarTransform4f().translate([0.5, 0, 2]).scale([0.5, 1, 1])
+    return block() | {"sheet": {"type": "rectangle", "to_world": sheet, "bsdf": mask}}
 
 
 def receiver() -> dict[str, Any]:
@@ -228,7 +235,8 @@ def test_points_on_emitters_span_the_solid_angle_that_each_emitter_has() -> None
     [
         (block, "moving.rotation.x", 2),
         (off_centre, "moving.translation.z", 2),
-        (screened, "moving.translation.z", 2),
+        (screened, "moving.translation.x", 2),
+        (veiled, "moving.translation.x", 3),
         (block, "moving.scale", 3),
         (block, "moving.translation.y", 4),
         (block, "moving.translation.z", 6),

@@ -48,7 +48,7 @@ def screened() -> dict[str, Any]:
     """A sheet before the near clipping plane, which nobody sees, hides half of the pictures from the camera itself."""
     described = glowing()
     described["sensor"]["near_clip"] = 1.0
-    sheet = transform().translate([-0.25, 0, 3.4]).scale([0.25, 0.5, 1])
+    sheet = transform().translate([0.25, 0, 3.4]).scale([0.25, 0.5, 1])
     return described | {"sheet": {"type": "rectangle", "to_world": sheet}}
 
 
