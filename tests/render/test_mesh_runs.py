@@ -12,9 +12,11 @@ import pytest
 import trimesh
 
 import unrender as ur
+from unrender.runs.callbacks import Callback
 from unrender.runs.folder import reader
 from unrender.runs.metadata import RunAnnotations
 from unrender.runs.refinement import remeshed
+from unrender.runs.run import Run
 from unrender.scene.problem import Problem
 
 SMALL = {"resolution": 16, "subdivisions": 2, "reference_spp": 32}
@@ -104,3 +106,33 @@ def test_views_know_their_values_after_a_change_of_triangles() -> None:
         for view in (0, 1):
             np.testing.assert_allclose(ur.render(again, view=view, spp=64), before[view], atol=0.02)
     assert before[0].mean() > 5 * before[1].mean()
+
+
+def test_a_change_of_triangles_restarts_what_is_of_the_mesh_alone() -> None:
+    """In whichever part of a partition the mesh is, and not the schedule of a smoothed loss."""
+    made = ur.gallery.problem("statue", resolution=8, subdivisions=1, reference_spp=4, views=1, texture_resolution=4)
+    given = [
+        replace(p, remeshing={"steps": [2], "method": "subdivide"}) if p.key == STATUE else p for p in made.parameters
+    ]
+    problem = Problem(made.renderer.pair.description, given, made.views, made.loss, made.max_depth)  # type: ignore
+    smoothed = ur.SmoothedDerivatives(0.05, 4, spp=2, schedule=ur.optimizers.schedules.Exponential(2))
+    estimator = ur.estimators.HybridGradient(ur.PathGradient(spp=2), smoothed, keys=(STONE,))
+    vertices, texels = ur.optimizers.Adam(0.005, uniform=True), ur.optimizers.Adam(0.02)
+    seen = Steps()
+    optimizer = ur.optimizers.Partitioned((STONE,), texels, vertices)
+    result = ur.optimize(problem, estimator, optimizer, steps=4, callbacks=[seen])
+    assert [record.get("faces") for record in result.history if "faces" in record] == [{STATUE: 320}]
+    assert seen.rows == [(1.0, 1, 1), (2.0, 2, 2), (3.0, 3, 1), (4.0, 4, 2)]
+
+
+class Steps(Callback):
+    """Age of the smoothed loss, and number of steps in the states of both optimizers."""
+
+    def __init__(self) -> None:
+        self.rows: list[tuple[float, int, int]] = []
+
+    def on_step(self, run: Run, record: dict[str, Any]) -> None:
+        del record
+        parts = run.state.optimizer.own, run.state.optimizer.others
+        own, others = (part.step - part.begun for part in parts)
+        self.rows.append((run.state.estimator.perturbed.age, own, others))

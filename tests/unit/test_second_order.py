@@ -16,7 +16,7 @@ from unrender.core import trees
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import AtBounds, Capability, Hessian, HessianProduct, LossFunction, Smoothing
-from unrender.optimizers import CMAES, LBFGS, Adam, AveragedNewton, Newton, NewtonCG
+from unrender.optimizers import CMAES, LBFGS, Adam, AveragedNewton, Newton, NewtonCG, Partitioned
 from unrender.optimizers.cma_es import CMAESState
 from unrender.schedules import Constant, Exponential
 
@@ -719,3 +719,13 @@ def test_the_loop_tells_optimizers_which_elements_are_at_their_bounds() -> None:
     result = ur.optimize(problem, ur.GaussNewton(2, 2), AveragedNewton(), steps=9)
     assert result.parameters["a"] == pytest.approx([1e-4], abs=1e-6)
     assert result.parameters["b"] == pytest.approx([best], abs=1e-3)
+
+
+def test_parts_of_a_partition_know_smoothing_and_bounds() -> None:
+    """Both are what the same optimizer gets alone: the trust region is in units of σ, and an element at its bound stays."""
+    like, gradient = {"a": np.zeros(2), "b": np.zeros(1)}, {"a": np.array([3.0, 1.0]), "b": np.ones(1)}
+    at = AtBounds(lambda: {"a": np.array([-1.0, 0.0]), "b": np.zeros(1)})
+    whole = Estimate(0.0, gradient, (Smoothing({"a": 0.01, "b": 0.5}), at))
+    partition = Partitioned(("b",), Adam(), LBFGS())
+    steps, _ = partition.update(whole, partition.init(like), like)
+    np.testing.assert_allclose(steps["a"], [0.0, -0.05 * 0.01])

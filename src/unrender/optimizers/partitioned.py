@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +12,15 @@ from unrender.core.registry import register
 from unrender.core.text import listed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import BlockEstimate, Capabilities, FreshGradient, Gradient
+from unrender.estimators.capabilities import (
+    AtBounds,
+    BlockEstimate,
+    Capabilities,
+    Capability,
+    FreshGradient,
+    Gradient,
+    Smoothing,
+)
 from unrender.optimizers.base import Choosing, Optimizer, averaged_by
 from unrender.optimizers.recipes import Adam
 from unrender.optimizers.transforms.base import checked_keys
@@ -83,14 +91,12 @@ class Partitioned:
 
     def update(self, estimate: Estimate, state: PartitionedState, parameters: Tree) -> tuple[Tree, PartitionedState]:
         points, gradients = self._parts(parameters), self._parts(estimate.gradient)
-        fresh = estimate.get(FreshGradient)
-        fresh_parts = ({}, {}) if fresh is None else self._parts(fresh.values)
         steps, states = {}, []
-        for part, before, point, gradient, values in zip(
-            (self.optimizer, self.others), (state.own, state.others), points, gradients, fresh_parts, strict=True
+        for part, before, point, gradient in zip(
+            (self.optimizer, self.others), (state.own, state.others), points, gradients, strict=True
         ):
-            capabilities = () if fresh is None else (FreshGradient(values),)
-            own = replace(estimate, gradient=gradient, capabilities=capabilities)
+            own_parts = (_part(capability, gradient) for capability in estimate.capabilities)
+            own = replace(estimate, gradient=gradient, capabilities=tuple(filter(None, own_parts)))
             if self._solves_block and part is self.optimizer:
                 block = estimate.require("Partitioned", BlockEstimate)
                 if set(block.keys) != set(self.keys):
@@ -102,6 +108,14 @@ class Partitioned:
             steps |= part_steps
             states.append(after)
         return {key: steps[key] for key in parameters}, PartitionedState(*states)
+
+    def restarted(self, state: PartitionedState, fresh: PartitionedState, keys: Iterable[str]) -> PartitionedState:
+        """Return a state in which those of the two states restart that belong to one of these parameters."""
+        own, others = self._parts(dict.fromkeys(keys))
+        return PartitionedState(
+            restarted(state.own, fresh.own) if own else state.own,
+            restarted(state.others, fresh.others) if others else state.others,
+        )
 
     def averages(self, keys: Iterable[str]) -> frozenset[str]:
         """Return the keys that one of the two optimizers averages."""
@@ -119,3 +133,15 @@ class Partitioned:
         """Split a tree into the part of `keys` and the rest."""
         own = {key: value for key, value in tree.items() if key in self.keys}
         return own, {key: value for key, value in tree.items() if key not in self.keys}
+
+
+def _part(capability: Capability, keys: Collection[str]) -> Capability | None:
+    """Return a capability for some of the parameters; None for one that is left out."""
+    match capability:
+        case FreshGradient(values):
+            return FreshGradient({key: values[key] for key in keys})
+        case Smoothing(sigma):
+            return Smoothing({key: sigma[key] for key in keys})
+        case AtBounds(sides):
+            return AtBounds(lambda: {key: side for key, side in sides().items() if key in keys})
+    return None

@@ -15,7 +15,7 @@ import numpy as np
 
 from unrender.core import arrays, trees
 from unrender.core.errors import InputError
-from unrender.optimizers.partitioned import PartitionedState
+from unrender.optimizers.partitioned import Partitioned
 from unrender.rendering.picture_format import format_of
 from unrender.rendering.renderer import Remeshable, ReplacedMesh
 from unrender.runs.callbacks import Callback
@@ -178,11 +178,11 @@ class MeshRefinement(Callback):
         values = {key: unchanged.get(key, run.problem.unknowns[key].initial) for key in run.parameters}
         run.parameters = {key: run.problem.renderer.array(value) for key, value in values.items()}
         fresh = run.optimizer.init(run.problem.coordinates.of(run.parameters), run.problem.learning_rates)
-        state.estimator = run.estimator.init(run.problem, run.parameters)
+        state.estimator = restarted(state.estimator, run.estimator.init(run.problem, run.parameters))
         before = state.optimizer
         state.optimizer = restarted(before, fresh)
-        if isinstance(before, PartitionedState) and isinstance(fresh, PartitionedState):
-            state.optimizer = PartitionedState(restarted(before.own, fresh.own), before.others)
+        if isinstance(run.optimizer, Partitioned):
+            state.optimizer = run.optimizer.restarted(before, fresh, meshes)
         state.noise = GradientNoise()
         run.description["meshes"] = arrays_of(run.problem, run.description["meshes"])
         arrays.evaluate(run.parameters, state.estimator, state.optimizer)
