@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from tests.analytic import AnalyticRenderer
 from unrender.core.random import Key
 from unrender.estimators.gauss_newton import GaussNewtonState
 from unrender.estimators.hybrid import HybridState
+from unrender.rendering.renderer import SampleRequest
 from unrender.runs import least_squares
 from unrender.runs.least_squares import NumbersCheck, _checked, _Fit, check_numbers, pixel_weights
 from unrender.runs.numbers import Differences, Numbers
@@ -486,3 +488,38 @@ def test_a_number_that_starts_and_ends_at_0_is_changed_within_its_bounds():
     parameters = [ur.Parameter(key, initial=x, bounds=(0, None)) for key, x in values.items()]
     made = ur.Problem(renderer, parameters, [ur.View(reference)])
     assert set(check_numbers(made, values, values, FAR).errors) == {"a", "b"}
+
+
+class OfTwoSizes(AnalyticRenderer):
+    """The second sensor shows the first sixteen pixels of the first."""
+
+    def resolutions(self) -> list[tuple[int, int]]:
+        return [self.shape, (4, 4)]
+
+    def image_batch(self, parameters: Any, request: SampleRequest) -> np.ndarray:
+        size = self.resolutions()[request.sensor]
+        samples = np.random.default_rng(request.seed).uniform(-1.0, 1.0, (*size, 3, request.spp)).mean(axis=-1)
+        states = zip(*(np.reshape(x, (len(x), -1)) for x in parameters.values()), strict=True)
+        exact = [(self.matrix @ np.concatenate(state))[: samples.size].reshape(samples.shape) for state in states]
+        return np.stack([image * (1.0 + self.noise * samples) for image in exact])
+
+
+def test_errors_are_those_of_the_weights_that_the_loss_gives_views_of_different_sizes():
+    """A view of sixteen pixels counts as much as one of 576. Equal pixels would have a third of the errors."""
+    size, truth, z = (24, 24), np.array([0.6, 0.4]), []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        matrix = rng.uniform(0.2, 1.0, (24 * 24 * 3, 2))
+        start = {"a": np.full(1, 0.5), "b": np.full(1, 0.5)}
+        renderer = OfTwoSizes(start, matrix, noise=0.02, shape=size, sensors=2)
+        parts = [(matrix, size), (matrix[:48], (4, 4))]
+        noisy = [a @ truth + rng.normal(0.0, 0.05, len(a)) for a, _ in parts]
+        views = [ur.View(y.reshape(*of, 3), n) for n, (y, (_, of)) in enumerate(zip(noisy, parts, strict=True))]
+        made = ur.Problem(renderer, [ur.Parameter(key) for key in start], views)
+        normal = sum(a.T @ a / len(a) for a, _ in parts)
+        found = np.linalg.solve(normal, sum(a.T @ y / len(a) for y, (a, _) in zip(noisy, parts, strict=True)))
+        values = {key: found[[n]].astype(np.float32) for n, key in enumerate(start)}
+        check = check_numbers(made, values, start, FAR)
+        assert not check.unfinished
+        z += [(values[key][0] - truth[n]) / check.errors[key][0] for n, key in enumerate(start)]
+    assert np.std(z) == pytest.approx(1.0, abs=0.35)

@@ -223,8 +223,13 @@ class Numbers:
         return np.concatenate(flat)
 
     def roots(self, view: int) -> np.ndarray:
-        """Return the roots of the weights of a view's pixels, (P, 3), or (P, 1) if its channels have equal weights."""
-        roots = mask_roots(self.problem, view).reshape(-1, 1) * math.sqrt(self.problem.views[view].weight)
+        """Return the roots of the weights of a view's pixels, (P, 3), or (P, 1) if its channels have equal weights.
+
+        As in the loss, a view has its weight whatever the number of its pixels.
+        """
+        roots = mask_roots(self.problem, view).reshape(-1, 1)
+        share = self.problem.pixels / (len(self.problem.views) * len(roots))
+        roots = roots * math.sqrt(share * self.problem.views[view].weight)
         return roots * np.sqrt(self.weights[view]).reshape(len(roots), -1) if self.weights else roots
 
     def differences(self, directions: np.ndarray, key: Key) -> Differences:
