@@ -523,3 +523,15 @@ def test_errors_are_those_of_the_weights_that_the_loss_gives_views_of_different_
         assert not check.unfinished
         z += [(values[key][0] - truth[n]) / check.errors[key][0] for n, key in enumerate(start)]
     assert np.std(z) == pytest.approx(1.0, abs=0.35)
+
+
+@pytest.mark.parametrize(("high", "finite"), [(0.55, False), (0.6001, True), (1.0, True)])
+def test_a_number_whose_solution_is_beyond_its_bound_has_no_standard_error(high: float, finite: bool):
+    """At the bound, a small error would exclude the true value, 0.6."""
+    made = problem(MATRIX)
+    made = made.replaced(parameters=[ur.Parameter("a", bounds=(0.0, high)), ur.Parameter("b")])
+    values = {"a": np.array([min(0.6, high), 0.3, 0.4], np.float32), "b": np.asarray(0.5, np.float32)}
+    values["a"] = np.asarray(made.unknowns["a"].project(values["a"]), np.float32)
+    check = check_numbers(made, values, made.initial_values(), FAR)
+    assert np.isfinite(check.errors["a"]).tolist() == [finite, True, True]
+    assert np.isfinite(check.errors["b"]).all()

@@ -227,6 +227,7 @@ class _Fit:
         unseen: largest changes of the numbers along each hidden direction that leaves them open, signed, (n, number of hidden directions).
         blind: largest changes of the numbers along the other hidden directions, whose slopes this check does not know, (n,).
         better: standard errors by which the picture is better than with the start's numbers.
+        beyond: whether the solution is beyond a bound of the number by more than noise, (n,).
     """
 
     covariance: np.ndarray
@@ -236,6 +237,7 @@ class _Fit:
     unseen: np.ndarray
     blind: np.ndarray | float = 0.0
     better: float = math.inf
+    beyond: np.ndarray | bool = False
 
     @classmethod
     def of(
@@ -275,6 +277,8 @@ class _Fit:
         noises = covariance(noise, noise) + covariance(left, left, 0.5 * (differences.one - differences.other))
         error, own = (np.sqrt(np.maximum(np.diag(x)[:n], 0.0)) for x in (total, noises))
         step = numbers.inside((numbers.point + changes @ along)[None])[0] - numbers.point
+        rounding = 1e-6 * np.abs(numbers.point[:n])
+        beyond = np.abs((changes @ along - step)[:n]) > _ERRORS * np.hypot(error, own) + rounding
         flat = squares + _ERRORS * errors < (_FLAT * _SHIFT * numbers.slope()) ** 2 * residual.size
         # The noise of this check says nothing about references that have much less of it.
         comparable = np.mean(after[0] * after[1]) > _COMPARABLE**2 * np.mean(noise * noise)
@@ -283,7 +287,7 @@ class _Fit:
         unseen = changes[:n] * (hidden[None] & open_)
         blind = np.abs(changes[:n] * (hidden[None] & ~open_)).max(axis=1, initial=0.0)
         better = math.inf if before is None else _better(residuals, before)
-        return cls(total, error, own, step[:n], unseen[:, hidden], blind, better)
+        return cls(total, error, own, step[:n], unseen[:, hidden], blind, better, beyond)
 
 
 def _better(residuals: np.ndarray, before: np.ndarray) -> float:
@@ -341,7 +345,8 @@ def _checked(numbers: Numbers, fit: _Fit, widths: np.ndarray) -> NumbersCheck:
                 f"{key}: the run ended before it settled: a least-squares step from its end moves it by {_numbers(fit.step[of])}, with the "
                 f"standard error {_numbers(of_step[of])}; give more steps or seconds, or resume the run"
             )
-    known = np.where((error > sizes) | refuted, np.inf, error)  # beyond its own size an error is not linear
+    # Beyond its own size an error is not linear, and at a bound it is not that of the solution.
+    known = np.where((error > sizes) | refuted | fit.beyond, np.inf, error)
     errors, steps, noise = ({k: x[of] for k, of in numbers.places().items()} for x in (known, fit.step, own))
     hidden = tuple(k for k, of in numbers.places().items() if blind[of].any() and k not in undetermined)
     return NumbersCheck(undetermined, unfinished, errors, steps, noise, blind=hidden)
