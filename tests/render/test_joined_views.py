@@ -132,8 +132,8 @@ def kinds(asked: ur.Problem, estimator: ur.PathGradient, monkeypatch: pytest.Mon
     [
         (lambda: problem(), ur.PathGradient(spp=2), 1),
         (lambda: problem(sizes=(12, 8, 8, 8)), ur.PathGradient(spp=2), 1),
-        (lambda: problem(sizes=(64, 64, 64, 64)), ur.PathGradient(spp=4), 2),
-        (lambda: problem(sizes=(72, 64, 64, 64)), ur.PathGradient(spp=4), 0),
+        (lambda: problem(sizes=(64, 64, 64, 64)), ur.PathGradient(spp=16), 2),
+        (lambda: problem(sizes=(72, 64, 64, 64)), ur.PathGradient(spp=16), 0),
         (lambda: problem(sizes=(12,)), ur.PathGradient(spp=2), 0),
         (lambda: problem(), ur.PathGradient(spp=2, adjoint_spp=2), 0),
         (lambda: problem(), ur.PathGradient(pixels=ur.pixels.AdaptiveCounts(), spp=4), 0),

@@ -16,8 +16,8 @@ from unrender.rendering.renderer import SampleRequest
 from unrender.scene.problem import Problem
 from unrender.statistics.paired_losses import slices_of_images
 
-_MOST_JOINED = 1 << 15
-"""Maximum number of paths of a launch of several views."""
+_MOST_JOINED = 1 << 19
+"""Maximum number of path segments of a launch of several views. Cached paths of as many take less than 36 MB."""
 
 
 @dataclass(frozen=True)
@@ -300,7 +300,7 @@ def joined_views(problem: Problem, spp: int, key: Key) -> list[JoinedViews]:
         key: random key of the step.
     """
     sizes, count = [height * width for height, width in problem.sizes], len(problem.views)
-    fitting = _MOST_JOINED // (spp * max(sizes))
+    fitting = _MOST_JOINED // (problem.max_depth * spp * max(sizes))
     several = max((n for n in range(1, fitting + 1) if count % n == 0), default=1)
     if several == 1 or (several < count and len(set(sizes)) > 1) or not _supports_joined(problem):
         return []
