@@ -153,3 +153,17 @@ def test_posed_matrices_are_the_renderers_poses() -> None:
     for name, pose in (("ball", ball), ("camera", camera)):
         expected = np.array(pose.point(mi.Point3f(*map(float, point)))).reshape(-1)
         np.testing.assert_allclose((found[name] @ [*point, 1])[:3], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("axis", "words"), [([1, 1, 0], "sky: to_world: cannot be exported"), ([0.577] * 3, "")])
+def test_a_rotation_about_an_axis_of_another_length_is_refused(axis: list[float], words: str, tmp_path: Path) -> None:
+    """Mitsuba takes the transposed matrix for its inverse, so the lit scene is not that of the matrix, which a file holds."""
+    turned = mi.ScalarTransform4f().rotate(axis=axis, angle=50)
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32)), "to_world": turned}
+    asked = problem(scene({"type": "diffuse"}) | {"sky": sky}, "ball.bsdf.reflectance.value")
+    if not words:
+        assert ur.app.export((asked, start(asked)), tmp_path / "out").scene is not None
+        return
+    with pytest.raises(ur.InputError, match=words):
+        ur.app.export((asked, start(asked)), tmp_path / "out")
+    assert not list(tmp_path.iterdir())

@@ -44,6 +44,8 @@ _OWN = {textures.RECORD, textures.TABLE, textures.FOLDER, *_OF_SCENE, *OWN}
 _SPP = 256
 _POSITIONS = mesh_layout.POSITIONS
 _ROUNDING = 1e-4
+_INVERSE = 5e-3
+"""Largest deviation from 1 of a matrix times its inverse; axes are typed with two or three digits."""
 _Maps = Mapping[str, Mapping[str, np.ndarray]]
 """{name: {key: array}}, see `textures.write`."""
 
@@ -171,6 +173,7 @@ def _fill(
 ) -> dict[str, str]:
     """Write scene.xml and the files that it names. Returns `Exported.renamed`."""
     graph = SceneGraph(_description(renderer.pair.description, folder))
+    _check_transforms(graph)
     described = renderer.pair.as_described()
     scene = described.scene
     moved = {key: value for key, value in values.items() if key in poses.keys(scene)}
@@ -199,6 +202,23 @@ def _fill(
     path.write_bytes(graph.xml())
     names = _verify(graph, path, {key: places[key].key for key in own}, posed)
     return {key: names[place.key] for key, place in places.items() if names[place.key] != key}
+
+
+def _check_transforms(graph: SceneGraph) -> None:
+    """Raise `InputError` for a transform whose inverse is not that of its matrix, which is all that a file holds.
+
+    Mitsuba makes such a transform from a rotation about an axis of another length than 1.
+    """
+    for index in graph.used():
+        props = graph.nodes[index].props
+        for name in [name for name in props.keys() if props.type(name) == mi.Properties.Type.Transform]:  # noqa: SIM118
+            matrix, inverse = (np.array(x, np.float64) for x in (props[name].matrix, props[name].inverse_transpose))
+            rounding = 1e-6 * np.abs(matrix).max() * np.abs(inverse).max()
+            if np.abs(matrix @ inverse.T - np.eye(len(matrix))).max() > _INVERSE + rounding:
+                what = graph.names[index] or f"a {props.plugin_name()}"
+                raise InputError(
+                    f"{what}: {name}: cannot be exported: it rotates about an axis whose length is not 1; normalise the axis"
+                )
 
 
 def _description(description: Any, folder: Path) -> Path | dict[str, Any]:
