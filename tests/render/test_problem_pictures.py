@@ -127,6 +127,15 @@ def test_says_which_channels_a_file_without_colours_has(tmp_path: Path):
         images.read(tmp_path / "b.exr")
 
 
+@pytest.mark.parametrize("largest", [100, 65535])
+def test_refuses_a_ppm_file_that_mitsuba_misreads(tmp_path: Path, largest: int):
+    """Its values were off by a factor, or their bytes were swapped."""
+    values = np.full((6, 8, 3), 50, ">u2" if largest > 255 else "u1")
+    (tmp_path / "a.ppm").write_bytes(b"P6\n8 6\n%d\n" % largest + values.tobytes())
+    with pytest.raises(InputError, match=rf"a\.ppm: cannot be read as a picture: the largest value .* is {largest},"):
+        images.read(tmp_path / "a.ppm")
+
+
 def test_refuses_what_is_no_picture(tmp_path: Path):
     for name in ("a.png", "a.jpg", "a.exr", "a.hdr", "a.npy"):
         (tmp_path / name).write_bytes(b"this is not a picture at all")

@@ -225,11 +225,21 @@ def _check_scanlines(data: bytes, width: int, height: int) -> None:
 
 
 def _netpbm(pattern: bytes, coloured: bytes) -> _Reader:
-    """Return the reader of a text header; `pattern` has its type, of which those `coloured` have three channels, width and height."""
+    """Return the reader of a text header.
+
+    Args:
+        pattern: its groups are the type, width, height and, if Mitsuba decodes the file, the largest value.
+        coloured: types of three channels.
+    """
 
     def read(data: bytes, _: IO[bytes]) -> Sizes:
         if (match := re.match(pattern, data)) is None:
             raise ValueError("no resolution")
+        if any(largest != b"255" for largest in match.groups()[3:]):
+            what = (
+                f"the largest value of a .ppm is {int(match[4])}, which Mitsuba ignores or reads in another byte order"
+            )
+            raise InputError(f"cannot be read as a picture: {what}; save it as .png")
         return [(int(match[2]), int(match[3]), 3 if match[1] in coloured else 1)]
 
     return read
