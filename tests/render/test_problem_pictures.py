@@ -136,6 +136,16 @@ def test_refuses_a_ppm_file_that_mitsuba_misreads(tmp_path: Path, largest: int):
         images.read(tmp_path / "a.ppm")
 
 
+def test_refuses_indexed_colours_that_mitsuba_takes_for_grey(tmp_path: Path):
+    colours = np.random.default_rng(0).integers(0, 256, (6, 8, 3)).astype(np.uint8)
+    Image.fromarray(colours).quantize(16).save(tmp_path / "a.bmp")
+    with pytest.raises(InputError, match=r"a\.bmp: cannot be read as a picture: its colours are indexed"):
+        images.read(tmp_path / "a.bmp")
+    Image.fromarray(colours[..., 0]).save(tmp_path / "grey.bmp")
+    grey = images.read(tmp_path / "grey.bmp", linearise=False).values
+    np.testing.assert_allclose(grey, colours[..., :1] / 255, atol=1e-6)
+
+
 def test_refuses_what_is_no_picture(tmp_path: Path):
     for name in ("a.png", "a.jpg", "a.exr", "a.hdr", "a.npy"):
         (tmp_path / name).write_bytes(b"this is not a picture at all")

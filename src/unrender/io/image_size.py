@@ -276,6 +276,15 @@ def _bmp(data: bytes, _: IO[bytes]) -> Sizes:
     return [(width, abs(height), max(bits // 8, 1))]
 
 
+def _mitsubas_bmp(data: bytes, file: IO[bytes]) -> Sizes:
+    """Return the size. Raise `InputError` for indexed colours, since Mitsuba takes the indices for grey."""
+    head, bits, used = (struct.unpack_from(form, data, at)[0] for form, at in (("<I", 14), ("<H", 28), ("<I", 46)))
+    table = data[14 + head : 14 + head + 4 * (used or 256)] if bits == 8 else b""
+    if any(table[at : at + 3] != bytes([at // 4]) * 3 for at in range(0, len(table) - 3, 4)):
+        raise InputError("cannot be read as a picture: its colours are indexed, expected 24 bits; save it as .png")
+    return _bmp(data, file)
+
+
 def _tga(data: bytes, _: IO[bytes]) -> Sizes:
     """Return the size from a header that Pillow accepts."""
     width, height, bits = struct.unpack_from("<HHB", data, 12)
@@ -351,7 +360,7 @@ def _jpeg(data: bytes, file: IO[bytes]) -> Sizes:
 
 
 _MITSUBA: tuple[_Kind, ...] = (
-    (b"BM", "BMP", _bmp),
+    (b"BM", "BMP", _mitsubas_bmp),
     (b"#?", "HDR", _hdr),
     (b"PF", "PFM", _pfm),
     (b"Pf", "PFM", _pfm),
@@ -364,7 +373,8 @@ _MITSUBA: tuple[_Kind, ...] = (
 """Kinds of files that Mitsuba's `Bitmap` may decode."""
 
 _PHOTOGRAPHS: tuple[_Kind, ...] = (
-    *(each for each in _MITSUBA if each[1] not in ("PPM", "TGA")),
+    *(each for each in _MITSUBA if each[1] not in ("BMP", "PPM", "TGA")),
+    (b"BM", "BMP", _bmp),
     *((magic, "TIFF", tiff_header.read) for magic in tiff_header.MAGICS),
     (b"RIFF", "WEBP", _webp),
     *((b"P%d" % number, "PPM", _pnm) for number in range(1, 7)),
