@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from unrender.core import registry, tables
 from unrender.core.errors import InputError
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import NoiseSample, Variance
-from unrender.optimizers import Adam, Chain, ScheduleFree
+from unrender.optimizers import Adam, AveragedNewton, Chain, Partitioned, ScheduleFree
 from unrender.optimizers.transforms import (
     AgreementRate,
     ApplyPreconditioner,
@@ -34,7 +35,7 @@ from unrender.optimizers.transforms.base import SmoothingChange, StepUpdate, che
 from unrender.optimizers.transforms.lasting_agreement import GradientBlocks
 from unrender.preconditioners import Sobolev
 from unrender.runs.folder.state import Packed, check_alike, pack, unpack
-from unrender.scene.upsampling import restarted
+from unrender.scene.upsampling import NotCarried, restarted, upsampled
 from unrender.schedules import Cosine
 
 SMOOTH = FittedSobolev(Sobolev(2.0), ("map",))
@@ -119,13 +120,15 @@ def test_a_chain_goes_on_from_its_table_and_its_checkpoint(name: str) -> None:
 
 @pytest.mark.parametrize("name", CHAINS)
 def test_a_chain_that_starts_anew_makes_a_first_step(name: str) -> None:
-    """The schedule goes on, everything else is as before the first step."""
+    """The schedule goes on, and a pull keeps its start. Everything else is as before the first step."""
     chain = Chain(CHAINS[name](), 0.1)
     _, state, x = take(chain, estimates(5))
-    fresh = restarted(state, chain.init(x))
+    fresh, first = restarted(state, chain.init(x)), chain.init(x)
     assert (fresh.step, fresh.begun) == (5, 5)
+    if name == "PullToStart":
+        first = replace(first, states=(state.states[0], *first.states[1:]))
     (estimate,) = estimates(1, seed=3)
-    same(chain.update(estimate, fresh, x)[0], chain.update(estimate, chain.init(x), x)[0])
+    same(chain.update(estimate, fresh, x)[0], chain.update(estimate, first, x)[0])
 
 
 def test_adam_is_a_mean_over_a_root_mean_square() -> None:
@@ -320,3 +323,24 @@ def test_keys_are_read_once_and_nothing_else_is_accepted() -> None:
     for keys in (5, None, "ab", ["a", 1]):
         with pytest.raises(InputError, match=r"^A: keys must be keys of parameters"):
             checked_keys("A: keys", keys)
+
+
+def test_a_restart_keeps_the_start_that_pulls() -> None:
+    pull = PullToStart({"a": 1.0, "b": 1.0})
+    state = pull.init({"a": np.zeros(2), "b": np.zeros(2)}, {})
+    again = restarted(state, pull.init({"a": np.ones(2), "b": np.ones(4)}, {}))
+    np.testing.assert_array_equal(again.values["a"], np.zeros(2))
+    np.testing.assert_array_equal(again.values["b"], np.ones(4))  # of another resolution
+
+
+@pytest.mark.parametrize("refined", ["grid", "number"])
+def test_numbers_beside_a_refined_grid_keep_their_models(refined: str) -> None:
+    start = {"grid": np.zeros((2, 2, 1)), "number": np.zeros(1)}
+    optimizer = Partitioned(("number",), AveragedNewton(), Adam())
+    state = optimizer.init(start)
+    upsampler: Any = SimpleNamespace(shares={refined: 0.25}, tree=lambda tree, power=0.0: tree)
+    if refined == "number":
+        with pytest.raises(NotCarried, match="AveragedNewton"):
+            upsampled(state, upsampler)
+    else:
+        assert upsampled(state, upsampler).own is state.own

@@ -26,6 +26,7 @@ from unrender.optimizers import rates
 from unrender.optimizers.directions import coordinate_scales, sides_of_bounds
 from unrender.optimizers.newton import trust_region_step
 from unrender.optimizers.transforms.base import checked_keys
+from unrender.scene.upsampling import NotCarried, Upsampler
 from unrender.statistics.scores import positive_part, scaled_eigh
 
 _FEWEST_MODELS = 8.0
@@ -80,6 +81,12 @@ class AveragedNewtonState:
     radii: np.ndarray
     step: np.ndarray
     scores: np.ndarray | None
+
+    def upsampled(self, upsampler: Upsampler) -> AveragedNewtonState:
+        """Return this state. Raises `NotCarried` if one of its parameters changes its resolution."""
+        if any(key in upsampler.shares for key in self.learning_rates):
+            raise NotCarried("AveragedNewton's models")
+        return self
 
 
 @register

@@ -22,6 +22,11 @@ class Start(TransformState):
 
     values: Tree = field(metadata=VALUES)
 
+    def restarted(self, fresh: Start) -> Start:
+        """Return the values before the first step, and those of `fresh` where shapes have changed."""
+        pairs = {key: (self.values[key], x) for key, x in fresh.values.items()}
+        return Start({key: old if arrays.shape(old) == arrays.shape(x) else x for key, (old, x) in pairs.items()})
+
 
 @register
 @dataclass(frozen=True)
