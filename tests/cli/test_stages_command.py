@@ -383,3 +383,20 @@ def test_a_resume_after_all_stages_have_ended_is_refused(
         assert answer.refuses("result: all stages have ended; to continue the last one, give --steps or --seconds")
         assert "unrender resume result/3-all" in answer.error
     assert (out / "stages.toml").read_text() == before
+
+
+def test_views_whose_scene_has_none_of_the_unknowns_are_left_out_of_a_stage(staged: Path) -> None:
+    """Also where such a view comes first, whose scene holds no result of the stage before."""
+    (staged / "other.xml").write_text((staged / "wall.xml").read_text().replace('id="sky"', 'id="lamp"'))
+    problem = staged / "problem.toml"
+    other = '[[views]]\nreference = "photo.exr"\nscene = "other.xml"\n[[views]]'
+    problem.write_text(problem.read_text().replace("[[views]]", other))
+    colour, light = stages_file.Stage("colour", (KEY,)), stages_file.Stage("light", ("sky.radiance.value",))
+    whole = StagedProblem.read(stages_file.Stages(problem, (light, colour), steps=2))
+    half = np.full(3, 0.5, np.float32)
+    first = whole.of_stage(light, {KEY: half}, staged / "one")
+    assert [view.scene for view in first.original_views] == [None]
+    assert "view 0 is left out: its scene has none of the unknowns of this stage" in first.notices
+    second = whole.of_stage(colour, {"sky.radiance.value": half}, staged / "two")
+    assert len(second.original_views) == 2
+    assert not any("left out" in notice for notice in second.notices)

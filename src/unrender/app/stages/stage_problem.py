@@ -100,18 +100,35 @@ class StagedProblem:
         if stored:
             if not (folder / scene_folder.SCENE).is_file():
                 unknowns = [Parameter(key, keys=self.parameters[key].keys) for key in stored]
-                problem = Problem(scene, unknowns, self.views[:1], self.loss, self.max_depth, partial=True)
+                view = next((view for view in self.views if view.scene is None), self.views[0])
+                problem = Problem(scene, unknowns, [view], self.loss, self.max_depth, partial=True)
                 self._check_names(stage, scene_folder.export((problem, stored), folder))
             scene = folder / scene_folder.SCENE
-        return Problem(
+        seen = self._seen(stage)
+        views = [view for index, view in enumerate(self._views(fixed)) if seen[index]]
+        problem = Problem(
             scene,
             [self._parameter(key, stage, values.get(key)) for key in stage.unknowns],
-            self._views(fixed),
+            views,
             self.loss,
             self.max_depth,
             truth={key: self.truth[key] for key in stage.unknowns if key in self.truth},
             name=f"{self.name}: {stage.name}"[:200],
         )
+        left_out = [
+            f"view {n} is left out: its scene has none of the unknowns of this stage"
+            for n, own in enumerate(seen)
+            if not own
+        ]
+        return problem.with_parts(notices=[*problem.notices, *left_out])
+
+    def _seen(self, stage: Stage) -> list[bool]:
+        """Return whether each view depends on the unknowns of a stage; all do if none does."""
+        ties = {tie.key: tie.factors for tie in ties_of(list(self.parameters.values()))}
+        members = {member for key in stage.unknowns for member in ties.get(key, [key])}
+        everywhere = not members.isdisjoint(OF_PHOTOGRAPHS)
+        seen = [everywhere or not keys or not members.isdisjoint(keys) for keys in self.scenes]
+        return seen if any(seen) else [True] * len(seen)
 
     def _views(self, fixed: Mapping[str, np.ndarray]) -> list[View]:
         """Return the views; those of other scenes know the fixed values there."""
