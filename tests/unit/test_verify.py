@@ -131,6 +131,13 @@ def test_all_pictures_of_a_run_of_a_million_paths_use_at_most_a_fiftieth_of_them
     assert 3 * 4096 <= paths <= 0.02 * steps * spp * 30 * SIDE * SIDE
 
 
+def test_a_run_of_sixty_steps_on_a_small_film_is_compared_with_an_earlier_step() -> None:
+    """It has 2,304 pixels with 8 samples each, as by `auto`."""
+    problem = made(views=16)
+    result = ur.optimize(problem, ur.PathGradient(spp=8), ur.optimizers.Adam(0.01), steps=60)
+    assert result.verification["change"]["step"] == 16
+
+
 @pytest.mark.parametrize(("probability", "told"), [(0.5, False), (0.1, False), (0.02, True), (0.005, True)])
 def test_pictures_whose_light_few_paths_bring_are_told(probability: float, told: bool) -> None:
     """Pixels of different brightness; the number in the line is that of the paths within a third."""

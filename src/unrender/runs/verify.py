@@ -63,7 +63,7 @@ _LEAST_CHANGE = 1e-3
 """Relative change of the loss below which two points count as equal."""
 _WORTH_A_LINE = 1.25
 """Ratio of the last loss to that of earlier parameters from which a warning says that these are returned."""
-_FIRST_EARLIER, _COST = 4, 0.005
+_FIRST_EARLIER, _COST = 4, 0.014
 """Step from which images of earlier steps are taken for short runs, if their paths are at most this fraction of the steps' paths."""
 _SMALL, _END, _AGAIN = 1, 2, 3
 """Indices of the sets of random numbers."""
@@ -98,13 +98,13 @@ class Verify(Callback):
                 self._earlier = restored(run.state.pictures, self._small, self._first)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """Render a candidate at steps 64, 128, 256, …, and images for the residual of short runs at steps 4, 8, 16 and 32."""
+        """Render a candidate at steps 64, 128, 256, …, but the last, and images for the residual of short runs at steps 4, 8, 16 and 32."""
         del record
         pictures = self._small
         if pictures is None or run.step < _FIRST_EARLIER or run.step & (run.step - 1) or _other_meshes(run.problem):
             return
         short = run.step < FIRST_CANDIDATE
-        if short and pictures.paths > _COST * run.state.samples:
+        if run.step == run.steps or (short and pictures.paths > _COST * run.state.samples):
             return
         values = run.full()
         picture = pictures.picture(values)
