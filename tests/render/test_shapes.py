@@ -51,6 +51,10 @@ def gradient(description: Any, key: str = KEY, request: SampleRequest | None = N
     return np.array(session.adjoint(values, rendering.paths, renderer.array(np.ones(rendering.images.shape)))[key])
 
 
+CUT_OUT = {"type": "rectangle", "bsdf": {"type": "mask", "opacity": 0.5, "inner": {"type": "diffuse"}}}
+"""The gradient by a block behind such a sheet had the wrong sign."""
+
+
 @pytest.mark.parametrize(
     ("more", "key", "message"),
     [
@@ -58,6 +62,8 @@ def gradient(description: Any, key: str = KEY, request: SampleRequest | None = N
         ({"camera": {"type": "orthographic"}}, "thing.rotation", r"limited to perspective sensors"),
         ({"ball": {"type": "sphere", "radius": 0.1}}, "ball.translation", r"ball is not a mesh \(Sphere\)"),
         ({"camera": {"type": "orthographic"}}, "camera.translation", "limited to perspective sensors"),
+        ({"sheet": CUT_OUT}, KEY, r"opacity masks and null surfaces \(sheet\)"),
+        ({"sheet": CUT_OUT}, "camera.translation", r"opacity masks and null surfaces \(sheet\)"),
         ({"fog": {"type": "cube", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}}, KEY, "with media"),
         (
             {"ball": {"type": "sphere", "emitter": {"type": "area"}}},

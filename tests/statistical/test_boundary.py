@@ -61,13 +61,6 @@ def screened() -> dict[str, Any]:
     return described | {"sheet": {"type": "rectangle", "to_world": sheet, "bsdf": {"type": "diffuse"}}}
 
 
-def veiled() -> dict[str, Any]:
-    """Half of the picture is seen through a mask, which lets half of the light pass."""
-    mask = {"type": "mask", "opacity": 0.5, "inner": {"type": "twosided", "inner": {"type": "diffuse"}}}
-    sheet = mi.ScalarTransform4f().translate([0.5, 0, 2]).scale([0.5, 1, 1])
-    return block() | {"sheet": {"type": "rectangle", "to_world": sheet, "bsdf": mask}}
-
-
 def receiver() -> dict[str, Any]:
     """What moves receives the shadow of a ball that stands still, and casts one."""
     place = mi.ScalarTransform4f().translate([0.0, -0.6, 0.3]).rotate([1, 0, 0], -90).scale(0.5)
@@ -236,7 +229,6 @@ def test_points_on_emitters_span_the_solid_angle_that_each_emitter_has() -> None
         (block, "moving.rotation.x", 2),
         (off_centre, "moving.translation.z", 2),
         (screened, "moving.translation.x", 2),
-        (veiled, "moving.translation.x", 3),
         (block, "moving.scale", 3),
         (block, "moving.translation.y", 4),
         (block, "moving.translation.z", 6),
@@ -311,10 +303,8 @@ def others() -> dict[str, tuple[dict[str, Any], str]]:
     """{name: (objects beside the moving block, key)} of parameters whose derivatives Mitsuba's `prb` lacks."""
     before = mi.ScalarTransform4f().translate([0.1, -0.2, 0.8]).scale(0.4)
     grey = {"type": "rgb", "value": 0.5}
-    mask = {"type": "mask", "opacity": 0.5, "inner": {"type": "twosided", "inner": {"type": "diffuse"}}}
     mirror = {"type": "twosided", "inner": {"type": "conductor", "specular_reflectance": grey}}
     return {
-        "mask": ({"sheet": {"type": "rectangle", "to_world": before, "bsdf": mask}}, "sheet.bsdf.opacity.value"),
         "mirror": (
             {"sheet": {"type": "rectangle", "to_world": before, "bsdf": mirror}},
             "sheet.bsdf.brdf_0.specular_reflectance.value",
@@ -323,7 +313,7 @@ def others() -> dict[str, tuple[dict[str, Any], str]]:
     }
 
 
-@pytest.mark.parametrize("name", quick(("mask", "mirror", "sky"), "mask"))
+@pytest.mark.parametrize("name", quick(("mirror", "sky"), "mirror"))
 def test_other_gradients_beside_a_moving_shape_are_those_without_it(name: str) -> None:
     more, key = others()[name]
     found = []

@@ -55,6 +55,8 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
         return "path gradients of moving shapes do not support spectral variants"
     if any(sensor.film().sample_border() and not is_box(sensor.film()) for sensor in pair.current.sensors()):
         return "path gradients of moving shapes do not support sample_border: leave it out of the film"
+    if reason := _masks_obstacle(pair):
+        return reason
     if shape is None:
         return "path gradients do not support moving instances"
     if has_instances(pair.current):
@@ -67,6 +69,16 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
     kinds = [sensor.class_name() for sensor in pair.current.sensors()]
     if "PerspectiveCamera" not in kinds:
         return f"boundary derivatives are limited to perspective sensors; the scene has none ({', '.join(kinds)})"
+    return ""
+
+
+def _masks_obstacle(pair: ScenePair) -> str:
+    """Return the reason why a scene with opacity masks or null surfaces has no boundary derivative; "" for others. Edges behind these are
+    omitted, and `prb` loses the motion of the light that passes them."""
+    for shape in pair.current.shapes():
+        bsdf = shape.bsdf()
+        if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_mirror_or_glass(bsdf):
+            return f"boundary derivatives do not support opacity masks and null surfaces ({shape.id()})"
     return ""
 
 
@@ -197,7 +209,7 @@ def translation_obstacle(pair: ScenePair) -> str:
         return "boundary derivatives do not support scenes with instances"
     if kinds := SilhouetteCurves.omitted(pair.current):
         return f"boundary derivatives do not support the silhouettes of {', '.join(kinds)}"
-    return ""
+    return _masks_obstacle(pair)
 
 
 def lens_parameters(pair: ScenePair) -> dict[str, ParameterInfo]:

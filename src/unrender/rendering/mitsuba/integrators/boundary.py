@@ -105,7 +105,7 @@ class BoundaryIntegrator:
     # ------------------------------------------------------------------ edges on the picture
 
     def _primary(self, picture: Picture, positions: Any, seed: int) -> Any:
-        table = self._table
+        table, scene = self._table, picture.scene
         camera = dr.detach(picture.sensor.world_transform()) @ mi.Point3f(0)
         with dr.suspend_grad():
             all_edges = table.at(positions, dr.arange(mi.UInt32, table.moving))
@@ -129,7 +129,7 @@ class BoundaryIntegrator:
             towards = mi.Point3f(dr.detach(point)) - start
             ray = mi.Ray3f(start, dr.normalize(towards))
             ray.maxt = dr.norm(towards) * (1 - _NEAR)
-            active &= dr.any(picture.transmission(ray, active)[0] > 0)
+            active &= ~scene.ray_test(ray, active)
             jump = self._picture_jump(picture, uv, normal, dr.norm(towards), active, seed ^ 0x9E3779B9)
             jump *= length / pmf
         with dr.resume_grad():

@@ -27,8 +27,6 @@ class Picture:
         # Opaque, since the number of samples in a mini-batch varies between steps and would change the kernels.
         self.scale = dr.opaque(mi.Float, self.width * self.height / samples)
         self.time: Any = dr.opaque(mi.Float, float(sensor.shutter_open()))
-        flags = [shape.bsdf().flags() for shape in scene.shapes()]
-        self._passable = any(mi.has_flag(each, mi.BSDFFlags.Null) for each in flags)
         self._near: Any = dr.opaque(mi.Float, float(sensor.near_clip()))
         with dr.suspend_grad():
             matrix = dr.detach(sensor.projection_transform().matrix) @ dr.detach(
@@ -57,25 +55,6 @@ class Picture:
         beyond it."""
         start = camera + (mi.Point3f(point) - camera) * (self._near / dr.maximum(depth, self._near))
         return mi.Point3f(start), depth > self._near
-
-    def transmission(self, ray: Any, active: Any) -> tuple[Any, Any]:
-        """Return the part of the light that masks and null surfaces let pass along a ray to its end, and the number of these surfaces. The
-        part is 0 behind other surfaces."""
-        if not self._passable:
-            return mi.Spectrum(dr.select(self.scene.ray_test(ray, active), 0.0, 1.0)), mi.UInt32(0)
-        end = ray(ray.maxt)
-
-        def step(ray: Any, T: Any, passed: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-            si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=active)
-            hit = active & si.is_valid()
-            T = dr.select(hit, T * si.bsdf().eval_null_transmission(si, hit), T)
-            active = hit & dr.any(T > 0)
-            return dr.select(active, si.spawn_ray_to(end), ray), T, dr.select(hit, passed + 1, passed), active
-
-        loop: Any = dr.while_loop
-        lanes = dr.width(ray)
-        state = mi.Ray3f(ray), dr.full(mi.Spectrum, 1, lanes), dr.zeros(mi.UInt32, lanes), mi.Bool(active)
-        return loop(state, lambda ray, T, passed, active: active, step, label="transmission")[1:3]
 
     def project_motion(self, point: Any, uv: Any, motion: Any) -> Any:
         """Return the motion on the film of points at `uv` that move in space."""
@@ -191,7 +170,7 @@ class EyePath:
         moved: x_a as hit by a ray from the sensor's side; attached.
         throughput: importance over density.
         position: on the film in pixels.
-        bounces: number of intermediate vertices, masks and null surfaces; there are `bounces` + 1 segments before x_a.
+        bounces: number of intermediate vertices; there are `bounces` + 1 segments before x_a.
         active: whether it reaches the sensor.
     """
 
@@ -209,9 +188,7 @@ class EyePath:
             ds, importance = picture.sensor.sample_direction(walk.si, mi.Point2f(0.5), walk.active)
             active = walk.active & (ds.pdf > 0) & dr.any(importance > 0)
             to_sensor = walk.si.spawn_ray_to(picture.near_point(ds.p, walk.si.p, picture.project(walk.si.p)[1])[0])
-            transmission, passed = picture.transmission(to_sensor, active)
-            importance *= transmission
-            active &= dr.any(importance > 0) & (self.bounces + passed <= max(most, 0))
+            active &= ~scene.ray_test(to_sensor, active)
             wo = walk.si.to_local(ds.d)
             bsdf = walk.si.bsdf()
             value = bsdf.eval(mi.BSDFContext(mi.TransportMode.Importance), walk.si, wo, active)
@@ -219,7 +196,6 @@ class EyePath:
             self.throughput = dr.select(active, walk.β * value * importance / (ds.pdf * probability), 0)
             self.position, self.active = ds.uv, active & dr.any(self.throughput != 0)
             outgoing = dr.select(self.bounces == 0, ds.d, walk.first_direction)
-            self.bounces += passed
             back = mi.Ray3f(si.p + outgoing, -outgoing)
         with dr.resume_grad():
             self.moved = pi.compute_surface_interaction(back, mi.RayFlags.Minimal, self.active).p
