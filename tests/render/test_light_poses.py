@@ -299,3 +299,14 @@ def test_auto_recovers_the_pose_of_a_light(name: str) -> None:
     assert result.status == "finished"
     errors = problem.parameter_error(result.parameters)
     assert all(errors[f"lamp.{part}"] < most for part, most in allowed.items()), errors
+
+
+@pytest.mark.parametrize(("place", "able"), [(1.0, True), ([-1.0, 1.0, 1.0], True), (2.0, False)])
+def test_a_sky_whose_directions_are_scaled_has_no_path_gradient(place: Any, able: bool) -> None:
+    """Its light by emitter sampling is twice that by BSDF sampling in Mitsuba, and gradients by its texels were a quarter off."""
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((4, 8, 3), np.float32))}
+    sky["to_world"] = mi.ScalarTransform4f().rotate([1, 0, 0], 90).scale(place)
+    known = MitsubaRenderer({"type": "scene", "eye": {"type": "perspective"}, "sky": sky}, 2).parameters()
+    assert (known["sky.data"].differentiable, known["sky.rotation"].differentiable) == (able, able)
+    assert known["sky.data"].perturbable
+    assert known["sky.scale"].differentiable

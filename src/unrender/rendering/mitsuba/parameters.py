@@ -139,6 +139,11 @@ def _traits_of(chain: list[Any], key: str) -> ParameterTraits:
         if leaf == "sun_direction":
             reason = "it moves the sun's disk, and path gradients do not support its boundary"
             return ParameterTraits(False, reason, replayable=False)
+        if leaf == "data" and any(
+            n.class_name() == "EnvironmentMapEmitter" and not poses.keeps_lengths(n) for n in chain
+        ):
+            reason = "Mitsuba samples its light with a wrong density, because its to_world is no rotation or reflection"
+            return ParameterTraits(False, reason, replayable=False)
         return ParameterTraits(False, "")
     if any(isinstance(n, mi.Medium) for n in chain):
         if any(

@@ -99,14 +99,21 @@ def keys(scene: Any) -> dict[str, PoseKey]:
 def _turns_smoothly(lamp: Any) -> bool:
     """Return whether the radiance of an emitter in a fixed direction is a continuous function of the emitter's rotation.
 
-    It is for an environment map and for a spotlight with a falloff and no texture. The disk of a sun has an edge, and Mitsuba's
-    derivative of a projector does not contain the cosine at its plane.
+    It is for an environment map without scale, and for a spotlight with a falloff and no texture. The disk of a sun has an edge, and
+    Mitsuba's derivative of a projector does not contain the cosine at its plane.
     """
     if lamp.class_name() != "SpotLight":
-        return lamp.class_name() == "EnvironmentMapEmitter"
+        return lamp.class_name() == "EnvironmentMapEmitter" and keeps_lengths(lamp)
     known: Any = mi.traverse(lamp)
     ramp = float(known["cutoff_angle"][0]) - float(known["beam_width"][0])
     return ramp > 0.0 and "texture.data" not in known
+
+
+def keeps_lengths(lamp: Any) -> bool:
+    """Return whether the `to_world` of a distant emitter is a rotation or a reflection. Mitsuba samples others with a wrong density."""
+    known: Any = mi.traverse(lamp)
+    linear = np.array(dr.detach(known["to_world"].matrix), float).reshape(4, 4)[:3, :3]
+    return np.allclose(linear @ linear.T, np.eye(3), atol=1e-3)
 
 
 def is_posable(emitter: Any) -> bool:
