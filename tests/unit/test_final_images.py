@@ -369,11 +369,12 @@ def told_of(made: Problem, values: np.ndarray) -> str:
             "were sharper",
         ),
         (lambda image: 0.8 * image, "times as bright"),
+        (lambda image: np.minimum(image, 0.45), "were saturated at 0.45"),
         (lambda image: image * (1.0 - 0.3 * SPOT), ""),
         (lambda image: image + 0.05 * np.random.default_rng(0).standard_normal(image.shape), None),
         (lambda image: image, None),
     ],
-    ids=["shifted", "blurred", "sharper", "darker", "unlit spot", "noisy", "right"],
+    ids=["shifted", "blurred", "sharper", "darker", "saturated", "unlit spot", "noisy", "right"],
 )
 @pytest.mark.parametrize("progress", [0.2, 0.7, 1.0])
 def test_pixels_that_the_unknowns_hardly_change_tell_of_wrong_references_at_any_progress(

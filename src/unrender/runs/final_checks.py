@@ -212,7 +212,7 @@ def unexplained_pixels(
     size, everywhere = (math.sqrt(mean_square(references, of)) for of in (weights * little, weights))
     least = _LEAST * max(1.0, everywhere / max(size, 1e-300))
     differs = misfit(rest[0::2], rest[1::2], references, weights * little, sizes, least)
-    cause, shared, sure = _as_if(rest, residuals + references, weights * little, sizes)
+    cause, shared, sure = _as_if(rest, residuals + references, references, weights * little, sizes)
     if differs is None and sure and shared > _LEAST_OF_CAUSE * least * size:
         total = mean_square(rest.mean(axis=0), weights * little)
         differs = Misfit(shared, size, math.sqrt(max(total - shared**2, 0.0)))
@@ -292,7 +292,11 @@ def _pulled(problem: Problem, values: Mapping[str, np.ndarray]) -> list[dict[str
 
 
 def _as_if(
-    residuals: np.ndarray, images: np.ndarray, weights: np.ndarray, sizes: Sequence[tuple[int, int]]
+    residuals: np.ndarray,
+    images: np.ndarray,
+    references: np.ndarray,
+    weights: np.ndarray,
+    sizes: Sequence[tuple[int, int]],
 ) -> tuple[str, float, bool]:
     """Return what a view's reference looks like, the root mean square of the difference over all pixels, and whether that proves it.
 
@@ -308,7 +312,8 @@ def _as_if(
             continue
         wanted, again = (np.ravel(half[part] * root) for half in (one, other))
         noise, best, explained = np.square(wanted - again) / 2.0, "", {}
-        distortions = _distortions(images[1::2, part].mean(axis=0).reshape(*sizes[view], 3))
+        image, white = images[1::2, part].mean(axis=0).reshape(*sizes[view], 3), float(references[part].max())
+        distortions = _distortions(image, white)
         for index, (words, changes) in enumerate(distortions.items()):
             columns = np.stack([np.ravel(change.reshape(-1, 3) * root) for change in changes], axis=1)
             inverse = np.linalg.pinv(columns.T @ columns, hermitian=True)
@@ -328,8 +333,11 @@ def _as_if(
     return cause, shared, sure
 
 
-def _distortions(image: np.ndarray) -> dict[Callable[[np.ndarray], str], list[np.ndarray]]:
-    """Return changes of an image (H, W, 3), in units of a pixel where they move it, by functions that name amounts; brightness first."""
+def _distortions(image: np.ndarray, white: float) -> dict[Callable[[np.ndarray], str], list[np.ndarray]]:
+    """Return changes of an image (H, W, 3), in units of a pixel where they move it, by functions that name amounts; brightness first.
+
+    The largest value of its reference is `white`.
+    """
     from scipy.ndimage import gaussian_filter  # takes long to import
 
     down, along = np.gradient(image, axis=(0, 1))
@@ -339,6 +347,7 @@ def _distortions(image: np.ndarray) -> dict[Callable[[np.ndarray], str], list[np
         lambda by: f"were {1.0 - by[0]:.2g} times as bright": [image],
         lambda by: f"were shifted by {-by[0]:.2g} pixels along x and {-by[1]:.2g} along y": [-along, -down],
         lambda by: "were blurred" if by[0] < 0.0 else "were sharper": [gaussian_filter(image, (1.0, 1.0, 0.0)) - image],
+        lambda by: f"were saturated at {white:.3g} (set the loss Censored)": [np.minimum(image, white) - image],
         lambda by: "had another field of view": [x[..., None] * along + y[..., None] * down],
     }
 
