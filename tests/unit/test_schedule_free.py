@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -392,16 +393,35 @@ def test_refuses_parameters_that_do_not_suit():
         ScheduleFree({"*": 0.1, "y": 0.2}).init(x)
 
 
+def within_bounds(wanted: Callable[[int], np.ndarray], steps: int, known: bool) -> np.ndarray:
+    """Return the parameter after some steps towards `wanted(step)` within [0, 1], with bounds known to the optimizer or not."""
+    x = np.full(wanted(0).shape, 0.4)
+    optimizer = ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("x",))
+    state = optimizer.init({"x": x})
+    for number in range(steps):
+        at = AtBounds(lambda x=x: {"x": np.where(x >= 1.0, 1.0, np.where(x <= 0.0, -1.0, 0.0))})
+        estimate = Estimate(0.0, {"x": x - wanted(number)}, (at,) if known else ())
+        step, state = optimizer.update(estimate, state, {"x": x})
+        x = np.clip(x + step["x"], 0.0, 1.0)
+    return x
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_texels_beside_saturated_ones_are_not_led_astray(known: bool):
     """A square whose minimum is above the upper bound. Its gradient remains, and smoothing spreads it where bounds are unknown."""
     wanted = np.full((16, 16, 1), 0.5)
     wanted[4:9, 4:9] = 1.6
-    optimizer, x = ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("x",)), np.full(wanted.shape, 0.4)
-    state = optimizer.init({"x": x})
-    for _ in range(60):
-        at = AtBounds(lambda x=x: {"x": np.where(x >= 1.0, 1.0, np.where(x <= 0.0, -1.0, 0.0))})
-        step, state = optimizer.update(Estimate(0.0, {"x": x - wanted}, (at,) if known else ()), state, {"x": x})
-        x = np.clip(x + step["x"], 0.0, 1.0)
-    error = float(np.abs(x - np.minimum(wanted, 1.0)).max())
+    error = float(np.abs(within_bounds(lambda step: wanted, 160, known) - np.minimum(wanted, 1.0)).max())
     assert error < 0.02 if known else error > 0.2
+
+
+def test_texels_leave_a_bound_as_soon_as_their_gradient_turns_in_the_first_steps():
+    """As those of a texture beside a lamp that starts too dim do, when the lamp becomes bright."""
+
+    def wanted(step: int) -> np.ndarray:
+        return np.full((16, 16, 1), 1.6 if step < 20 else 0.5)
+
+    saturated, known, unknown = (within_bounds(wanted, *of) for of in ((20, True), (40, True), (40, False)))
+    assert saturated.min() == 1.0
+    assert known.max() < 0.95
+    np.testing.assert_array_equal(known, unknown)
