@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import unrender as ur
+from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
+from unrender.estimators import coordinates
 from unrender.preconditioners import LargeSteps, Sobolev
+from unrender.runs import loop
 
 
 def data(shape: tuple[int, ...]) -> np.ndarray:
@@ -43,3 +47,19 @@ def test_refuses_what_is_no_texture():
         Sobolev().check("key", (3,))
     with pytest.raises(InputError, match="must have 3 entries"):
         Sobolev(1.0, (True, False)).check("key", (2, 3, 4, 1))
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_texels_beside_saturated_ones_are_not_led_astray(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A square of 1.6 where 1 is the bound. The planted fault spreads its gradient over its neighbours."""
+    if not known:
+        for module in (coordinates, loop):
+            monkeypatch.setattr(module, "free_of_bounds", lambda *_: {})
+    wanted = np.full((12, 12, 1), 0.5)
+    wanted[3:7, 3:7] = 1.6
+    renderer = AnalyticRenderer({"map": wanted}, np.repeat(np.eye(144), 3, axis=0), noise=0.0, shape=(12, 12))
+    unknown = ur.Parameter("map", 0.4, (0, 1), preconditioner=Sobolev(4.0))
+    problem = ur.Problem(renderer, [unknown], [ur.View(renderer.exact({"map": wanted}))])
+    result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(0.02), steps=150)
+    error = float(np.abs(result.parameters["map"] - np.minimum(wanted, 1.0)).max())
+    assert error < 0.03 if known else error > 0.2

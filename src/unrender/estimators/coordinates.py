@@ -42,19 +42,33 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
     if estimate.preconditioned:  # by an estimator with a state in these coordinates
         return _bounded(estimate, problem, parameters)
     coordinates = problem.coordinates
-    slopes = coordinates.slopes(parameters)
+    slopes, free = coordinates.slopes(parameters), free_of_bounds(estimate, problem, parameters)
 
     def converted(capability: Capability) -> Capability:
         if isinstance(capability, BlockEstimate):
             return _block(capability, problem, parameters)
         if isinstance(capability, (FreshGradient, NoiseSample)):
-            return replace(capability, values=coordinates.pull_back(capability.values, slopes))
+            return replace(capability, values=coordinates.pull_back(capability.values, slopes, free))
         return _second_order(capability, estimate.gradient, problem, parameters, slopes) if slopes else capability
 
-    gradient = coordinates.pull_back(estimate.gradient, slopes)
+    gradient = coordinates.pull_back(estimate.gradient, slopes, free)
     capabilities = tuple(converted(capability) for capability in estimate.capabilities)
     mapped = replace(estimate, gradient=gradient, capabilities=capabilities, preconditioned=True)
     return _bounded(mapped, problem, parameters)
+
+
+def free_of_bounds(estimate: Estimate, problem: Problem, parameters: Tree) -> Tree:
+    """Return {key: 0 for elements at a bound beyond which the loss falls, 1 for the others} of parameters with a preconditioner S.
+
+    S would spread the gradient of elements that cannot move over their neighbours. It is {} if the estimate is with respect to v already.
+    """
+    smooth, bent = problem.coordinates.preconditioners, problem.coordinates.transforms
+    bounded = {k: problem.unknowns[k] for k in smooth if k not in bent and problem.unknowns[k].bounds != (None, None)}
+    if estimate.preconditioned or not bounded:
+        return {}
+    sides = {key: unknown.sides(parameters[key]) for key, unknown in bounded.items()}
+    held = {key: side * estimate.gradient[key] < 0.0 for key, side in sides.items()}
+    return {key: arrays.where(held[key], 0.0 * side, 0.0 * side + 1.0) for key, side in sides.items()}
 
 
 def restricted(problem: Problem, keys: Sequence[str]) -> Problem:

@@ -15,7 +15,7 @@ from unrender.core.random import WARM_UP, Key, check_seed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
-from unrender.estimators.coordinates import by_coordinates
+from unrender.estimators.coordinates import by_coordinates, free_of_bounds
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
@@ -215,7 +215,7 @@ def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimize
     coordinates = problem.coordinates
     mapped = by_coordinates(estimate, problem, parameters)
     steps, state = optimizer.update(mapped, state, coordinates.of(parameters))
-    moved, reached = coordinates.moved(parameters, steps)
+    moved, reached = coordinates.moved(parameters, steps, free_of_bounds(estimate, problem, parameters))
     bounded = {k: problem.unknowns[k].reached(x) for k, x in reached.items()}
     # Checked before projection, because the projection of a NaN may be a bound.
     finite = trees.map(arrays.is_finite, moved)

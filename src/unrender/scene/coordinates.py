@@ -45,17 +45,21 @@ class Coordinates:
         """Return the gradient with respect to u, φ' g, from the gradient g with respect to x."""
         return _times(gradient, self.slopes(parameters))
 
-    def pull_back(self, gradient: Tree, slopes: Tree) -> Tree:
-        """Return the gradient with respect to v, S (φ' g), from the gradient g with respect to x."""
-        return self._precondition(_times(gradient, slopes))
+    def pull_back(self, gradient: Tree, slopes: Tree, free: Tree | None = None) -> Tree:
+        """Return the gradient with respect to v, S (φ' g), from the gradient g with respect to x; `free`: see `moved`."""
+        return self._precondition(_times(gradient, slopes | (free or {})))
 
     def push_forward(self, tangent: Tree, slopes: Tree) -> Tree:
         """Return the tangent of x, φ' (S t), from a tangent t of v."""
         return _times(self._precondition(tangent), slopes)
 
-    def moved(self, parameters: Tree, steps: Tree) -> tuple[Tree, Tree]:
-        """Return u and x after steps of v. Elements of x whose change is zero keep their exact value."""
-        changes = self._precondition(steps)
+    def moved(self, parameters: Tree, steps: Tree, free: Tree | None = None) -> tuple[Tree, Tree]:
+        """Return u and x after steps of v. Elements of x whose change is zero keep their exact value.
+
+        Args:
+            free: {key: 0 for elements that stay at a bound, 1 for the others} of parameters with a preconditioner and without a φ.
+        """
+        changes = _times(self._precondition(steps), free or {})
         reached = trees.add(self.of(parameters), changes)
 
         def values(key: str):
