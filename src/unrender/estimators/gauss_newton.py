@@ -45,6 +45,8 @@ _SETTLED = 0.5
 """Maximum step, in units of the widths, after which the shift is halved."""
 _DRIFT = 0.25
 """Distance, in units of the widths, from which on mean derivative images are of another point."""
+_NARROWER = 0.7
+"""Ratio of a width to the one with which mean derivative images began, from which on they are of too wide differences."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class GaussNewtonState:
         images: effective number of images since the last long step.
         origin: parameters of the last derivative images, (n,); None before the first estimate.
         noise: noise of the mean derivative images relative to the derivatives, averaged over directions.
+        differenced: widths with which the mean derivative images began; {} before the first estimate.
     """
 
     widths: dict[str, float]
@@ -75,6 +78,12 @@ class GaussNewtonState:
     images: float = 0.0
     origin: np.ndarray | None = None
     noise: float = 0.0
+    differenced: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def narrowed(self) -> bool:
+        """Whether the mean derivative images are of too wide differences. They begin anew."""
+        return any(self.widths[key] < _NARROWER * width for key, width in self.differenced.items())
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:
         """Return an empty state: widths are estimated again."""
@@ -214,8 +223,13 @@ class GaussNewton:
         return estimate, self._next(state, system, point, _CHANGE) if system.is_finite() else before
 
     def _needs_derivatives(self, point: Point, state: GaussNewtonState) -> bool:
-        """Return whether a step has new derivative images: while the mean is of another point or shift, or has too much noise."""
-        settled = state.derivatives and state.shift == self.shift and point.since(state.origin, state)[1] <= _DRIFT
+        """Return whether a step has new derivative images: while the mean is of another point, shift or width, or has too much noise."""
+        settled = (
+            state.derivatives
+            and state.shift == self.shift
+            and not state.narrowed
+            and point.since(state.origin, state)[1] <= _DRIFT
+        )
         if not settled:
             return True
         renders = 2 * point.theta.size
@@ -233,6 +247,7 @@ class GaussNewton:
         """Return the state with updated widths, at which renders differ from the image as much as the target shift, in the root mean
         square over the elements of a parameter. Widths change by at most the factor `change`."""
         squares, slopes = (trees.parts(x, point.parameters) for x in (system.products.squares, system.slopes))
+        begins = state.narrowed or not state.differenced
         widths = dict(state.widths)
         for key, width in state.widths.items() if system.fresh else ():
             square, slope = float(squares[key].mean()), float(slopes[key].mean())
@@ -249,6 +264,7 @@ class GaussNewton:
             residuals=tuple(system.residuals),
             hessian=system.products.hessian if system.residuals else None,
             origin=point.theta if system.fresh else state.origin,
+            differenced=state.widths if system.derivatives and begins else state.differenced,
             noise=_relative_noise(system.products.hessian, system.products.noise),
         )
 

@@ -147,7 +147,8 @@ class Point:
         averaged: bool,
     ) -> HalvesMean:
         """Return the derivative images of a view, in a mean with those of earlier steps if `averaged`."""
-        before = state.derivatives[len(total.derivatives)] if averaged and state.derivatives else None
+        known = averaged and state.derivatives and not state.narrowed
+        before = state.derivatives[len(total.derivatives)] if known else None
         if before is not None and not total.fresh:
             mean = before
         else:
