@@ -18,6 +18,7 @@ from unrender.runs.metadata import RunAnnotations
 from unrender.runs.refinement import remeshed
 from unrender.runs.run import Run
 from unrender.scene.problem import Problem
+from unrender.scene.surfaces import Surface
 
 SMALL = {"resolution": 16, "subdivisions": 2, "reference_spp": 32}
 STATUE, STONE = "statue.vertex_positions", "statue.bsdf.brdf_0.reflectance.data"
@@ -136,3 +137,21 @@ class Steps(Callback):
         parts = run.state.optimizer.own, run.state.optimizer.others
         own, others = (part.step - part.begun for part in parts)
         self.rows.append((run.state.estimator.perturbed.age, own, others))
+
+
+def test_a_resumed_run_knows_the_true_surface(tmp_path: Path) -> None:
+    """Problem files have none, so the run folder tells it."""
+    film = '<film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>'
+    text = f'<sensor type="perspective">{film}</sensor><emitter type="constant"/><shape type="cube" id="box"/>'
+    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
+    key, views = "box.vertex_positions", [ur.View(np.full((4, 4, 3), 0.5, np.float32))]
+    made = Problem(tmp_path / "scene.xml", [ur.Parameter(key)], views)
+    surface = Surface(1.1 * made.unknowns[key].initial.reshape(-1, 3), made.faces[key])
+    made = Problem(tmp_path / "scene.xml", [ur.Parameter(key)], views, surfaces={key: surface})
+    ur.optimize(made, "plain", steps=1, run_directory=tmp_path / "run")
+    before = reader.read(tmp_path / "run").error_before
+    result = ur.resume(tmp_path / "run", steps=2)
+    assert "parameter_error" in result.history[-1]
+    after = reader.read(tmp_path / "run")
+    assert after.error_before == before == {key: pytest.approx(made.parameter_error(made.initial())[key], rel=1e-5)}
+    assert after.error_after.keys() == {key}

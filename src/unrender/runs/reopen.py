@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,9 @@ from unrender.io import bounded_files, toml_lines
 from unrender.optimizers.base import Optimizer
 from unrender.rendering.renderer import ReplacedMesh
 from unrender.runs.callbacks import Callback
+from unrender.runs.folder.meshes import surfaces_in
 from unrender.runs.folder.reader import RunFolder, read_run_record
+from unrender.runs.folder.schema import MESHES
 from unrender.runs.refinement import remeshed
 from unrender.runs.result import Result
 from unrender.runs.resume import load_run, resume_run
@@ -114,4 +117,14 @@ def problem_of(directory: str | Path) -> Problem:
             "unrender.app.export((problem, result.parameters), out)"
         )
     file = origin.get("file")
-    return Problem.from_file(file if isinstance(file, str) and bounded_files.kind(Path(file)) == "file" else path)
+    problem = Problem.from_file(file if isinstance(file, str) and bounded_files.kind(Path(file)) == "file" else path)
+    return _with_surfaces(problem, folder)
+
+
+def _with_surfaces(problem: Problem, folder: Path) -> Problem:
+    """Return the problem with the true surfaces of a run folder, which problem files do not have."""
+    if not problem.faces or not bounded_files.exists(folder / MESHES):
+        return problem
+    known = surfaces_in(bounded_files.read_float_arrays(folder / MESHES, folder))
+    unknowns = {key: replace(problem.unknowns[key], surface=x) for key, x in known.items() if key in problem.faces}
+    return problem.with_parts(unknowns={**problem.unknowns, **unknowns})

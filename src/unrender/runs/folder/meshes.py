@@ -89,6 +89,13 @@ def meshes_in(
     return meshes
 
 
+def surfaces_in(arrays: Mapping[str, np.ndarray]) -> dict[str, Surface]:
+    """Return {key: true surface} from the contents of meshes.npz. Raises `InputError` for arrays that are no surface."""
+    ends = f"/{_VERTICES}", f"/{_TRUE_FACES}"
+    keys = [name.removesuffix(ends[0]) for name in arrays if name.endswith(ends[0])]
+    return {key: Surface(arrays[key + ends[0]], arrays[key + ends[1]]) for key in keys if key + ends[1] in arrays}
+
+
 def _checked(faces: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Return the faces after checking them against vertex positions (3 V,), whatever their values. Raises `InputError`."""
     if positions.ndim != 1 or positions.size % 3:
