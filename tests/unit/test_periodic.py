@@ -86,3 +86,25 @@ def test_steps_move_the_repeated_columns_along():
         _, moved = coordinates.moved({"sky": sky}, {"sky": -0.1 * pulled["sky"]})
         follows = np.array_equal(moved["sky"], periodic.repeat(moved["sky"], 1))
         assert follows == bool(repeated)
+
+
+@pytest.mark.mitsuba
+def test_repeated_columns_stay_at_a_bound_with_their_own() -> None:
+    """Columns of a sky at its bound, black in the reference, between others that become brighter. Repeated ones have no gradient."""
+    import mitsuba as mi
+
+    film = {"type": "hdrfilm", "width": 8, "height": 4, "rfilter": {"type": "box"}}
+    look = mi.ScalarTransform4f().look_at([0, 0, 0], [0, 0, -1], [0, 1, 0])
+    camera = {"type": "perspective", "fov": 150, "to_world": look, "film": film}
+    sky = np.abs(X) + 0.5
+    sky[:, [0, -1]] = 0.0
+    scene = {"type": "scene", "camera": camera, "sky": {"type": "envmap", "bitmap": mi.Bitmap(sky)}}
+    reference = np.full((4, 8, 3), 5.0)
+    reference[:, 2:6] = 0.0
+    smooth = ur.preconditioners.LargeSteps(10.0)
+    unknown = ur.Parameter("sky.data", preconditioner=smooth, parameterisation="identity")
+    problem = ur.Problem(scene, [unknown], [ur.View(reference)])
+    result = ur.optimize(problem, ur.PathGradient(spp=4), ur.optimizers.Adam(0.01), steps=2)
+    values = result.last["sky.data"] if result.last else result.parameters["sky.data"]
+    np.testing.assert_array_equal(values, periodic.repeat(values, 1))
+    assert (values[:, 1:-1] != problem.initial_values()["sky.data"][:, 1:-1]).any()

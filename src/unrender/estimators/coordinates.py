@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from unrender.core import arrays, trees
+from unrender.core import arrays, periodic, trees
 from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
@@ -67,7 +67,9 @@ def free_of_bounds(estimate: Estimate, problem: Problem, parameters: Tree) -> Tr
     if estimate.preconditioned or not bounded:
         return {}
     sides = {key: unknown.sides(parameters[key]) for key, unknown in bounded.items()}
-    held = {key: side * estimate.gradient[key] < 0.0 for key, side in sides.items()}
+    repeated = problem.coordinates.repeated  # columns without a gradient of their own
+    gradient = {key: periodic.repeat(estimate.gradient[key], repeated.get(key, 0)) for key in sides}
+    held = {key: side * gradient[key] < 0.0 for key, side in sides.items()}
     return {key: arrays.where(held[key], 0.0 * side, 0.0 * side + 1.0) for key, side in sides.items()}
 
 
