@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 
@@ -13,6 +16,7 @@ from unrender.core.random import Key
 from unrender.estimators.capabilities import FreshGradient, NoiseSample
 from unrender.estimators.sample_groups import GradientRequest
 from unrender.gallery import parts, textures
+from unrender.runs.folder.state import check_alike
 from unrender.scene import batches
 
 KEYS = ("wall.bsdf.reflectance.data", "ball.bsdf.alpha.value")
@@ -156,3 +160,35 @@ def test_a_state_of_separate_views_goes_on_with_them(monkeypatch: pytest.MonkeyP
         _, state = steps(asked, estimator, 2)[-1]
     _, after = estimator.estimate(asked, asked.initial(), state, Key(7, 2))
     assert len(after.image.views) == 4
+
+
+def test_checkpoints_of_separate_and_joined_views_are_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of workers and of earlier versions are; with the same launches to the same bits."""
+    asked = problem()
+    parts: dict[str, Any] = {"estimator": ur.PathGradient(CONTROL, spp=2), "optimizer": ur.optimizers.SGD(0.1)}
+
+    def run(name: str, steps: int) -> Any:
+        options = {"run_directory": tmp_path / name, "checkpoint_every": 2, "seed": 1, "progress": False}
+        return ur.optimize(asked, parts["estimator"], parts["optimizer"], steps=steps, **options)
+
+    threads = dr.thread_count()
+    dr.set_thread_count(1)
+    expected = run("whole", 4).last
+    run("half", 2)
+    with monkeypatch.context() as patch:
+        apart(patch)
+        run("apart", 2)
+    joined, separate = (ur.resume(tmp_path / name, asked, steps=4, **parts).last for name in ("half", "apart"))
+    dr.set_thread_count(threads)
+    for key, value in expected.items():
+        np.testing.assert_array_equal(joined[key], value)
+        np.testing.assert_allclose(separate[key], value, rtol=1e-4)
+
+
+@pytest.mark.parametrize("sizes", [((1000, 1000),) * 4, ((12, 12),) * 3, ("x",) * 4, ((12,),) * 4])
+def test_memories_of_other_sizes_are_refused(sizes: Any) -> None:
+    state = steps(problem(), ur.PathGradient(CONTROL, spp=2), 2)[-1][1].image
+    check_alike(state, [state])
+    other = replace(state, views=(replace(state.views[0], sizes=sizes),))
+    with pytest.raises(ur.InputError, match="expected"):
+        check_alike(other, [state])

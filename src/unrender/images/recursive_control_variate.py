@@ -109,6 +109,10 @@ class RecursiveControlVariateState:
         """Return the memory of each view."""
         return tuple(memory for joined in self.views for memory in joined.of_views())
 
+    def of_single_views(self) -> RecursiveControlVariateState:
+        """Return the equivalent state with a memory for each view."""
+        return replace(self, views=self.of_views())
+
     def control_variates(self) -> tuple[Tree, tuple[Array, ...]] | None:
         """Return the parameters of the control variates, and the control variate of each view; None before the first step."""
         return None if self.parameters is None else (self.parameters, tuple(memory.image for memory in self.of_views()))

@@ -14,7 +14,7 @@ import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import drjit as dr
 import numpy as np
@@ -81,11 +81,21 @@ def unpack(packed: Packed, patterns: Sequence[Any] = ()) -> Any:
     return state
 
 
+@runtime_checkable
+class HasForms(Protocol):
+    """A state that may have one part for several views."""
+
+    def of_single_views(self) -> Any:
+        """Return the equivalent state with a part for each view."""
+        ...
+
+
 def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> None:
     """Raise `InputError` unless each part of `state` has the form of that part in one of `patterns`, states of the same components.
 
     The form is class, keys, lengths, array types and shapes. The first axis of an array on the host may differ, because some states grow
-    with the steps. Where all patterns are empty, a state is accepted that its field's annotation allows.
+    with the steps. Views are compared one by one (`HasForms`). Where all patterns are empty, a state is accepted that its field's
+    annotation allows.
     """
     if all(pattern is None or (isinstance(pattern, (tuple, list, dict)) and not pattern) for pattern in patterns):
         return
@@ -96,6 +106,8 @@ def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> No
     if not fitting:
         expected = " or ".join(sorted({type(pattern).__name__ for pattern in patterns}))
         raise InputError(f"{where}: expected {expected}, got {type(state).__name__}")
+    if isinstance(state, HasForms):
+        state, fitting = _of_views(state, where), [pattern.of_single_views() for pattern in fitting]
     if dataclasses.is_dataclass(state):
         for each in dataclasses.fields(state):
             part, parts = getattr(state, each.name), [getattr(pattern, each.name) for pattern in fitting]
@@ -116,6 +128,13 @@ def check_alike(state: Any, patterns: Sequence[Any], where: str = "state") -> No
             check_alike(value, [pattern[index] for pattern in fitting], f"{where}[{index}]")
     elif isinstance(state, np.ndarray) or arrays.is_drjit(state):
         _check_array(state, fitting, where)
+
+
+def _of_views(state: HasForms, where: str) -> Any:
+    try:
+        return state.of_single_views()
+    except (AttributeError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{where}: expected the pixels of whole views") from error
 
 
 def _check_annotation(part: Any, kind: type, name: str, where: str) -> None:
