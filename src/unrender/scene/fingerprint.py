@@ -132,7 +132,7 @@ def _objects(renderer: Renderer, without: Container[str] = ()) -> dict[str, list
 def _of_files(problem: Problem) -> dict[str, str]:
     """Return the hash of each file of the XML scenes: the problem's and those of single views."""
     named = (problem.origin.get("scene"), *(view.scene for view in problem.original_views))
-    scenes = [Path(scene).resolve() for scene in named if isinstance(scene, (str, Path))]
+    scenes = list(dict.fromkeys(Path(scene).resolve() for scene in named if isinstance(scene, (str, Path))))
     paths = dict.fromkeys(path for scene in scenes for path in scene_files.of(scene))
     return {f"file {_shown(path, scenes[0].parent)}": _of_file(path) for path in paths}
 
