@@ -427,6 +427,19 @@ def test_a_pixel_that_is_not_finite_leaves_the_others_judged(column: int, monkey
     assert not told_of(half_textured(exact), truth)
 
 
+@pytest.mark.parametrize(("progress", "told"), [(0.0, True), (0.05, True), (0.9, False)])
+def test_a_map_without_a_path_gradient_that_has_explained_little_is_told(
+    progress: float, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(final_images, "curvature", lambda *_, **__: Curvature())  # none is differentiable
+    monkeypatch.setattr(final_images, "map_keys", lambda problem: list(problem.unknowns))
+    truth, made = np.random.default_rng(0).uniform(0.1, 0.9, 50).astype(np.float32), half_textured()
+    values = {"map": 0.5 + np.float32(progress) * (truth - 0.5)}
+    result = Result(values, made.initial_values(), [{}] * 20, 1.0, 0.0, "steps", verification={"best": "end"})
+    lines = final_images.render_final_images(made, result, 64).undetermined
+    assert any("hardly closer to the references" in line for line in lines) is told
+
+
 @pytest.mark.parametrize("count", [4, 10])
 @pytest.mark.parametrize("darker", [0.0, 0.2])
 def test_pixels_that_many_unknowns_hardly_change_tell_of_wrong_references(count: int, darker: float) -> None:

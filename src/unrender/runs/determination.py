@@ -36,6 +36,8 @@ _UNSEEN = 0.05
 """Fraction of unseen cells of a texture or grid from which a line is returned."""
 _SCALE = "scale"
 """Last part of the keys of factors, such as that of an environment map."""
+_EXPLAINED = 0.2
+"""Share of the square difference from the references that a map without a path gradient must have explained."""
 _ROLES = ("value", "height")
 """Roles of the tested parameters; equal normals or directions are no range."""
 _STEP = 0.1
@@ -149,6 +151,38 @@ def _words(hidden: bool, change: Change, ranged: bool, bounded: bool) -> str:
     if bounded and change.is_below(_LEAST):
         return f"over its entire range the pictures change {less}; its value is the initial one, or noise"
     return ""
+
+
+def no_better_maps(
+    problem: Problem,
+    result: Result,
+    keys: Sequence[str],
+    ends: Sequence[Sequence[np.ndarray]],
+    pictures: Callable[[Mapping[str, np.ndarray], int], Sequence[np.ndarray]],
+) -> list[str]:
+    """Return a line for each texture or grid with whose initial values the pictures are nearly as close to the references.
+
+    It is for those without a path gradient, of which nothing else tells whether the pictures determine them.
+
+    Args:
+        keys: keys of textures and grids.
+        ends: K >= 2 independent pictures (H, W, 3) of each view at the end.
+        pictures: function of values and a view that returns such pictures with the same random numbers.
+    """
+    lines = []
+    for key in keys if result.verification.get("best") == "end" and len(ends[0]) > 1 else ():
+        state, errors = {**result.parameters, key: result.initial[key]}, []
+        for images in ([pictures(state, view) for view in range(len(ends))], ends):
+            residuals, _, weights, _ = residuals_of_views(problem, range(len(ends)), images)
+            errors.append((residuals[0::2].mean(axis=0) * residuals[1::2].mean(axis=0)).sum(axis=1) * weights)
+        falls = errors[0] - errors[1]
+        noise = math.sqrt(float(np.square(falls - falls.mean()).sum()))
+        if not falls.sum() > max(_ERRORS * noise, _EXPLAINED * float(errors[0].sum())):
+            lines.append(
+                f"{key}: the final picture is hardly closer to the references than with its initial values: they hardly determine it, or "
+                "it needs more steps, or fewer elements"
+            )
+    return lines
 
 
 def undetermined_cells(sensitivities: Mapping[str, np.ndarray]) -> list[str]:

@@ -13,7 +13,14 @@ import numpy as np
 from unrender.core import phases
 from unrender.io.resampling import resize_nearest
 from unrender.runs.budget import MOST_SLOWDOWN, slowdown
-from unrender.runs.determination import common_factor, undetermined, undetermined_cells, untested_factor, with_lost
+from unrender.runs.determination import (
+    common_factor,
+    no_better_maps,
+    undetermined,
+    undetermined_cells,
+    untested_factor,
+    with_lost,
+)
 from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.final_checks import (
     beyond_priors,
@@ -57,6 +64,8 @@ _MOST_CHECK = 1.25
 _MOST_BYTES, _PICTURES = 1 << 29, 3
 """Memory limit of the images of views whose references are not in memory, and the number of images per view: reference, start, result."""
 
+_NOT_TESTED = "the end of the run was not tested, or had no time left"
+"""Reason for no standard errors of textures and grids."""
 _SEEDS = {"initial": 1, "result": 2}
 _FEWEST_SAMPLES = 8
 """Fewest samples per pixel of a half with which `unexplained_pixels` judges: of fewer, most pixels miss the rare bright paths."""
@@ -141,10 +150,9 @@ def render_final_images(
         everything = tested and len(chosen) == len(problem.views)
         halves = list(zip(*ends, strict=True)) if everything and result.steps and len(ends[0]) == 2 else []
         noise = pixel_noise(problem, halves) if halves else ()
-        maps = _untested(problem, result, "the end of the run was not tested, or had no time left")
         known = curvature(problem, result.parameters, seconds=seconds, noise=noise) if everything else Curvature()
         sensitivities, deviations = known.sensitivity(), dict(result.standard_error)
-        lines, warnings = [], ()
+        lines, warnings, maps = [], (), _untested(problem, result, _NOT_TESTED)
         can_check = _cost_of_check(problem) * spent < _PICTURES_SHARE * left()
         differs = _differs(problem, result, chosen, halves_of, samples, can_check)
         if not tested and result.steps and not differs:
@@ -155,6 +163,7 @@ def render_final_images(
                 problem, result, sensitivities, 0.25 * tests, weights, fits=not differs, complete=complete
             )
             differs = with_lost(problem, result, differs, unseen, ends, _pass_spp(problem), left)
+            lines += _maps_without_gradient(problem, result, sensitivities, ends, samples) if spent < left() else []
             if halves and left() > 0.0:
                 maps = of_residuals(problem, result.parameters, halves, known)
     deviations |= maps.standard_error
@@ -290,6 +299,22 @@ def _picture(
     )
     reference = np.asarray(problem.views[view].reference)
     return (one, other), debiased.rmse(one, other, reference, problem.test_weights(view, (one, other)))
+
+
+def _maps_without_gradient(
+    problem: Problem,
+    result: Result,
+    sensitivities: Mapping[str, np.ndarray],
+    ends: Sequence[tuple[np.ndarray, ...]],
+    spp: int,
+) -> list[str]:
+    """Return `no_better_maps` of the textures and grids without a sensitivity, with the random numbers of the result's final images."""
+
+    def halves(values: Mapping[str, np.ndarray], view: int) -> tuple[np.ndarray, ...]:
+        return _picture(problem, values, view, spp, _SEEDS["result"])[0]
+
+    keys = [key for key in map_keys(problem) if key not in sensitivities] if result.steps else []
+    return no_better_maps(problem, result, keys, ends, halves)
 
 
 def _per_pass(problem: Problem, spp: int) -> int | None:
