@@ -22,8 +22,11 @@ from unrender.app.stages import stages_file
 from unrender.app.stages.stage_problem import StagedProblem
 from unrender.core.errors import InputError
 from unrender.display.terminal import Console
+from unrender.losses import L2
+from unrender.rendering.renderer import ParameterInfo
 from unrender.runs.folder import checkpoint, method_file, reader
 from unrender.runs.folder.lock import Lock
+from unrender.scene.parameter import Parameter
 
 STAGES = f"""\
 problem = "problem.toml"
@@ -400,3 +403,12 @@ def test_views_whose_scene_has_none_of_the_unknowns_are_left_out_of_a_stage(stag
     second = whole.of_stage(colour, {"sky.radiance.value": half}, staged / "two")
     assert len(second.original_views) == 2
     assert not any("left out" in notice for notice in second.notices)
+
+
+def test_a_later_stage_begins_at_the_resolution_of_the_result_before() -> None:
+    """Its coarse start would lose the details that the stage before has found."""
+    given, known = {"map": Parameter("map", coarse_to_fine=[50])}, {"map": ParameterInfo((16, 16, 3), resizable=True)}
+    problem = StagedProblem(Path(), given, (), L2(), None, {}, "", known, {}, frozenset(), ())
+    stage, found = stages_file.Stage("all", ("map",)), np.zeros((16, 16, 3), np.float32)
+    assert problem._parameter("map", stage, None).coarse_to_fine == [50]
+    assert problem._parameter("map", stage, found).coarse_to_fine is None

@@ -150,7 +150,7 @@ class StagedProblem:
 
     def _parameter(self, key: str, stage: Stage, value: np.ndarray | None) -> Parameter:
         parameter, info = self.parameters[key], self.known[key]
-        parameter = parameter if value is None else replace(parameter, initial=value)
+        parameter = parameter if value is None else replace(parameter, initial=value, coarse_to_fine=None)
         if stage.coarser == 1 or not info.resizable:
             return parameter
         coarse = CoarseToFine((NEVER,), stage.coarser)
