@@ -166,3 +166,19 @@ def test_adaptive_pixels_inside_a_medium_that_emits(part: str) -> None:
 
 def test_a_medium_that_emits_tells_what_it_is() -> None:
     assert str(mi.load_dict(glow())).startswith("EmissiveMedium[")
+
+
+def test_light_leaves_fog_without_a_border_in_the_channel_that_it_lets_through():
+    """Its flights once had no end, since light of this channel never collides."""
+
+    def red_and_blue(fog: dict[str, Any]) -> np.ndarray:
+        stone = {"type": "sphere", "radius": 1, "bsdf": {"type": "diffuse"}}
+        described = {"type": "scene", "stone": stone, "sky": {"type": "constant"}, "eye": camera(OUTSIDE, **fog)}
+        session = MitsubaRenderer(described, 4).prepare([], None, False)
+        return np.array(session.image({}, SampleRequest(0, 1024, 1)).images).mean((0, 1, 2))[[0, 2]]
+
+    colours = {"type": "rgb", "value": [0.5, 0.2, 0]}
+    seen = red_and_blue({"medium": {"type": "homogeneous", "albedo": 0.5, "sigma_t": colours}})
+    clear = red_and_blue({})
+    assert seen[1] == pytest.approx(clear[1], rel=0.03)
+    assert seen[0] < 0.1 * clear[0]

@@ -158,7 +158,8 @@ def _tentative_collision(segment: MediumSegment, flight: FreeFlight, sampler: An
         dr.select(flying, β * scale * dr.select(flight.collides, 1, dr.maximum(σ̄ - σ, 0)), β)
         for β, σ in zip(flight.β, σₜ, strict=True)
     ]
-    flight.active = flying & ~flight.collides
+    endless = ~dr.isfinite(segment.far)  # of a homogeneous medium, which light without extinction never leaves
+    flight.active = flying & ~flight.collides & ~(endless & (mass <= 0))
     flight.dda = dda
     return flight
 
