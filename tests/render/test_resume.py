@@ -252,7 +252,8 @@ def test_a_parameter_of_another_shape_cannot_be_forced(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="initial has changed"):
         ur.resume(folder, problems[1])
     with pytest.raises(
-        InputError, match=r"checkpoint of step 2: parameters.*expected shape \(5, 5, 3\), got \(4, 4, 3\)"
+        InputError,
+        match=r"checkpoint of step 2: parameters.*expected shape \(5, 5, 3\), got \(4, 4, 3\); start the run again",
     ):
         ur.resume(folder, problems[1], force=True)
     assert ur.resume(folder).steps == 3

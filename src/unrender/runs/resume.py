@@ -264,7 +264,10 @@ def _unpack(
         raise InputError(f"{where}: {_WARNINGS}: expected a list of lines, got {repr(warnings)[:60]}")
     for name, value in saved.items():
         if name not in (_WARNINGS, _SENT, *_OPTIONAL):
-            check_alike(value, [fresh[name], warm[name]], f"{where}: {name}")
+            try:
+                check_alike(value, [fresh[name], warm[name]], f"{where}: {name}")
+            except InputError as error:
+                raise InputError(f"{error}; start the run again if another version of unrender made it") from error
     for name in SNAPSHOT_COUNTS:
         if not 0 <= saved[name] < float("inf"):
             raise InputError(f"{where}: {name}: expected a number of at least 0, got {saved[name]}")
