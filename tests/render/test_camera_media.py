@@ -182,3 +182,35 @@ def test_light_leaves_fog_without_a_border_in_the_channel_that_it_lets_through()
     clear = red_and_blue({})
     assert seen[1] == pytest.approx(clear[1], rel=0.03)
     assert seen[0] < 0.1 * clear[0]
+
+
+def test_a_channel_with_hardly_any_extinction_ends_its_flights_through_fog_without_a_border():
+    """The steps of a flight once grew as the ratio of the extinctions."""
+
+    def seen(blue: float) -> np.ndarray:
+        colours = {"type": "rgb", "value": [0.5, 0.2, blue]}
+        fog = {"type": "homogeneous", "albedo": 0.5, "sigma_t": colours}
+        stone = {"type": "sphere", "radius": 1, "emitter": {"type": "area", "radiance": 2.0}}
+        described = {"type": "scene", "stone": stone, "eye": camera(OUTSIDE, medium=fog)}
+        session = MitsubaRenderer(described, 4).prepare([], None, False)
+        return np.array(session.image({}, SampleRequest(0, 256, 1)).images)
+
+    np.testing.assert_allclose(seen(1e-9), seen(0.0), atol=1e-6)
+
+
+def test_gradient_by_extinction_where_one_channel_leaves_fog_without_a_border():
+    """A lamp at distance d fills half of the image: its radiance exp(-σ d) has the derivative -d exp(-σ d). Paths beside the lamp once
+    gave an infinite one, or NaN."""
+    key, d, σ = "eye.medium.sigma_t.value.value", 3.0, np.array([0.5, 0.2, 0])
+    place = mi.ScalarTransform4f().translate([1, 0, d]).rotate([1, 0, 0], 180)
+    half = {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    fog = {"type": "homogeneous", "albedo": 0.0, "sigma_t": {"type": "rgb", "value": list(σ)}}
+    eye = {"type": "perspective", "fov": 1, "film": film, "medium": fog}
+    renderer = MitsubaRenderer({"type": "scene", "half": half, "sky": {"type": "constant"}, "eye": eye}, 2, [key])
+    session, values = renderer.prepare([key], None), renderer.values([key])
+    paths = session.image(values, SampleRequest(0, 4096, 1)).paths
+    weights = renderer.array(np.ones((1, SIZE, SIZE, 3), np.float32))
+    found = np.array(session.adjoint(values, paths, weights)[key])
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found[:2], (-d * np.exp(-σ * d) * SIZE * SIZE / 2)[:2], rtol=0.03)

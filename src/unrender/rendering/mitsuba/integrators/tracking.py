@@ -123,19 +123,44 @@ class FreeFlight:
 def sample_free_flight(
     segment: MediumSegment, β: Sequence[Spectrum], sampler: Any, active: Bool
 ) -> tuple[Float, Bool, list[Spectrum]]:
-    """Sample a collision on a segment by delta tracking.
+    """Sample a collision on a segment: in closed form for homogeneous media, else by delta tracking.
 
     The probability of a real collision weights all channels of all states by their throughput. The sum of all throughputs is then
-    constant at every null collision, so none of them diverges.
+    constant, so none of them diverges.
 
     Returns:
         distance of the real collision, whether there is one, and the throughputs, including σₛ over the density.
     """
     flying = active & (segment.near < segment.far)
-    flight = FreeFlight(segment.majorant.start(), list(β), mi.Bool(False), flying)
+    closed = flying & segment.media[0].is_homogeneous()
+    flight = FreeFlight(segment.majorant.start(), list(β), mi.Bool(False), flying & ~closed)
+    _sample_exponential(segment, flight, sampler, closed)
     while dr.hint(flight.active, label="free flight"):
         flight = _tentative_collision(segment, flight, sampler)
     return flight.dda.t, flight.collides, _scattered(segment, flight)
+
+
+def _sample_exponential(segment: MediumSegment, flight: FreeFlight, sampler: Any, active: Bool) -> None:
+    """Complete flights through homogeneous media by the extinction of one channel of one state, sampled by throughput.
+
+    Delta tracking has the same density. It does not end on an unbounded segment where the extinctions differ by orders of magnitude.
+    """
+    near, far = segment.near, segment.far
+    σₜ = segment.extinctions(segment.at(near), active)
+    before = total([dr.sum(β) for β in flight.β])
+    rest, chosen = mi.Float(sampler.next_1d() * before), mi.Float(0)
+    for b, σ in ((b, σ) for β, σs in zip(flight.β, σₜ, strict=True) for b, σ in zip(β, σs, strict=True)):
+        chosen = dr.select((b > 0) & (rest >= 0), σ, chosen)
+        rest -= b
+    t = near + dr.select(chosen > 0, sample_optical_depth(sampler.next_1d()) / chosen, dr.inf)
+    collides = active & (t < far)
+    length = dr.select(collides, t, far) - near
+    βT = [β * dr.select(σ > 0, dr.exp(-σ * length), 1) for β, σ in zip(flight.β, σₜ, strict=True)]
+    after = total([dr.sum(β * dr.select(collides, σ, 1)) for β, σ in zip(βT, σₜ, strict=True)])
+    scale = dr.select(after > 0, before / after, 0)
+    flight.β = [dr.select(active, β * scale, old) for β, old in zip(βT, flight.β, strict=True)]
+    flight.collides = collides
+    flight.dda.t = dr.select(active, t, flight.dda.t)
 
 
 def _scattered(segment: MediumSegment, flight: FreeFlight) -> list[Spectrum]:
@@ -158,8 +183,7 @@ def _tentative_collision(segment: MediumSegment, flight: FreeFlight, sampler: An
         dr.select(flying, β * scale * dr.select(flight.collides, 1, dr.maximum(σ̄ - σ, 0)), β)
         for β, σ in zip(flight.β, σₜ, strict=True)
     ]
-    endless = ~dr.isfinite(segment.far)  # of a homogeneous medium, which light without extinction never leaves
-    flight.active = flying & ~flight.collides & ~(endless & (mass <= 0))
+    flight.active = flying & ~flight.collides
     flight.dda = dda
     return flight
 
@@ -337,6 +361,8 @@ def relative_derivatives(segment: MediumSegment, t: Float, collides: Bool, noise
         inside: lanes inside the medium.
     """
     length = dr.select(collides, t, segment.far) - segment.near
+    # Light leaves an unbounded medium only in channels without extinction, whose derivative is infinite and left out.
+    length = dr.select(dr.isfinite(length), length, 0)
     collision, middle = segment.at(t), segment.at(segment.near + noise.next_1d() * length)
     c = mis_constant(segment.near, segment.far)
     result = []

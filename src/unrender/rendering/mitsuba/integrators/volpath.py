@@ -206,7 +206,12 @@ class VolumePair:
         if follow_media:
             changes = tracking.relative_derivatives(segment, t, collides, noise, inside)
             with dr.resume_grad():
-                derivatives = [L * change for L, change in zip(path.L, changes, strict=True)]
+                derivatives = [
+                    dr.select(
+                        β > 0, L * change, 0
+                    )  # Without throughput, L is a rounding error that long segments enlarge.
+                    for β, L, change in zip(path.β, path.L, changes, strict=True)
+                ]
         return Flight(segment, t, collides, emits, may_scatter, derivatives)
 
     def _sample_emitter(
