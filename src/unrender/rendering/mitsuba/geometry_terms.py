@@ -73,12 +73,12 @@ def _obstacle(pair: ScenePair, target: str, shape: Any) -> str:
 
 
 def _masks_obstacle(pair: ScenePair) -> str:
-    """Return the reason why a scene with opacity masks or null surfaces has no boundary derivative; "" for others. Edges behind these are
-    omitted, and `prb` loses the motion of the light that passes them."""
+    """Return the reason why a scene whose surfaces let light pass straight on has no boundary derivative; "" for others. Edges behind
+    these are omitted, and `prb` loses the motion of the light that passes them."""
     for shape in pair.current.shapes():
         bsdf = shape.bsdf()
-        if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) and not is_mirror_or_glass(bsdf):
-            return f"boundary derivatives do not support opacity masks and null surfaces ({shape.id()})"
+        if bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null):
+            return f"boundary derivatives do not support opacity masks, thin glass and null surfaces ({shape.id()})"
     return ""
 
 
