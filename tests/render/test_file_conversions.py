@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -193,6 +194,20 @@ def test_an_array_is_rounded_to_half_precision_as_its_file_is(renderer: MitsubaR
     array = parameter_values.fill(PICTURE, info.shape, info.conversion)[0]
     assert not np.array_equal(array, PICTURE)
     np.testing.assert_array_equal(array, of_file(renderer, key, tmp_path / "picture.npy"))
+
+
+def test_rounding_to_half_precision_leaves_no_bounds(renderer: MitsubaRenderer):
+    """0.1 is rounded to 0.09998: an initial value of 0.1 was moved into bounds from 0.1 with a notice, and a true one was out of reach."""
+    key = "rounded.bsdf.reflectance.data"
+    unknown = ur.Parameter(key, 0.1, bounds=(0.1, 0.7))
+    for truth in (0.1, 0.7):
+        made = ur.Problem(renderer, [unknown], [VIEW], truth={key: truth})
+        assert made.notices == []
+        assert (made.unknowns[key].initial == np.float32(0.1)).all()
+    made = ur.Problem(renderer, [replace(unknown, initial=0.0999)], [VIEW], truth={key: 0.701})
+    assert len(made.notices) == 2
+    assert "such as 0.0999" in made.notices[0]
+    assert "no run can reach: such as 0.701" in made.notices[1]
 
 
 # ------------------------------------------------------------------ environment maps

@@ -25,6 +25,8 @@ _LOBE_START = 0.01
 """Distance from an end of the range, as a fraction of it, to which a start is moved if a lobe would never be sampled."""
 _ROUNDING = 1e-6
 """Distance of a true value from the bounds that rounding explains, relative to the largest value or to 1."""
+_HALF_PRECISION = 2.0**-11
+"""Largest relative change of a value that is rounded to half precision."""
 _CLEARANCE = 0.01
 """Distance to a singular value that bounds keep, relative to that value; at most half of the initial distance."""
 
@@ -63,20 +65,25 @@ def check_bounds(bounds: Any, info: ParameterInfo, start: np.ndarray) -> tuple[B
     return side, f"bounds narrowed to {_interval(side)}: images are singular at {singular:g}"
 
 
-def clip_to_bounds(start: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, str]:
-    """Return `start` clamped to the bounds, and a notice with the number of changed values; "" if none changed."""
+def clip_to_bounds(start: np.ndarray, bounds: Bounds, half: bool = False) -> tuple[np.ndarray, str]:
+    """Return `start` clamped to the bounds, and a notice with the number of changed values; "" if none changed.
+
+    The notice ignores changes that undo the rounding of a value at a bound, if `start` was rounded to half precision (`half`).
+    """
     low, high = bounds
-    moved, ends = _outside(start, bounds)
-    if not moved:
+    if not _outside(start, bounds)[0]:
         return start, ""
+    clipped = np.asarray(np.clip(start, low, high), np.float32)  # clip returns a scalar for a scalar
+    moved, ends = _outside(start, bounds, half=half)
+    if not moved:
+        return clipped, ""
     example = f"{'such as ' if moved > len(ends) else ''}{listed([f'{value:g} to {end:g}' for value, end in ends])}"
-    notice = f"{moved} of {start.size} initial values moved into the bounds {_interval(bounds)}: {example}"
-    return np.asarray(np.clip(start, low, high), np.float32), notice  # clip returns a scalar for a scalar
+    return clipped, f"{moved} of {start.size} initial values moved into the bounds {_interval(bounds)}: {example}"
 
 
-def truth_notice(truth: np.ndarray, bounds: Bounds) -> str:
-    """Return a notice of true values outside the bounds, beyond rounding; "" for none."""
-    count, ends = _outside(truth, bounds, _ROUNDING * max(float(np.abs(truth).max(initial=0.0)), 1.0))
+def truth_notice(truth: np.ndarray, bounds: Bounds, half: bool = False) -> str:
+    """Return a notice of true values outside the bounds, beyond rounding, to half precision if `half`; "" for none."""
+    count, ends = _outside(truth, bounds, _ROUNDING * max(float(np.abs(truth).max(initial=0.0)), 1.0), half)
     if not count:
         return ""
     example = f"{'such as ' if count > len(ends) else ''}{listed([f'{value:g}' for value, _ in ends])}"
@@ -85,11 +92,19 @@ def truth_notice(truth: np.ndarray, bounds: Bounds) -> str:
     )
 
 
-def _outside(values: np.ndarray, bounds: Bounds, margin: float = 0.0) -> tuple[int, list[tuple[float, float]]]:
-    """Return the number of values outside the bounds by more than a margin, and the furthest beyond each end with that end."""
+def _outside(
+    values: np.ndarray, bounds: Bounds, margin: float = 0.0, half: bool = False
+) -> tuple[int, list[tuple[float, float]]]:
+    """Return the number of values outside the bounds by more than a margin, and the furthest beyond each end with that end.
+
+    The margin is larger for values that were rounded to half precision (`half`).
+    """
     count, ends = 0, []
     for sign, end in zip((-1.0, 1.0), bounds, strict=True):
-        if end is not None and (beyond := sign * (values - np.float32(end)) > margin).any():
+        if end is None:
+            continue
+        most = margin + (_HALF_PRECISION * abs(end) if half else 0.0)
+        if (beyond := sign * (values - np.float32(end)) > most).any():
             count += int(np.count_nonzero(beyond))
             ends.append((float(sign * np.max(sign * values)), end))
     return count, ends
@@ -147,7 +162,7 @@ def angle_notice(info: ParameterInfo, *values: Any) -> str:
 def move_inside(start: np.ndarray, bounds: Bounds, info: ParameterInfo) -> tuple[np.ndarray, tuple[str, ...]]:
     """Return a start inside the bounds at which each lobe is sampled, and notices of the changes."""
     start, moved = _sampled_lobe(start, info)
-    start, clipped = clip_to_bounds(start, bounds)
+    start, clipped = clip_to_bounds(start, bounds, info.conversion.half)
     return start, tuple(filter(None, (moved, clipped)))
 
 

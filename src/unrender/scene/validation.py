@@ -322,7 +322,7 @@ def check_truth(
         raise FieldError(("truth", key), f"not one of the parameters{did_you_mean(key, unknowns)}")
     with FieldError.at(("truth", key)):
         truth, converted = parameter_values.fill(value, known[key].shape, known[key].conversion)
-    notices = filter(None, (converted, truth_notice(truth, unknowns[key].bounds)))
+    notices = filter(None, (converted, truth_notice(truth, unknowns[key].bounds, known[key].conversion.half)))
     return truth, tuple(f"parameter {key}: truth {notice}" for notice in notices)
 
 
