@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -35,6 +37,20 @@ def test_each_pair_has_one_number_in_each_stratum_and_pairs_are_uncorrelated(siz
     assert np.abs(correlations - np.eye(8)).max() < 5.0 * error
     means = numbers.mean(axis=-1)  # of one pixel: independent of those of others and of other pairs
     assert np.abs(np.corrcoef(means[0::2]) - np.eye(4)).max() < 5.0 / np.sqrt(PIXELS)
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_pairs_of_a_lane_are_independent(size: int) -> None:
+    """Numbers of two pairs fill a grid of 8² cells evenly. Scrambles of consecutive pairs that are related leave up to a sixth too much."""
+    sampler = StratifiedSampler(200_000 * size, size)
+    sampler.seed(mi.UInt32(3), 200_000 * size)
+    pairs = [np.array(sampler.next_2d()).reshape(2, -1, size)[..., 0] for _ in range(5)]  # one lane of each group
+    cells = [np.floor(8 * x).astype(int) for x in pairs]
+    for first, second in itertools.combinations(range(5), 2):
+        for a, b in itertools.product(cells[first], cells[second]):
+            counts = np.bincount(8 * a + b, minlength=64)
+            excess = (np.square(counts - a.size / 64) / (a.size / 64)).sum() - 63.0
+            assert excess < 6.0 * np.sqrt(2 * 63.0)
 
 
 def test_stratified_images_are_unbiased_with_independent_groups_and_less_noise() -> None:

@@ -247,6 +247,8 @@ class PixelBatch:
 class JoinedViews(PixelBatch):
     """All pixels of consecutive views in one launch. Each view has the random numbers of a launch of its own.
 
+    If only some cameras have an aperture or a shutter, the others sample one too, so their random numbers are others.
+
     Attributes:
         memory: index of this frame in its step.
         views: indices of the views.

@@ -95,8 +95,8 @@ class StratifiedSampler:
     def next_2d(self, active: Any = True) -> Any:
         """Return two uniform numbers per lane, including inactive lanes."""
         del active
-        x, y = mi.sample_tea_32(self.group, self.pair)
-        order = mi.sample_tea_32(self.group, self.pair + (1 << 31))
+        x, y = mi.sample_tea_32(self.group, self.pair, 8)  # with the default of 4 rounds, consecutive pairs are related
+        order = mi.sample_tea_32(self.group, self.pair + (1 << 31), 8)
         self.pair = self.pair + 1
         index = _shuffled(self.sample, (self.size - 1).bit_length(), *order)
         return mi.Point2f(mi.radical_inverse_2(index, x), mi.sobol_2(index, y))
