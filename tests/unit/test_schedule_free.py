@@ -18,12 +18,13 @@ from unrender.optimizers import Adam, ScheduleFree
 from unrender.optimizers.transforms import agreement_rate, fitted_sobolev, lasting_agreement
 from unrender.optimizers.transforms.agreement_rate import Agreement
 from unrender.optimizers.transforms.base import StepUpdate
-from unrender.optimizers.transforms.fitted_sobolev import StrengthFit
+from unrender.optimizers.transforms.fitted_sobolev import FittedSobolevState, StrengthFit
 from unrender.optimizers.transforms.pull_to_start import PullToStart
 from unrender.optimizers.transforms.scale import MeanSquare
 from unrender.optimizers.transforms.schedule_free_average import Iterates
 from unrender.optimizers.transforms.wiener_shrinkage import GradientProducts
 from unrender.preconditioners import Sobolev
+from unrender.runs.folder.state import check_alike
 from unrender.schedules import Cosine
 
 
@@ -425,3 +426,16 @@ def test_texels_leave_a_bound_as_soon_as_their_gradient_turns_in_the_first_steps
     assert saturated.min() == 1.0
     assert known.max() < 0.95
     np.testing.assert_array_equal(known, unknown)
+
+
+def test_states_stored_without_the_mean_gradient_go_on():
+    """As checkpoints of versions before it: they have the form of a state, and the mean begins with the next gradient."""
+    optimizer, x = ScheduleFree(0.1, preconditioner=Sobolev(), preconditioned=("x",)), {"x": np.full((8, 8, 1), 0.4)}
+    fresh = optimizer.init(x)
+    after = optimizer.update(Estimate(0.0, {"x": x["x"] - 1.0}), fresh, x)[1]
+    stored = [replace(part, mean={}) if isinstance(part, FittedSobolevState) else part for part in after.states]
+    stored = replace(after, states=tuple(stored))
+    check_alike(stored, [fresh, after])
+    again = optimizer.update(Estimate(0.0, {"x": x["x"] - 1.0}), stored, x)[1]
+    check_alike(again, [after])
+    np.testing.assert_allclose(again.of(FittedSobolevState).mean["x"], -0.06)

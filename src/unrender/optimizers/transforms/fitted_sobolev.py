@@ -261,7 +261,8 @@ class FittedSobolevState(TransformState):
     Attributes:
         gradient: Preconditioned gradient of the last step; zeros before the first.
         strengths: {key: fit of the strength} of the parameters whose preconditioner is a `Sobolev`.
-        mean: Exponentially weighted mean of earlier gradients of the preconditioned parameters, without preconditioning.
+        mean: Exponentially weighted mean of earlier gradients of the preconditioned parameters, without preconditioning; empty before the
+            first, and in checkpoints of versions without it.
     """
 
     gradient: Tree = field(metadata=GRADIENTS)
@@ -318,13 +319,13 @@ class FittedSobolev(StepTransform):
             if self.preconditioner is not None:
                 self._smooth(key).check(key, arrays.shape(parameters[key]))
         fitted = self.preconditioned if isinstance(self.preconditioner, Sobolev) else ()
-        mean = {key: arrays.zeros_like(parameters[key]) for key in self.preconditioned}
-        return FittedSobolevState(trees.zeros_like(parameters), dict.fromkeys(fitted, StrengthFit()), mean)
+        return FittedSobolevState(trees.zeros_like(parameters), dict.fromkeys(fitted, StrengthFit()))
 
     def update(self, update: StepUpdate, state: FittedSobolevState) -> tuple[StepUpdate, FittedSobolevState]:
         """Precondition the gradient. Waits for the device if a strength is fitted."""
         held = held_at_bounds(update, state.mean)
-        mean = {k: _MEMORY * m + (1.0 - _MEMORY) * update.gradient[k] for k, m in state.mean.items()}
+        gradients = {k: (1.0 - _MEMORY) * update.gradient[k] for k in self.preconditioned}
+        mean = {k: _MEMORY * state.mean[k] + g if k in state.mean else g for k, g in gradients.items()}
         arrays.evaluate(held, mean)
         raw = without(update.gradient, held)
         if update.made == 0:
