@@ -367,6 +367,24 @@ def test_earlier_parameters_are_kept_where_they_are_better(tmp_path: Path) -> No
     assert found.record.verified == "finished"
 
 
+@pytest.mark.mitsuba
+@pytest.mark.parametrize(
+    ("done", "steps", "spp", "best", "compared"), [(32, 64, 64, "end", 32), (64, 90, 4, "step 64", None)]
+)
+def test_a_run_resumed_at_a_power_of_two_has_the_earlier_pictures_of_the_whole_run(
+    done: int, steps: int, spp: int, best: str, compared: int | None, tmp_path: Path
+) -> None:
+    """A rate that rises after 70 steps spoils what was reached."""
+    parts = ur.PathGradient(spp=spp), ur.optimizers.Adam(0.05, schedule=Rising())
+    whole = ur.optimize(made(), *parts, steps=steps, run_directory=tmp_path / "whole")
+    ur.optimize(made(), *parts, steps=done, run_directory=tmp_path / "resumed")
+    resumed = ur.resume(tmp_path / "resumed", made(), steps=steps)
+    assert whole.verification["best"] == best
+    assert whole.verification.get("change", {}).get("step") == compared
+    assert resumed.verification == whole.verification
+    np.testing.assert_array_equal(resumed.parameters["x"], whole.parameters["x"])
+
+
 def test_a_result_says_the_same_as_its_folder_and_old_folders_are_not_verified(tmp_path: Path) -> None:
     result = ur.optimize(made(), RCV, ur.optimizers.Adam(0.03), steps=70)
     result.save(tmp_path / "run")

@@ -98,13 +98,14 @@ class Verify(Callback):
                 self._earlier = restored(run.state.pictures, self._small, self._first)
 
     def on_step(self, run: Run, record: dict[str, Any]) -> None:
-        """Render a candidate at steps 64, 128, 256, …, but the last, and images for the residual of short runs at steps 4, 8, 16 and 32."""
+        """Render a candidate at steps 64, 128, 256, …, and images for the residual of short runs at steps 4, 8, 16 and 32."""
         del record
         pictures = self._small
         if pictures is None or run.step < _FIRST_EARLIER or run.step & (run.step - 1) or _other_meshes(run.problem):
             return
         short = run.step < FIRST_CANDIDATE
-        if run.step == run.steps or (short and pictures.paths > _COST * run.state.samples):
+        at_end = run.step == run.steps and run.folder is None  # no run continues, and the end has its own image
+        if at_end or (short and pictures.paths > _COST * run.state.samples):
             return
         values = run.full()
         picture = pictures.picture(values)
@@ -124,13 +125,12 @@ class Verify(Callback):
         return callbacks.with_phase(result, callbacks.VERIFYING, time.perf_counter() - started)
 
     def _verified(self, run: Run, result: Result) -> Result:
-        problem = run.problem
-        pictures, first = self._start(run, result)
+        problem, (pictures, first) = run.problem, self._start(run, result)
         began = time.perf_counter()
         result, last, unaveraged = _end(run, result, pictures)
         seconds = time.perf_counter() - began
         candidate = None if _other_meshes(problem) else run.state.candidate
-        if candidate is not None and candidate.loss >= last.loss[0]:
+        if candidate is not None and (candidate.step == result.steps or candidate.loss >= last.loss[0]):
             candidate = None
         memory, candidate_picture = _memory(run, pictures, last), None
         if candidate is not None:
