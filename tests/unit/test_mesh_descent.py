@@ -388,6 +388,16 @@ def test_a_warning_about_the_end_is_in_every_result_and_in_none_after_it_was_giv
     assert MeshWatch().warnings(run) == []  # of a resumed run
 
 
+def test_a_mesh_that_passes_through_itself_is_told_beside_another_whose_name_ends_alike() -> None:
+    key, away = "ball.vertex_positions", np.repeat([0.0, 3.0], len(POINTS))[:, None] * [1.0, 0, 0]
+    vertices, faces = np.concatenate([POINTS, POINTS]), np.concatenate([FACES, FACES + len(POINTS)])
+    problem = of_mesh(key, vertices + away, faces, "warn")
+    run: Any = SimpleNamespace(problem=problem, parameters={key: vertices + away / 2}, warnings=[], stopped="steps")
+    (line,) = MeshWatch().warnings(run)
+    run.warnings = [f"step 25: big{line}"]
+    assert MeshWatch().warnings(run) == [line]
+
+
 def test_a_mesh_that_one_view_shows_is_there_while_a_view_is_drawn_at_each_step() -> None:
     key = "ball.vertex_positions"
     problem = of_mesh(key, POINTS, FACES, "ignore")

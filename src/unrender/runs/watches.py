@@ -134,7 +134,7 @@ class MeshWatch(Callback):
         """Return the warning about new self-intersections of a mesh; "" if there are none, or it was issued."""
         told = f"{key}: the mesh passes through itself"
         ignored = run.problem.unknowns[key].parameter.self_intersection == "ignore"
-        if ignored or any(told in line for line in run.warnings):
+        if ignored or any(f": {told}" in f": {line}" for line in run.warnings):
             return ""
         before, after, joined = _joined(run, key)
         count = len(crossing_triangles(after, joined))
