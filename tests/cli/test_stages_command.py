@@ -314,6 +314,17 @@ def test_a_key_that_the_scene_between_stages_has_under_another_name_is_refused(s
     assert not (staged / "scene").exists()
 
 
+def test_a_transform_that_a_later_stage_cannot_export_is_refused_at_once(staged: Path) -> None:
+    """It was refused when the second stage began, after the time of the first. A single stage exports nothing."""
+    scene = staged / "wall.xml"
+    turned = '<transform name="to_world"><rotate x="1" y="1" angle="50"/></transform>'
+    scene.write_text(scene.read_text().replace("</scene>", f'<shape type="sphere" id="ball">{turned}</shape></scene>'))
+    first, second = stages_file.Stage("light", ("sky.radiance.value",)), stages_file.Stage("colour", (KEY,))
+    StagedProblem.read(stages_file.Stages(staged / "problem.toml", (first,), steps=1))
+    with pytest.raises(InputError, match="ball: to_world: cannot be exported: it rotates about an axis whose length"):
+        StagedProblem.read(stages_file.Stages(staged / "problem.toml", (first, second), steps=1))
+
+
 def test_an_exposure_stays_an_unknown(unrender: Unrender, staged: Path) -> None:
     problem = staged / "problem.toml"
     problem.write_text(problem.read_text().replace("[[views]]", '[[parameters]]\nkey = "exposure"\n[[views]]'))

@@ -167,3 +167,16 @@ def test_a_rotation_about_an_axis_of_another_length_is_refused(axis: list[float]
     with pytest.raises(ur.InputError, match=words):
         ur.app.export((asked, start(asked)), tmp_path / "out")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("axis", [[0.58] * 3, [0.71, 0.71, 0]])
+def test_a_mesh_rotated_about_an_axis_of_two_digits_is_exported(axis: list[float], tmp_path: Path) -> None:
+    """It was refused, although its picture hardly depends on the inverse. That of an environment map does."""
+    turned = mi.ScalarTransform4f().rotate(axis=axis, angle=180)
+    wall = {"type": "rectangle", "to_world": turned}
+    asked = problem(scene({"type": "diffuse"}) | {"wall": wall}, "ball.bsdf.reflectance.value")
+    assert ur.app.export((asked, start(asked)), tmp_path / "out").scene is not None
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((2, 4, 3), np.float32)), "to_world": turned}
+    asked = problem(scene({"type": "diffuse"}) | {"sky": sky}, "ball.bsdf.reflectance.value")
+    with pytest.raises(ur.InputError, match="sky: to_world: cannot be exported"):
+        ur.app.export((asked, start(asked)), tmp_path / "other")

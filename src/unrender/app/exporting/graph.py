@@ -83,8 +83,7 @@ class SceneGraph:
 
     def children(self, index: int) -> dict[str, int]:
         """Return {property: index} of the children of a node."""
-        props = self.nodes[index].props
-        return {name: props[name].index() for name in props.keys() if props.type(name) == _Kind.ResolvedReference}  # noqa: SIM118
+        return _children(self.nodes[index].props)
 
     def add(self, parent: int, name: str, kind: Any, plugin: str) -> int:
         """Add a plugin as the property `name` of `parent`; return its index."""
@@ -121,14 +120,7 @@ class SceneGraph:
 
     def used(self) -> set[int]:
         """Return all nodes that are reachable from the scene."""
-        reachable: set[int] = set()
-        waiting = [0]
-        while waiting:
-            index = waiting.pop()
-            if index not in reachable:
-                reachable.add(index)
-                waiting += self.children(index).values()
-        return reachable
+        return reachable(self.nodes)
 
     def sensors(self) -> list[Any]:
         """Return the sensors of the live scene; their ids are n0 to nN, after their nodes."""
@@ -204,6 +196,22 @@ _REFRACTING = ("dielectric", "roughdielectric", "thindielectric", "plastic", "ro
 _METALS = ("conductor", "roughconductor")
 _SPECTRA = ("regular", "irregular")
 _VERTEX = ("vertex_", "face_")
+
+
+def reachable(nodes: Any) -> set[int]:
+    """Return the indices of the `mitsuba.parser.SceneNode` objects that the first one, the scene, refers to directly or indirectly."""
+    found: set[int] = set()
+    waiting = [0]
+    while waiting:
+        index = waiting.pop()
+        if index not in found:
+            found.add(index)
+            waiting += _children(nodes[index].props).values()
+    return found
+
+
+def _children(props: Any) -> dict[str, int]:
+    return {name: props[name].index() for name in props.keys() if props.type(name) == _Kind.ResolvedReference}  # noqa: SIM118
 
 
 def store(graph: SceneGraph, place: Place, value: np.ndarray, key: str, folder: Path) -> None:

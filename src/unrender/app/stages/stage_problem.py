@@ -58,7 +58,8 @@ class StagedProblem:
         """Read the problem file of the stages.
 
         Raises `InputError` if the file is malformed, a stage names an unknown that is no parameter of it, leaves out an unknown that no
-        scene can hold, or remeshes a mesh whose first triangles later stages need.
+        scene can hold, or remeshes a mesh whose first triangles later stages need; or if the scene has a transform that a stage cannot
+        export.
         """
         problem = Problem.from_file(stages.problem)
         known, scene = problem.renderer.parameters(), scene_renderer(problem.renderer)
@@ -68,8 +69,12 @@ class StagedProblem:
             if key not in scene.parameters():
                 raise InputError(f"{stages.problem}: {key} is an unknown of expressions, which stages do not support")
         initial = {key: u.initial for key, u in problem.unknowns.items() if key not in OF_PHOTOGRAPHS}
+        given = frozenset(key for key, value in initial.items() if _differs(problem.renderer, key, value))
+        path = Path(problem.origin["scene"])
+        if _exports(stages, given):
+            scene_folder.check_transforms(path)
         return cls(
-            Path(problem.origin["scene"]),
+            path,
             parameters,
             problem.original_views,
             problem.loss,
@@ -78,7 +83,7 @@ class StagedProblem:
             problem.name,
             {key: replace(known[key], mesh=None) for key in parameters},
             initial,
-            frozenset(key for key, value in initial.items() if _differs(problem.renderer, key, value)),
+            given,
             tuple(_keys_of_scene(problem, view) for view in range(len(problem.views))),
         )
 
@@ -155,6 +160,16 @@ class StagedProblem:
             return parameter
         coarse = CoarseToFine((NEVER,), stage.coarser)
         return replace(parameter, coarse_to_fine=coarse if max(coarse.shape(info.shape, 0)[:-1]) > 1 else None)
+
+
+def _exports(stages: Stages, given: frozenset[str]) -> bool:
+    """Return whether a stage has fixed values that the problem's scene does not have, so that it needs a scene of its own."""
+    stored = set(given)
+    for stage in stages.stages:
+        if not stored <= set(stage.unknowns):
+            return True
+        stored |= set(stage.unknowns)
+    return False
 
 
 def _keys_of_scene(problem: Problem, view: int) -> frozenset[str]:
