@@ -427,17 +427,47 @@ def test_a_pixel_that_is_not_finite_leaves_the_others_judged(column: int, monkey
     assert not told_of(half_textured(exact), truth)
 
 
+def without_gradient(made: Problem, start: np.ndarray, end: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Return whether a run of a map that is not differentiable is told that its picture is hardly closer to the references."""
+    monkeypatch.setattr(final_images, "curvature", lambda *_, **__: Curvature())
+    monkeypatch.setattr(final_images, "map_keys", lambda problem: list(problem.unknowns))
+    initial = {"map": start.astype(np.float32)}
+    result = Result({"map": end}, initial, [{}] * 20, 1.0, 0.0, "steps", verification={"best": "end"})
+    lines = final_images.render_final_images(made, result, 64).undetermined
+    return any("hardly closer to the references" in line for line in lines)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
 @pytest.mark.parametrize(("progress", "told"), [(0.0, True), (0.05, True), (0.9, False)])
 def test_a_map_without_a_path_gradient_that_has_explained_little_is_told(
-    progress: float, told: bool, monkeypatch: pytest.MonkeyPatch
+    progress: float, told: bool, noise: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(final_images, "curvature", lambda *_, **__: Curvature())  # none is differentiable
-    monkeypatch.setattr(final_images, "map_keys", lambda problem: list(problem.unknowns))
-    truth, made = np.random.default_rng(0).uniform(0.1, 0.9, 50).astype(np.float32), half_textured()
-    values = {"map": 0.5 + np.float32(progress) * (truth - 0.5)}
-    result = Result(values, made.initial_values(), [{}] * 20, 1.0, 0.0, "steps", verification={"best": "end"})
-    lines = final_images.render_final_images(made, result, 64).undetermined
-    assert any("hardly closer to the references" in line for line in lines) is told
+    """Also beside noise of the references, which no map explains."""
+    truth, exact = np.random.default_rng(0).uniform(0.1, 0.9, 50), np.asarray(half_textured().views[0].reference)
+    made = half_textured(exact + noise * np.random.default_rng(1).standard_normal(exact.shape))
+    end = (0.5 + progress * (truth - 0.5)).astype(np.float32)
+    assert without_gradient(made, np.full(50, 0.5), end, monkeypatch) is told
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+@pytest.mark.parametrize("shift", [0.0, 0.002])
+def test_a_map_without_a_path_gradient_that_begins_at_its_solution_has_nothing_to_explain(
+    shift: float, noise: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in the second stage of a run, or in a run from an earlier result."""
+    truth, exact = np.random.default_rng(0).uniform(0.1, 0.9, 50), np.asarray(half_textured().views[0].reference)
+    made = half_textured(exact + noise * np.random.default_rng(1).standard_normal(exact.shape))
+    assert not without_gradient(made, truth + shift, truth.astype(np.float32), monkeypatch)
+
+
+@pytest.mark.mitsuba
+def test_a_map_without_a_path_gradient_whose_loss_takes_no_reference_is_not_compared_with_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import drjit as dr
+
+    made = half_textured().replaced(loss=lambda image: dr.mean(image, axis=None))
+    assert not without_gradient(made, np.full(50, 0.5), np.full(50, 0.5, np.float32), monkeypatch)
 
 
 @pytest.mark.parametrize("count", [4, 10])

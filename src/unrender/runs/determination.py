@@ -16,7 +16,7 @@ from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements, shown_elsewhere
 from unrender.runs.numbers import MOST_ELEMENTS
 from unrender.runs.result import Result
-from unrender.runs.verification import LOST, Misfit, compares, residuals_of_views
+from unrender.runs.verification import LOST, Misfit, compares, misfit, residuals_of_views
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
@@ -162,7 +162,8 @@ def no_better_maps(
 ) -> list[str]:
     """Return a line for each texture or grid with whose initial values the pictures are nearly as close to the references.
 
-    It is for those without a path gradient, of which nothing else tells whether the pictures determine them.
+    It is for those without a path gradient, of which nothing else tells whether the pictures determine them. Where pictures with the
+    initial values differ from the references by noise only, there is nothing to explain.
 
     Args:
         keys: keys of textures and grids.
@@ -170,14 +171,18 @@ def no_better_maps(
         pictures: function of values and a view that returns such pictures with the same random numbers.
     """
     lines = []
-    for key in keys if result.verification.get("best") == "end" and len(ends[0]) > 1 else ():
-        state, errors = {**result.parameters, key: result.initial[key]}, []
-        for images in ([pictures(state, view) for view in range(len(ends))], ends):
-            residuals, _, weights, _ = residuals_of_views(problem, range(len(ends)), images)
-            errors.append((residuals[0::2].mean(axis=0) * residuals[1::2].mean(axis=0)).sum(axis=1) * weights)
-        falls = errors[0] - errors[1]
-        noise = math.sqrt(float(np.square(falls - falls.mean()).sum()))
-        if not falls.sum() > max(_ERRORS * noise, _EXPLAINED * float(errors[0].sum())):
+    judged = compares(problem) and result.verification.get("best") == "end" and len(ends[0]) > 1
+    for key in keys if judged else ():
+        state, views = {**result.parameters, key: result.initial[key]}, range(len(ends))
+        of = [
+            residuals_of_views(problem, views, images) for images in ([pictures(state, view) for view in views], ends)
+        ]
+        first, last = ((x[0::2].mean(axis=0) * x[1::2].mean(axis=0)).sum(axis=1) * weights for x, _, weights, _ in of)
+        noise = math.sqrt(float(np.square(first - last - (first - last).mean()).sum()))
+        residuals, references, weights, sizes = of[0]
+        differs = misfit(residuals[0::2], residuals[1::2], references, weights, sizes, _LEAST)
+        total = 3.0 * float(weights.sum())
+        if differs and not float((first - last).sum()) > max(_ERRORS * noise, _EXPLAINED * total * differs.error**2):
             lines.append(
                 f"{key}: the final picture is hardly closer to the references than with its initial values: they hardly determine it, or "
                 "it needs more steps, or fewer elements"
