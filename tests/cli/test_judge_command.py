@@ -233,6 +233,9 @@ def test_mistakes_about_what_is_judged_are_one_line(unrender, run: Path, mitsuba
     assert "none.toml: no such file" in refused("judge", "result", "--held-out", "none.toml")
     (run.parent / "held-out.toml").write_text((run.parent / "held-out.toml").read_text().replace(KEY, "wall.other"))
     assert "wall.other" in refused("judge", "result")
+    (run.parent / "other.xml").write_text((run.parent / "wall.xml").read_text())
+    (run.parent / "held-out.toml").write_text((run.parent / "problem.toml").read_text() + 'scene = "other.xml"\n')
+    assert 'judge does not support views with their own "with" or "scene"' in refused("judge", "result")
     (run.parent / "held-out.toml").unlink()
     line = refused("judge", "result")
     assert "no held-out.toml at " in line

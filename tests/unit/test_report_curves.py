@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from report_folders import write_run
+from report_folders import KEY, write_run
 
 from unrender.app.report import curves
 from unrender.app.report.curves import Series
@@ -74,6 +76,17 @@ def test_the_loss_is_smoothed_over_its_window_only(tmp_path):
     assert smoothed is not None
     assert smoothed.seconds.tolist() == [1, 2, 3, 5]
     assert smoothed.values.tolist() == [1.0, 5.0, 5.5, 4.0]
+
+
+@pytest.mark.parametrize("status", ["finished", "running"])
+def test_the_error_at_the_end_is_that_of_the_result(tmp_path: Path, status: str) -> None:
+    """`compare` showed the error of the last step where the result holds other values. Files of a running run are of an earlier step."""
+    result = {KEY: np.full((4, 5, 3), 0.45)}
+    run = read(write_run(tmp_path / "run", parameters=result, status=status))
+    series = curves.parameter_error(run, KEY)
+    assert series is not None
+    np.testing.assert_allclose(series.values, [0.5, 0.4, 0.3, 0.2, 0.2 if status == "finished" else 0.1], rtol=1e-5)
+    np.testing.assert_array_equal(series.seconds, [0.0, 1.0, 2.0, 3.0, 4.0])
 
 
 def test_median_and_spread_over_runs():

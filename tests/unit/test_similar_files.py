@@ -9,6 +9,13 @@ import pytest
 from unrender.io.bounded_files import no_file
 
 
+def test_only_problem_files_are_proposed_for_one(tmp_path: Path) -> None:
+    """The scene room.xml was proposed for room.toml."""
+    (tmp_path / "room.xml").touch()
+    assert no_file(tmp_path / "room.toml") == "no such file"
+    assert no_file(tmp_path / "room.xm") == "no such file; did you mean room.xml?"
+
+
 @pytest.mark.parametrize(
     ("name", "near"), [("rom.png", "room.png"), ("room.exr", "room.png"), ("m.png", ""), ("cm.png", "cmp.png")]
 )

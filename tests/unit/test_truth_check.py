@@ -99,6 +99,21 @@ def test_the_standard_error_of_a_direction_is_an_angle(error: float, count: int)
     assert not count or "error 10°, 1° at the start" in found[0]
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_that_channels_share_is_no_walk(seed: int) -> None:
+    """Channels counted as independent, so grey noise had a limit that was too small by √3."""
+    plain, truth = made(), made().truth["x"]
+    renderer = plain.renderer
+    assert isinstance(renderer, AnalyticRenderer)
+    noise = 0.3 * np.random.default_rng(seed).normal(size=(SIDE, SIDE, 1))
+    reference = np.asarray(plain.views[0].reference) + noise
+    problem = ur.Problem(renderer, [ur.Parameter("x", initial=truth + START)], [ur.View(reference)], truth={"x": truth})
+    values = np.linalg.lstsq(renderer.matrix, reference.ravel(), rcond=None)[0].reshape(truth.shape)
+    values[CELLS // 2 :] = truth[CELLS // 2 :]
+    values += 0.4 * (values - truth)  # 1.4 standard errors
+    assert lines(problem, values, changed(problem, 0.01, 0.01)) == []
+
+
 def test_a_wrong_model_is_no_noise() -> None:
     """The residual at the truth is then the model's error, which neighbouring pixels share."""
     walked = np.random.default_rng(1).normal(0, 0.1, (CELLS, CELLS, 1))

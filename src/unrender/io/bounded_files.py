@@ -89,7 +89,7 @@ def no_file(path: Path) -> str:
         neighbours = [
             visible(entry.name)
             for entry in itertools.islice(path.parent.iterdir(), _MOST_NEIGHBOURS)
-            if entry.is_file()
+            if entry.is_file() and (path.suffix != ".toml" or entry.name.endswith(".toml"))
         ]
     except (OSError, ValueError):  # ValueError: a name with a zero byte
         neighbours = []

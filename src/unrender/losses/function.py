@@ -27,9 +27,10 @@ class FunctionLoss:
     `Problem` wraps any callable loss in this class. The function gets tensors (H, W, 3) of linear radiance. `prepare` determines the
     framework: it calls the function with Dr.Jit tensors and, if that fails or returns no Dr.Jit scalar, with PyTorch tensors.
 
-    It is treated as a loss of full images with a nonlinear derivative. Image noise may bias its gradient, pixel mini-batches do not
-    support it, and it gets the reference where a view's mask is 0. A file cannot describe a function, so a run with one is resumed by
-    `unrender.resume(..., problem=)`.
+    It is treated as a loss of full images with a nonlinear derivative. Image noise may bias its gradient, pixel mini-batches do not support
+    it, and it gets the reference where a view's mask is 0. Its minimum may differ from the references, so the end of a run is not compared
+    with them pixel by pixel, and there are no standard errors from pixels. A file cannot describe a function, so a run with one is resumed
+    by `unrender.resume(..., problem=)`.
 
     Args:
         function: function of the image, or of the image and the reference; arguments with defaults keep them. It must be pure: equal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -151,6 +152,16 @@ def curvature(
         for sums in (squares, noisy)
     )
     return Curvature(means, overlap, smooth, made, variances)
+
+
+def root_of_covariance(variance: np.ndarray | float, correlation: float) -> np.ndarray:
+    """Return a and b (..., 2) of the root a I + b 11ᵀ of the covariance of three channels, whose correlation is limited to [0, 1].
+
+    `variance` has the shape (..., 1).
+    """
+    correlation = min(max(correlation, 0.0), 1.0)
+    own, both = math.sqrt(1.0 - correlation), math.sqrt(1.0 + 2.0 * correlation)
+    return np.sqrt(variance) * np.array([own, (both - own) / 3.0])
 
 
 def shown_elsewhere(problem: Problem, sensitivity: np.ndarray | None, step: np.ndarray | float, least: float) -> bool:

@@ -22,11 +22,12 @@ from unrender.runs.image_sensitivity import (
     map_keys,
     mask_roots,
     neighbour_means,
+    root_of_covariance,
     transposed,
 )
 from unrender.runs.least_squares import check_numbers, checked_keys
 from unrender.runs.result import Result
-from unrender.runs.verification import compares, misfit_of_views
+from unrender.runs.verification import OF_FUNCTION, compares, misfit_of_views
 from unrender.scene.problem import Problem
 from unrender.scene.render import as_tree, render, selected_views
 
@@ -144,8 +145,8 @@ def _others(problem: Problem, tested: Sequence[str], explained: Collection[str])
         reason = "least squares test few numbers only"
         if infos[key].welded:
             reason = "the vertices of a mesh have none"
-        elif unknown.prior is not None:
-            reason = "it has a prior"
+        elif unknown.prior is not None or not compares(problem):
+            reason = "it has a prior" if compares(problem) else OF_FUNCTION
         elif key in tested:
             reason = "the test's pictures are not finite, or do not depend on the numbers"
         result.append(f"{key}: no standard error: {reason}")
@@ -182,7 +183,7 @@ def of_residuals(
     shapes = problem.shapes()
     reasons = {key: _refusal(infos[key], known, key) for key, shape in shapes.items() if len(shape) >= MAP_AXES}
     if not compares(problem):
-        reasons = dict.fromkeys(reasons, "the loss does not compare pictures with the references")
+        reasons = dict.fromkeys(reasons, OF_FUNCTION)
     keys = [key for key, reason in reasons.items() if not reason]
     if not keys:
         return Uncertainty(missing=no_maps(reasons))
@@ -373,9 +374,8 @@ def pixel_noise(problem: Problem, halves: Sequence[Sequence[np.ndarray]]) -> lis
         )
         near = counts > 0.5 / _NEARBY**2  # running sums round
         variances = np.where(near, np.maximum(sums / np.where(near, counts, 1.0), least), least)[..., None]
-        correlation = min(max(float(shared[seen].sum()) / max(float(products[seen].sum()), 1e-300), 0.0), 1.0)
-        own, both = math.sqrt(1.0 - correlation), math.sqrt(1.0 + 2.0 * correlation)
-        roots.append(np.sqrt(variances) * [own, (both - own) / 3.0])
+        correlation = float(shared[seen].sum()) / max(float(products[seen].sum()), 1e-300)
+        roots.append(root_of_covariance(variances, correlation))
     return roots
 
 

@@ -11,7 +11,7 @@ from unrender.core.errors import InputError
 from unrender.estimators.fresh_pictures import FreshPictures
 from unrender.optimizers.averaged_newton import AveragedNewton
 from unrender.optimizers.base import Optimizer
-from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, sensitivity
+from unrender.runs.image_sensitivity import MAP_AXES, Curvature, curvature, root_of_covariance, seen_cells
 from unrender.runs.verification import misfit
 from unrender.scene.problem import Problem
 
@@ -63,8 +63,8 @@ def further_from_truth(
     if not suspects:
         return []
     truth = {**last, **{key: value for key, value in problem.truth.items() if key in last}}
-    sensitivities = _sensitivities(problem, truth, seconds)
-    residual = _noise_of_pixels(pictures, truth) if sensitivities else math.nan
+    of = _curvature(problem, pictures, truth, seconds)
+    sensitivities = of.sensitivity()
     lines = []
     for key in suspects:
         measure, where, noise, words = problem.unknowns[key].measure, None, 0.0, ""
@@ -78,7 +78,7 @@ def further_from_truth(
                 words = " where the pictures show it"
             known = problem.truth[key]
             start, end = (measure.error(np.asarray(x[key]), known, where) or 0.0 for x in (first, last))
-            noise = max(noise, _noise(problem, key, sensitivity_of_key, where, residual))
+            noise = max(noise, _noise(problem, key, of, where))
         if start > 0.0 and math.hypot(ratio * start, _ERRORS * noise) < end:
             lines.append(
                 f"{key} ends further from the truth than it began{words}: error {measure.text(end)}, {measure.text(start)} at the "
@@ -87,35 +87,39 @@ def further_from_truth(
     return lines
 
 
-def _sensitivities(problem: Problem, values: Mapping[str, np.ndarray], seconds: float) -> dict[str, np.ndarray]:
+def _curvature(problem: Problem, pictures: FreshPictures, truth: Mapping[str, np.ndarray], seconds: float) -> Curvature:
+    """Return the curvature at the truth, with the noise of the pixels."""
     try:
-        return sensitivity(problem, values, _PROBES, seconds=_SECONDS_SHARE * seconds)
+        root = _noise_of_pixels(pictures, truth)
+        noise = [np.broadcast_to(root, (*size, 2)) for size in problem.sizes]
+        return curvature(problem, truth, _PROBES, seconds=_SECONDS_SHARE * seconds, noise=noise)
     except InputError:  # the renderer rejects the true values
-        return {}
+        return Curvature()
 
 
-def _noise_of_pixels(pictures: FreshPictures, truth: Mapping[str, np.ndarray]) -> float:
-    """Return the mean square of the noise of references and image: of the residual at the truth, without what neighbours share.
+def _noise_of_pixels(pictures: FreshPictures, truth: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return a and b (2,) of the root a I + b 11ᵀ of the channels' covariance, of the noise of references and image.
 
-    Neighbours share the difference of a wrong model, such as of exchanged references.
+    It is the residual at the truth without what neighbours share, such as the difference of a wrong model or of exchanged references.
     """
     images = pictures.images(truth)
     residuals, total = pictures.differences(images), pictures.residual(images)
-    of = residuals[0::2], residuals[1::2], pictures.references, pictures.weights, pictures.sizes
-    shared = misfit(*of, 0.0)
-    return total if shared is None else max(total - shared.error**2, 0.0)
+    shared = misfit(residuals[0::2], residuals[1::2], pictures.references, pictures.weights, pictures.sizes, 0.0)
+    variance = total if shared is None else max(total - shared.error**2, 0.0)
+    mean, used = np.nan_to_num(residuals.mean(axis=0), posinf=0.0, neginf=0.0), pictures.weights > 0
+    unshared = (mean[1::2] - mean[:-1:2])[used[1::2] & used[:-1:2]]
+    squares = float(np.square(unshared).sum())
+    products = 0.5 * (float(np.square(unshared.sum(axis=1)).sum()) - squares)
+    return root_of_covariance(variance, products / max(squares, 1e-300))
 
 
-def _noise(problem: Problem, key: str, sensitivity: np.ndarray, where: np.ndarray | None, residual: float) -> float:
+def _noise(problem: Problem, key: str, of: Curvature, where: np.ndarray | None) -> float:
     """Return the standard error of a parameter, in the unit of its error measure, from the noise of the pixels.
 
-    Few probes make single sensitivities uncertain, so all elements get the standard error of their mean square.
+    Few probes make single elements uncertain, so all get the standard error of their mean curvature.
     """
-    visible = sensitivity if where is None else sensitivity[where]
-    square = float(np.mean(np.square(visible, dtype=np.float64))) if visible.size else 0.0
-    if not (square > 0.0 and math.isfinite(residual)):
-        return 0.0
-    return _standard_error(problem, key, math.sqrt(residual / square), where)
+    square, noise = (float(np.mean(x[key] if where is None else x[key][where])) for x in (of.squares, of.noise))
+    return _standard_error(problem, key, math.sqrt(noise) / square, where) if square > 0.0 else 0.0
 
 
 def _standard_error(

@@ -27,6 +27,8 @@ STEPS, STEPS_OF_FEW, PRIOR, NOISE = "steps", "steps of few", "prior", "noise"
 that is too strong; noise of the references."""
 LOST = "lost"
 """Value of `Misfit.causes`: an unknown that the pictures show at the start, but no longer at the end."""
+OF_FUNCTION = "the loss is a function of your own, whose minimum may differ from the references"
+"""Reason for no standard errors with a `FunctionLoss`."""
 _OF_PRIOR = "a prior may be too strong, or "
 """Words about this cause."""
 _OF_MODEL = 0.25
@@ -224,8 +226,8 @@ def residuals_of_views(
 
 
 def compares(problem: Problem) -> bool:
-    """Return whether the loss compares pictures with the references, which a user's function of the picture alone does not."""
-    return not isinstance(problem.loss, FunctionLoss) or problem.loss.takes_reference
+    """Return whether pixels may tell if a run has converged. The minimum of a user's function may differ from the references."""
+    return not isinstance(problem.loss, FunctionLoss)
 
 
 def prior_cause(problem: Problem) -> tuple[str, tuple[str, ...]]:

@@ -38,7 +38,7 @@ def render(
         parameters: {key: array} of all parameters of the problem, possibly at a coarser resolution of the run; None for the initial ones.
         view: index of the view.
         spp: samples per pixel, >= 1.
-        seed: seed of the random numbers.
+        seed: seed of the random numbers, which differ between views.
         per_pass: most samples per pixel of a pass, >= 1. Passes of equal counts share one kernel. None for the most that memory allows.
 
     Returns:
@@ -56,7 +56,8 @@ def render(
     sensor = problem.views[view].sensor
     height, width = problem.renderer.resolutions()[sensor]
     per_pass = max(1, min(spp, _PATHS_PER_PASS // (height * width), per_pass or spp))
-    total, done, key = np.zeros((height, width, 3)), 0, Key(seed)
+    # Views of one seed are independent, so their noise averages out.
+    total, done, key = np.zeros((height, width, 3)), 0, Key(seed, view)
     while done < spp:
         take = min(per_pass, spp - done)
         request = view_request(problem, view, take, key.fold(done).uint32())

@@ -192,7 +192,7 @@ def _problem(
         other.origin["scene"], plain, other.original_views, max_depth=problem.max_depth, name=other.name, partial=True
     )
     if not isinstance(target.renderer, MitsubaRenderer):
-        raise InputError(f"{held_out}: it is not rendered by Mitsuba")
+        raise InputError(f'{held_out}: judge does not support views with their own "with" or "scene"; leave them out')
     target = reopen.with_meshes(target, run)
     values = {key: parameters[key] for key in shared}
     for key, shape in target.shapes().items():

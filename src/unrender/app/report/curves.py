@@ -120,7 +120,10 @@ class Band:
 
 
 def parameter_error(run: RunFolder, key: str) -> Series | None:
-    """Return the error of a parameter over the run; None if its truth is unknown."""
+    """Return the error of a parameter over the run; None if its truth is unknown.
+
+    It ends with the error of the result, which may hold other values than those of the last step.
+    """
     if key not in run.known:
         return None
     history = run.history
@@ -132,9 +135,13 @@ def parameter_error(run: RunFolder, key: str) -> Series | None:
     first, last = run.error_before.get(key), run.error_after.get(key)
     if first is not None:
         seconds, samples, values = np.r_[0.0, seconds], np.r_[0.0, samples], np.r_[first, values]
-    if last is not None and len(history) and (len(records) == 0 or records[-1] < len(history) - 1):
+    measured_last = len(records) > 0 and records[-1] == len(history) - 1
+    if last is not None and len(history) and not measured_last:
         seconds = np.r_[seconds, history.seconds[-1]]
         samples, values = np.r_[samples, history.samples[-1]], np.r_[values, last]
+    # Files of a running one are of an earlier step; float32 values round the error.
+    elif last is not None and run.record.status != "running" and not np.isclose(values[-1], last, rtol=1e-5, atol=0.0):
+        values = np.r_[values[:-1], last]
     return Series(seconds, samples, values) if len(values) else None
 
 
