@@ -196,6 +196,22 @@ def test_the_alpha_of_an_image_is_its_mask():
     made = problem(views=[View(REFERENCE, mask=mask), View(REFERENCE, mask=mask / np.float32(255))])
     for view in made.views:
         np.testing.assert_allclose(np.asarray(view.mask), mask[..., 3] / 255)
+    assert made.notices == [f"view {n}: mask is the alpha of the image" for n in range(2)]
+
+
+def test_a_constant_alpha_is_no_mask():
+    """It replaced the mask in the colours, so that all pixels counted. An alpha of 0 everywhere is still refused."""
+    seen = np.arange(WIDTH) % 2
+    mask = np.full((HEIGHT, WIDTH, 4), 254, np.uint8)
+    mask[..., :3] = 255 * seen[:, None]
+    halved = np.where(mask == 254, np.float32(0.5), mask / np.float32(255))
+    made = problem(views=[View(REFERENCE, mask=mask), View(REFERENCE, mask=halved)])
+    for view in made.views:
+        np.testing.assert_array_equal(np.asarray(view.mask), np.broadcast_to(seen, (HEIGHT, WIDTH)))
+    assert made.notices == []
+    mask[..., 3] = 0
+    with pytest.raises(InputError, match="it is 0 everywhere"):
+        problem(views=[View(REFERENCE, mask=mask)])
 
 
 def test_a_reference_with_saturated_pixels_says_so():

@@ -23,7 +23,7 @@ class View:
             store premultiplied colours.
         sensor: index of the scene's sensor.
         weight: factor of this view's loss, > 0.
-        mask: file or array (H, W), in [0, 1], the factor of each pixel's loss; None for ones. Of an image with alpha below 1, its alpha.
+        mask: file or array (H, W), in [0, 1], the factor of each pixel's loss; None for ones. Of an image whose alpha varies, its alpha.
         known: {key: value} of parameters that have this value in this view alone, such as lamps that are off, or the pose of an object on
             a turntable. Values as for `Parameter.initial`. An unknown among them does not act on this view. None for the problem's scene
             as it is.

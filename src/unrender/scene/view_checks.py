@@ -42,7 +42,7 @@ _DARKEST = -1e-4
 """Ratio to the largest value above which negative values count as rounding error."""
 
 _MOST_COLOUR = 0.05
-"""Largest difference of a mask's channels, which compression may leave."""
+"""Largest difference of a mask's channels, which compression may leave; also the largest relative one of an alpha that is no mask."""
 
 _DIMMEST = 1 / 254
 """Largest value of a mask that is taken for an integer 1 of 8 bits."""
@@ -126,8 +126,7 @@ def _of_aov(source: Any, name: str) -> Reference:
     images.check_metadata(source)
     values, notices = image.values, []
     if name == "mask" and image.notice:
-        values = _unscaled(source)
-        notices += ["is the alpha of the file"] if image.alpha is not None else []
+        values, notices = _unscaled(source)
     elif name == "albedo":
         notices += [image.notice] if image.notice else []
     elif image.notice:
@@ -252,7 +251,8 @@ def _check_view(
     mask = view.mask
     if view.mask is not None and not isinstance(view.mask, StoredPicture):
         try:
-            mask = _read_mask(view.mask, height, width)
+            mask, notes = _read_mask(view.mask, height, width)
+            notices += [f"{owner}: mask {notice}" for notice in notes]
         except InputError as error:
             raise wrong("mask", error) from error
     if alpha is not None:
@@ -268,9 +268,12 @@ def _check_view(
     return replace(view, reference=reference, mask=mask, weight=float(view.weight)), notices, loses_alpha
 
 
-def _read_mask(source: Any, height: int, width: int) -> np.ndarray:
-    """Return a mask (H, W) from a file or an array. Raises `InputError` for colours, and values outside [0, 1] or 0 everywhere."""
-    mask = _unscaled(source)
+def _read_mask(source: Any, height: int, width: int) -> tuple[np.ndarray, list[str]]:
+    """Return a mask (H, W) from a file or an array, and notices.
+
+    Raises `InputError` for colours, and values outside [0, 1] or 0 everywhere.
+    """
+    mask, notices = _unscaled(source)
     images.check_metadata(source)
     _check_size(mask, height, width, source)
     if np.ptp(mask, axis=2).max(initial=0.0) > _MOST_COLOUR:
@@ -280,20 +283,22 @@ def _read_mask(source: Any, height: int, width: int) -> np.ndarray:
         raise InputError(f"expected values from 0 to 1, got {mask.min():g} to {mask.max():g}")
     if not mask.any():
         raise InputError("it is 0 everywhere, so no pixel would count")
-    return mask
+    return mask, notices
 
 
-def _unscaled(source: Any) -> np.ndarray:
-    """Return the values of a mask, (H, W, C): its alpha if that is not 1 everywhere.
+def _unscaled(source: Any) -> tuple[np.ndarray, list[str]]:
+    """Return the values of a mask, (H, W, C), and notices. The values are the image's alpha, unless that is nearly constant above 0.
 
     Raises `InputError` for ones in 8 or 16 bits, which are 1/255 or 1/65535.
     """
     image = images.read(source, linearise=False, alpha=True)
-    values = image.values if image.alpha is None else image.alpha[..., None]
+    values, notices = image.values, list[str]()
+    if image.alpha is not None and not image.alpha.min() > (1 - _MOST_COLOUR) * image.alpha.max():
+        values, notices = image.alpha[..., None], ["is the alpha of the image"]
     if 0 < values.max() <= _DIMMEST:
         largest = "expected 1 where a pixel counts, which is 255 in 8 bits and 65535 in 16 bits; or booleans"
         raise InputError(f"its largest value is {values.max():.2g}: {largest}")
-    return values
+    return values, notices
 
 
 def _saturated(reference: np.ndarray, counted: np.ndarray | None) -> float:
