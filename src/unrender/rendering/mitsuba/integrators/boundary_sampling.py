@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from unrender.rendering.mitsuba.edges import EdgePoints
+from unrender.rendering.mitsuba.integrators.emitters import has_sun, inside_sun
 from unrender.rendering.mitsuba.samplers import RepeatingSampler
 
 _AREA, _POINT, _DISTANT = 0, 1, 2
@@ -183,7 +184,11 @@ def _emitter_points(emitter: Any, seed: int, count: int, time: Any) -> tuple[Any
     )
     density = dr.select(ds.delta, 1, ds.pdf) + zero
     kind = mi.UInt32(zero) + (_DISTANT if distant else _POINT)
-    direction, uv = mi.Vector3f(*spread(ds.d)), mi.Point2f(*spread(ds.uv))
+    towards = ds.d
+    if has_sun([emitter]):
+        density = emitter.pdf_direction(it, ds)
+        towards, _ = inside_sun(ds, sample, density, lambda other, lanes: emitter.sample_direction(it, other, lanes)[0])
+    direction, uv = mi.Vector3f(*spread(towards)), mi.Point2f(*spread(ds.uv))
     return mi.Point3f(*spread(ds.p)), mi.Normal3f(zero), direction, uv, density, kind, pointer
 
 

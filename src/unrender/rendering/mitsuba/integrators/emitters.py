@@ -8,7 +8,7 @@ sampling that change are therefore tables, and the scene's own weights do not ch
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -26,6 +26,7 @@ from unrender.rendering.mitsuba.integrators.base import (
     UInt32,
     registry_id,
 )
+from unrender.rendering.mitsuba.scene_graph import class_name
 from unrender.rendering.renderer import EmitterMoments
 
 
@@ -100,9 +101,13 @@ def mis_weight(pdf_a: Float, pdf_b: Float) -> Float:
 
 
 def _sample_direction(context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool) -> Any:
-    """Sample a point on an emitter without a visibility test, with the probabilities in `tables` or else the scene's own."""
+    """Sample a point on an emitter without a visibility test, with the probabilities in `tables` or else the scene's own.
+
+    Returns:
+        the direction sample, and its radiance over its density.
+    """
     if "emitter_cdf" not in context.tables:
-        return context.scene.sample_emitter_direction(vertex, sample, False, active)[0]
+        return context.scene.sample_emitter_direction(vertex, sample, False, active)
     cdf, count = context.tables["emitter_cdf"], len(context.scene.emitters())
     index = dr.binary_search(0, count - 1, lambda i: dr.gather(mi.Float, cdf, i + 1, active) <= sample.x)
     first = dr.gather(mi.Float, cdf, index, active)
@@ -110,9 +115,9 @@ def _sample_direction(context: PathContext, vertex: mi.Interaction3f, sample: mi
     pointer = dr.gather(mi.UInt32, context.tables["emitter_ids"], index, active)
     emitter: Any = dr.reinterpret_array(mi.EmitterPtr, pointer)
     reused = dr.clip((sample.x - first) / pmf, 0, dr.one_minus_epsilon(mi.Float))
-    ds, _ = emitter.sample_direction(vertex, mi.Point2f(reused, sample.y), active & (pmf > 0))
+    ds, weight = emitter.sample_direction(vertex, mi.Point2f(reused, sample.y), active & (pmf > 0))
     ds.pdf *= pmf
-    return ds
+    return ds, weight / pmf
 
 
 def _pdf_direction(context: PathContext, vertex: mi.Interaction3f, ds: mi.DirectionSample3f, active: Bool) -> Float:
@@ -122,6 +127,34 @@ def _pdf_direction(context: PathContext, vertex: mi.Interaction3f, ds: mi.Direct
     emitter: Any = ds.emitter
     pmf = dr.gather(mi.Float, context.tables["emitter_pmf"], registry_id(emitter), active)
     return emitter.pdf_direction(vertex, ds, active) * pmf
+
+
+_SUNS = {"SunskyEmitter", "TimedSunskyEmitter"}
+
+
+def has_sun(emitters: Iterable[mi.Emitter]) -> bool:
+    """Return whether one of the emitters has a sun."""
+    return any(class_name(emitter) in _SUNS for emitter in emitters)
+
+
+def inside_sun(
+    ds: Any, sample: mi.Point2f, density: Float, draw: Callable[[mi.Point2f, Bool], Any]
+) -> tuple[mi.Vector3f, Bool]:
+    """Return the directions of a sample, with those at the edge of the sun moved inside it, and the lanes of these.
+
+    In single precision the cosine of the sun's angular radius differs from 1 by 180 roundings only. Mitsuba therefore draws 0.4 % of the
+    sun's directions so close to its edge that `eval_direction` and `pdf_direction` take them for directions beside the sun.
+
+    Args:
+        ds: direction sample of the random numbers `sample`.
+        density: value of `pdf_direction` for `ds`.
+        draw: function that returns the direction sample of other random numbers, in some lanes.
+    """
+    edge = ~ds.delta & mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite) & (density < 0.5 * ds.pdf)
+    # These random numbers draw another point of the same disk. A chord of the disk lies inside it.
+    apart = dr.select(sample.y < 0.5, sample.y + 0.5, sample.y - 0.5)
+    other = draw(mi.Point2f(sample.x, apart), edge)
+    return dr.select(edge, dr.normalize(ds.d + other.d), ds.d), edge
 
 
 def met_emitter(
@@ -172,8 +205,25 @@ class EmitterConnection:
         self, context: PathContext, vertex: mi.Interaction3f, sample: mi.Point2f, active: Bool, turning: bool = False
     ):
         self._context, self._vertex, self._turning = context, vertex, turning and not context.primal
-        self.ds = _sample_direction(context, vertex, sample, active)
+        self.ds, weight = _sample_direction(context, vertex, sample, active)
         self.active = active & (self.ds.pdf > 0)  # also false for NaN
+        self._seen, self._factor = self.ds, None
+        if has_sun(context.scene.emitters()):
+            self._look_inside_sun(sample, weight)
+
+    def _look_inside_sun(self, sample: mi.Point2f, weight: Spectrum) -> None:
+        """Take the radiance at the edge of the sun from inside, for all states, times a factor for the sampled radiance of the current
+        state."""
+        context, vertex, ds = self._context, self._vertex, self.ds
+        self._seen = dr.copy(ds)
+        density = _pdf_direction(context, vertex, ds, self.active)
+        self._seen.d, edge = inside_sun(
+            ds, sample, density, lambda other, lanes: _sample_direction(context, vertex, other, lanes)[0]
+        )
+        edge &= self.active
+        radiance = ds.emitter.eval_direction(vertex, self._seen, edge)
+        factor = dr.clip(weight * ds.pdf / radiance, 0, 2)
+        self._factor = dr.select(edge & (radiance != 0), factor, 1)
 
     @property
     def emitter(self) -> UInt32:
@@ -184,6 +234,12 @@ class EmitterConnection:
         """Return the MIS weight over the density. For the arguments, see `contributions`."""
         mis = dr.select(self.ds.delta, 1, mis_weight(self.ds.pdf, pdf))
         return dr.select(self.active, mis * dr.rcp(self.ds.pdf), 0)
+
+    def radiance(self, emitter: mi.EmitterPtr, active: Bool) -> Spectrum:
+        """Return the radiance of a state's emitter at the vertex. Attached if the caller resumes gradients."""
+        radiance = emitter.eval_direction(self._vertex, self._seen, active)
+        radiance = self._turned(emitter, radiance) if self._turning else radiance
+        return radiance if self._factor is None else radiance * self._factor
 
     def contributions(self, β: Sequence[Spectrum], values: Sequence[Spectrum], pdf: Float) -> list[Spectrum]:
         """Return Ld of each state: throughput, scattering, emitted radiance and MIS weight. Attached if the caller resumes gradients.
@@ -198,9 +254,7 @@ class EmitterConnection:
         mis = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
         result = []
         for throughput, value, emitter in zip(β, values, self._context.states.emitters(ds.emitter), strict=True):
-            radiance = emitter.eval_direction(self._vertex, ds, self.active)
-            if self._turning:
-                radiance = self._turned(emitter, radiance)
+            radiance = self.radiance(emitter, self.active)
             result.append(dr.select(self.active, throughput * mis * value * (radiance * inv_pdf), 0))
         return result
 
@@ -209,6 +263,6 @@ class EmitterConnection:
         looks it up at the texture coordinates of the sample, which have none."""
         distant = self.active & ~self.ds.delta & mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
         beyond = dr.zeros(mi.SurfaceInteraction3f, dr.width(self.ds))
-        beyond.wi, beyond.wavelengths = -self.ds.d, self._vertex.wavelengths
+        beyond.wi, beyond.wavelengths = -self._seen.d, self._vertex.wavelengths
         there = emitter.eval(beyond, distant)
         return dr.select(distant, dr.replace_grad(radiance, there), radiance)

@@ -345,7 +345,7 @@ class TracePass(Pass):
         f, pdf = bsdf.eval_pdf(context.bsdf_ctx, si, si.to_local(ds.d), connection.active)
         number = self._number(context.tables, "cached_emitter", ds.emitter, connection.active)
         front = (number > self.lookups.areas) | (dr.dot(ds.d, ds.n) < 0)
-        known = ds.emitter.eval_direction(si, ds, connection.active & (number == 0))
+        known = connection.radiance(ds.emitter, connection.active & (number == 0))
         # The BSDF value of a diffuse surface is t · pdf, with the reflectance t.
         light = path.W * connection.weight(pdf) * dr.select(surface == 0, f, pdf)
         light *= dr.select(number == 0, known, dr.select(front, 1, 0))
