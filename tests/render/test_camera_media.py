@@ -214,3 +214,21 @@ def test_gradient_by_extinction_where_one_channel_leaves_fog_without_a_border():
     found = np.array(session.adjoint(values, paths, weights)[key])
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found[:2], (-d * np.exp(-σ * d) * SIZE * SIZE / 2)[:2], rtol=0.03)
+
+
+def test_in_scattering_in_a_channel_without_extinction_is_differentiated_beyond_all_shapes():
+    """Light of one lamp, scattered once, beside the lamp: the image rises with the extinction from 0, at points beyond the lamp too."""
+    key = "eye.medium.sigma_t.value.value"
+    place = mi.ScalarTransform4f().translate([2, 0, 3])
+    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+    lamp = {"type": "sphere", "radius": 0.3, "to_world": place, "emitter": {"type": "area"}}
+    fog = {"type": "homogeneous", "albedo": 1.0, "sigma_t": {"type": "rgb", "value": [0.5, 0.2, 0]}}
+    eye = {"type": "perspective", "fov": 5, "film": film, "medium": fog}
+    renderer = MitsubaRenderer({"type": "scene", "lamp": lamp, "eye": eye}, 2, [key])
+    session, values = renderer.prepare([key], None), renderer.values([key])
+    weights = renderer.array(np.ones((1, SIZE, SIZE, 3), np.float32))
+    paths = session.image(values, SampleRequest(0, 4096, 1)).paths
+    found = np.array(session.adjoint(values, paths, weights)[key])[2]
+    # The lamp of radius r is a point of intensity π r² at 2 from the axis: ∫₀^∞ π r² / (4π (4 + (t - 3)²)) dt per pixel.
+    expected = 0.3**2 / 4 * (np.pi / 2 + np.arctan(1.5)) / 2 * SIZE * SIZE
+    assert found == pytest.approx(expected, rel=0.05)

@@ -18,7 +18,7 @@ import pytest
 from fog import DARK, DEPTH, KIND, LEVELS, SIZE, cloud, fog, media_keys, scene, two_media, voxels
 from scipy import stats
 
-from unrender.rendering.mitsuba.integrators import tracking
+from unrender.rendering.mitsuba.integrators import differential_tracking
 from unrender.rendering.mitsuba.renderer import MitsubaRenderer
 from unrender.rendering.renderer import SampleRequest
 
@@ -138,7 +138,7 @@ def test_gradients_of_voxels_agree_with_finite_differences() -> None:
 @pytest.mark.slow
 def test_without_differential_ratio_tracking_black_and_empty_voxels_are_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     """So the test above can fail: collisions alone find no derivative where nothing collides or scatters."""
-    monkeypatch.setattr(tracking, "mis_constant", lambda near, far: near * 0)
+    monkeypatch.setattr(differential_tracking, "mis_density", lambda segment, t: segment.near * 0)
     renderer = MitsubaRenderer(scene(voxels(), lights="sky"), 2)
     found = scores(renderer, own(renderer), 16)
     wrong = {name for name, z in found.items() if abs(z) > limit(len(found))}

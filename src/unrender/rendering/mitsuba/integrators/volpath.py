@@ -13,7 +13,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from unrender.rendering.mitsuba.integrators import emitters, specular, tracking
+from unrender.rendering.mitsuba.integrators import differential_tracking, emitters, specular, tracking
 from unrender.rendering.mitsuba.integrators.base import (
     KEEP,
     Bool,
@@ -27,7 +27,8 @@ from unrender.rendering.mitsuba.integrators.base import (
     relative,
     while_loop,
 )
-from unrender.rendering.mitsuba.integrators.tracking import MediumSegment, Reservoir
+from unrender.rendering.mitsuba.integrators.differential_tracking import Reservoir
+from unrender.rendering.mitsuba.integrators.tracking import MediumSegment
 from unrender.rendering.mitsuba.integrators.volume_path import (
     ConnectionSample,
     Flight,
@@ -188,14 +189,17 @@ class VolumePair:
         media = context.states.media(medium)
         inside = path.active & (medium != None)  # noqa: E711 (a comparison per lane)
         near, far = tracking.clip_segment(medium, ray, si.t, inside)
-        segment = MediumSegment(tables, media, ray, near, far, inside, self.radiance_field)
+        size = differential_tracking.distance_scale(context.scene)
+        segment = MediumSegment(tables, media, ray, near, far, inside, self.radiance_field, size)
         may_scatter = path.active & (path.depth + 1 < self.max_depth)
         emits = mi.Bool(False)
         if self.emission:
             emits = dr.gather(mi.UInt32, tables["emits"], registry_id(medium), inside) != 0
         if follow_media:
             offers = inside & (may_scatter | emits)
-            path.reservoir = tracking.update_reservoir(path.reservoir, segment, path.depth, path.β, noise, offers)
+            path.reservoir = differential_tracking.update_reservoir(
+                path.reservoir, segment, path.depth, path.β, noise, offers
+            )
         flies = inside & ~path.forced
         t, collides, path.β = tracking.sample_free_flight(segment, path.β, sampler, flies)
         if start.t is not None:
@@ -204,13 +208,11 @@ class VolumePair:
             path.forced &= False
         derivatives = ()
         if follow_media:
-            changes = tracking.relative_derivatives(segment, t, collides, noise, inside)
+            changes = differential_tracking.relative_derivatives(segment, t, collides, noise, inside)
             with dr.resume_grad():
+                # Without throughput, L is a rounding error that long segments enlarge.
                 derivatives = [
-                    dr.select(
-                        β > 0, L * change, 0
-                    )  # Without throughput, L is a rounding error that long segments enlarge.
-                    for β, L, change in zip(path.β, path.L, changes, strict=True)
+                    dr.select(β > 0, L * change, 0) for β, L, change in zip(path.β, path.L, changes, strict=True)
                 ]
         return Flight(segment, t, collides, emits, may_scatter, derivatives)
 

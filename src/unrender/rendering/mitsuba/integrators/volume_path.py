@@ -19,7 +19,8 @@ from unrender.rendering.mitsuba.integrators.base import (
     UInt32,
     carries_light,
 )
-from unrender.rendering.mitsuba.integrators.tracking import MediumSegment, Reservoir
+from unrender.rendering.mitsuba.integrators.differential_tracking import Reservoir
+from unrender.rendering.mitsuba.integrators.tracking import MediumSegment
 
 
 class PathStart:
