@@ -8,9 +8,9 @@ import pytest
 import unrender as ur
 from tests.analytic import AnalyticRenderer
 from unrender.core.errors import InputError
-from unrender.estimators import coordinates
 from unrender.preconditioners import LargeSteps, Sobolev
 from unrender.runs import loop
+from unrender.runs.noise import GradientNoise
 
 
 def data(shape: tuple[int, ...]) -> np.ndarray:
@@ -53,8 +53,7 @@ def test_refuses_what_is_no_texture():
 def test_texels_beside_saturated_ones_are_not_led_astray(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A square of 1.6 where 1 is the bound. The planted fault spreads its gradient over its neighbours."""
     if not known:
-        for module in (coordinates, loop):
-            monkeypatch.setattr(module, "free_of_bounds", lambda *_: {})
+        monkeypatch.setattr(loop, "free_of_bounds", lambda *_: {})
     wanted = np.full((12, 12, 1), 0.5)
     wanted[3:7, 3:7] = 1.6
     renderer = AnalyticRenderer({"map": wanted}, np.repeat(np.eye(144), 3, axis=0), noise=0.0, shape=(12, 12))
@@ -63,3 +62,22 @@ def test_texels_beside_saturated_ones_are_not_led_astray(known: bool, monkeypatc
     result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(0.02), steps=150)
     error = float(np.abs(result.parameters["map"] - np.minimum(wanted, 1.0)).max())
     assert error < 0.03 if known else error > 0.2
+
+
+def test_noise_does_not_move_texels_from_their_bounds() -> None:
+    """Where the minimum is at the bound: if the present gradient held elements, only its inward noise would pass."""
+    wanted = np.ones((12, 12, 1))
+    renderer = AnalyticRenderer({"map": wanted}, np.repeat(np.eye(144), 3, axis=0), grain=1.0, shape=(12, 12))
+    unknown = ur.Parameter("map", 0.9, (0, 1), preconditioner=Sobolev(20.0))
+    problem = ur.Problem(renderer, [unknown], [ur.View(renderer.exact({"map": wanted}))])
+    result = ur.optimize(problem, ur.PathGradient(spp=2), ur.optimizers.Adam(0.02), steps=200)
+    assert 1.0 - float(result.parameters["map"].mean()) < 0.002
+
+
+def test_the_mean_gradient_that_decides_is_full_whether_or_not_a_variance_is_known() -> None:
+    gradient = {"map": np.ones((1200, 1000), np.float32), "x": np.ones(2, np.float32)}
+    for variance in (None, gradient):
+        noise = GradientNoise()
+        noise.update(gradient, variance, ("map",))
+        assert noise.mean is not None
+        np.testing.assert_allclose(noise.mean["map"], np.full((1200, 1000), 0.1), rtol=1e-6)

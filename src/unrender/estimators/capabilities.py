@@ -153,6 +153,11 @@ class Smoothing(Capability):
     sigma: Mapping[str, float | np.ndarray]
 
 
+_TURNING = 64
+"""Number of first steps in which no element is held at a bound: the mean of some ten gradients lags behind those of a texture beside a lamp
+of unknown brightness."""
+
+
 @dataclass(frozen=True)
 class AtBounds(Capability):
     """Elements at a bound, which the loop adds for the optimizer.
@@ -164,6 +169,19 @@ class AtBounds(Capability):
 
     name: ClassVar[str] = "at_bounds"
     sides: Callable[[], Tree]
+
+    def held(self, mean: Tree, made: int) -> Tree:
+        """Return {key: mask of the elements at a bound beyond which the loss falls}, from the mean of earlier gradients.
+
+        Smoothing would spread the gradient of these elements, which cannot move, over their neighbours. The present gradient does not
+        decide, because its noise would then no longer have mean 0. In the first 64 steps gradients may turn faster than their mean.
+
+        Args:
+            mean: {key: mean of earlier gradients}.
+            made: number of steps before this one.
+        """
+        sides = {} if made < _TURNING else self.sides()
+        return {key: sides[key] * x < 0.0 for key, x in mean.items() if key in sides}
 
 
 @dataclass(frozen=True)

@@ -32,17 +32,17 @@ from unrender.preconditioners.base import Preconditioner
 from unrender.scene.problem import Problem
 
 
-def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Estimate:
+def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree, free: Tree | None = None) -> Estimate:
     """Return the estimate with respect to v, where x = φ(u) and u = S v (`problem.coordinates`); itself if it already is.
 
     J is the diagonal matrix of φ'. Gradients become S J g, variances J² Var (a variance per element cannot be mapped by S). Second
     derivatives are exact, J H J + diag(g φ''), and the loss becomes a function of u. The σ of smoothed derivatives refers to x and is
-    converted for each element of u, see `_width`. `AtBounds` is added.
+    converted for each element of u, see `_width`. `AtBounds` is added. `free`: see `Coordinates.moved`.
     """
     if estimate.preconditioned:  # by an estimator with a state in these coordinates
         return _bounded(estimate, problem, parameters)
     coordinates = problem.coordinates
-    slopes, free = coordinates.slopes(parameters), free_of_bounds(estimate, problem, parameters)
+    slopes = coordinates.slopes(parameters)
 
     def converted(capability: Capability) -> Capability:
         if isinstance(capability, BlockEstimate):
@@ -57,20 +57,22 @@ def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree) -> Es
     return _bounded(mapped, problem, parameters)
 
 
-def free_of_bounds(estimate: Estimate, problem: Problem, parameters: Tree) -> Tree:
+def bounded_with_preconditioner(problem: Problem) -> tuple[str, ...]:
+    """Return the parameters with bounds and a preconditioner S, but without φ."""
+    smooth, bent = problem.coordinates.preconditioners, problem.coordinates.transforms
+    return tuple(key for key in smooth if key not in bent and problem.unknowns[key].bounds != (None, None))
+
+
+def free_of_bounds(problem: Problem, parameters: Tree, mean: Tree, made: int) -> Tree:
     """Return {key: 0 for elements at a bound beyond which the loss falls, 1 for the others} of parameters with a preconditioner S.
 
-    S would spread the gradient of elements that cannot move over their neighbours. It is {} if the estimate is with respect to v already.
+    S would spread the gradient of elements that cannot move over their neighbours. `mean`, `made`: see `AtBounds.held`.
     """
-    smooth, bent = problem.coordinates.preconditioners, problem.coordinates.transforms
-    bounded = {k: problem.unknowns[k] for k in smooth if k not in bent and problem.unknowns[k].bounds != (None, None)}
-    if estimate.preconditioned or not bounded:
-        return {}
-    sides = {key: unknown.sides(parameters[key]) for key, unknown in bounded.items()}
-    repeated = problem.coordinates.repeated  # columns without a gradient of their own
-    gradient = {key: periodic.repeat(estimate.gradient[key], repeated.get(key, 0)) for key in sides}
-    held = {key: side * gradient[key] < 0.0 for key, side in sides.items()}
-    return {key: arrays.where(held[key], 0.0 * side, 0.0 * side + 1.0) for key, side in sides.items()}
+    keys, repeated = bounded_with_preconditioner(problem), problem.coordinates.repeated
+    means = {k: periodic.repeat(mean[k], repeated.get(k, 0)) for k in keys if k in mean}  # columns without a gradient
+    at = AtBounds(lambda: {key: problem.unknowns[key].sides(parameters[key]) for key in keys})
+    ones = {key: arrays.zeros_like(parameters[key]) + 1.0 for key in keys}
+    return {key: arrays.where(held, 0.0 * ones[key], ones[key]) for key, held in at.held(means, made).items()}
 
 
 def restricted(problem: Problem, keys: Sequence[str]) -> Problem:

@@ -15,17 +15,16 @@ from unrender.core.random import WARM_UP, Key, check_seed
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
 from unrender.estimators.capabilities import Capabilities, LossFunction
-from unrender.estimators.coordinates import by_coordinates, free_of_bounds
+from unrender.estimators.coordinates import bounded_with_preconditioner, by_coordinates, free_of_bounds
 from unrender.estimators.gauss_newton import GaussNewton
 from unrender.estimators.penalties import penalized
 from unrender.methods.plan import Plan
-from unrender.optimizers.base import Measuring, Optimizer
+from unrender.optimizers.base import Measuring
 from unrender.runs.callbacks import COMPILING
 from unrender.runs.noise import GradientNoise
 from unrender.runs.result import Result
 from unrender.runs.run import Run, RunState, interruptible
 from unrender.runs.watches import remarks
-from unrender.scene.problem import Problem
 from unrender.scene.surfaces import guarded
 
 _ERRORS_PER_SECOND = 10.0
@@ -117,11 +116,11 @@ def warm_up(run: Run) -> tuple[float, dict[str, Any]]:
         )
         estimate = penalized(estimate, run.problem, run.parameters)
         memory.trim_cache(run.parameters)
-        update = _apply(run.problem, estimate, state.optimizer, run.optimizer, run.parameters)
+        update = _apply(run, estimate)
         run.parameters, state.optimizer = update.parameters, update.state
         del update
         memory.evaluate_in_turn(state.optimizer)
-        state.noise.update(estimate.gradient, estimate.variance)
+        _gradient_noise(run, estimate)
     return time.perf_counter() - started, run.snapshot()
 
 
@@ -139,7 +138,7 @@ def _step(run: Run) -> dict[str, Any]:
     memory.trim_cache(run.parameters)
     culprit = _not_finite(estimate)
     if not culprit:
-        update = _apply(problem, estimate, state.optimizer, run.optimizer, run.parameters)
+        update = _apply(run, estimate)
         culprit = update.not_finite
         if not culprit:
             _warn_of_shortened(run, update.shortened)
@@ -163,13 +162,19 @@ def _step(run: Run) -> dict[str, Any]:
         "seconds": run.clock,
         "loss": estimate.loss,
         "samples": state.samples,
-        "gradient_noise": state.noise.update(estimate.gradient, estimate.variance) if finite else None,
+        "gradient_noise": _gradient_noise(run, estimate) if finite else None,
     }
     if problem.has_truth and (run.stopped or run.clock >= state.next_error):
         measured = time.perf_counter()
         record["parameter_error"] = problem.parameter_error(run.parameters)
         state.next_error = run.clock + max(1 / _ERRORS_PER_SECOND, _ERROR_PAUSE * (time.perf_counter() - measured))
     return record
+
+
+def _gradient_noise(run: Run, estimate: Estimate) -> float | None:
+    """Add a gradient to the statistics, and return its fraction of noise. `_apply` uses the mean of gradients with respect to x."""
+    whole = () if estimate.preconditioned else bounded_with_preconditioner(run.problem)
+    return run.state.noise.update(estimate.gradient, estimate.variance, whole)
 
 
 def _not_finite(estimate: Estimate) -> str:
@@ -210,12 +215,14 @@ class _Update:
     shortened: tuple[str, ...] = ()
 
 
-def _apply(problem: Problem, estimate: Estimate, state: Any, optimizer: Optimizer, parameters: Tree) -> _Update:
+def _apply(run: Run, estimate: Estimate) -> _Update:
     """Transform, update, transform back, and bound: the optimizer uses the problem's `coordinates`; bounds apply to the parameters."""
-    coordinates = problem.coordinates
-    mapped = by_coordinates(estimate, problem, parameters)
-    steps, state = optimizer.update(mapped, state, coordinates.of(parameters))
-    moved, reached = coordinates.moved(parameters, steps, free_of_bounds(estimate, problem, parameters))
+    problem, parameters, state = run.problem, run.parameters, run.state.optimizer
+    coordinates, mean = problem.coordinates, run.state.noise.mean
+    free = {} if estimate.preconditioned or mean is None else free_of_bounds(problem, parameters, mean, run.step)
+    mapped = by_coordinates(estimate, problem, parameters, free)
+    steps, state = run.optimizer.update(mapped, state, coordinates.of(parameters))
+    moved, reached = coordinates.moved(parameters, steps, free)
     bounded = {k: problem.unknowns[k].reached(x) for k, x in reached.items()}
     # Checked before projection, because the projection of a NaN may be a bound.
     finite = trees.map(arrays.is_finite, moved)

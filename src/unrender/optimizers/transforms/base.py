@@ -12,7 +12,7 @@ from unrender.core.arrays import Array
 from unrender.core.errors import InputError
 from unrender.core.trees import Tree
 from unrender.estimators.base import Estimate
-from unrender.estimators.capabilities import AtBounds, Capability
+from unrender.estimators.capabilities import Capability
 from unrender.preconditioners.base import Preconditioner
 from unrender.scene.upsampling import SQUARES, Upsampler
 
@@ -154,22 +154,6 @@ class TransformState:
         """Interpolate the fields, and scale them by their metadata."""
         powers = {each.name: each.metadata["power"] for each in fields(self) if "power" in each.metadata}
         return replace(self, **{name: upsampler.tree(getattr(self, name), power) for name, power in powers.items()})
-
-
-_TURNING = 64
-"""Number of first steps in which no element is held at a bound: the mean of some ten gradients lags behind those of a texture beside a lamp
-of unknown brightness."""
-
-
-def held_at_bounds(update: StepUpdate, mean: Tree) -> Tree:
-    """Return {key: mask of the elements at a bound beyond which the loss falls}, from the mean of earlier gradients.
-
-    Smoothing would spread the gradient of these elements, which cannot move, over their neighbours. The present gradient does not
-    decide, because its noise would then no longer have mean 0. In the first 64 steps gradients may turn faster than their mean.
-    """
-    bounds = update.estimate.get(AtBounds)
-    sides = {} if bounds is None or update.made < _TURNING else bounds.sides()
-    return {key: sides[key] * x < 0.0 for key, x in mean.items() if key in sides}
 
 
 def without(gradient: Tree, held: Tree) -> Tree:

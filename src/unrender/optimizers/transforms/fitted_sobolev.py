@@ -15,7 +15,7 @@ from unrender.core.errors import InputError
 from unrender.core.registry import register
 from unrender.core.text import listed
 from unrender.core.trees import Tree
-from unrender.estimators.capabilities import FreshGradient
+from unrender.estimators.capabilities import AtBounds, FreshGradient
 from unrender.optimizers.transforms.base import (
     GRADIENTS,
     SmoothingChange,
@@ -23,7 +23,6 @@ from unrender.optimizers.transforms.base import (
     StepUpdate,
     TransformState,
     checked_keys,
-    held_at_bounds,
     without,
 )
 from unrender.preconditioners import Sobolev
@@ -323,7 +322,8 @@ class FittedSobolev(StepTransform):
 
     def update(self, update: StepUpdate, state: FittedSobolevState) -> tuple[StepUpdate, FittedSobolevState]:
         """Precondition the gradient. Waits for the device if a strength is fitted."""
-        held = held_at_bounds(update, state.mean)
+        bounds = update.estimate.get(AtBounds)
+        held = {} if bounds is None else bounds.held(state.mean, update.made)
         gradients = {k: (1.0 - _MEMORY) * update.gradient[k] for k in self.preconditioned}
         mean = {k: _MEMORY * state.mean[k] + g if k in state.mean else g for k, g in gradients.items()}
         arrays.evaluate(held, mean)
