@@ -273,6 +273,8 @@ def test_every_derivative_of_an_estimate_has_the_priors_part() -> None:
         ({"near": math.nan, "std": 0.5}, "finite"),
         ({"near": 0.5, "std": 0.0}, "std must be a finite number > 0"),
         ({"palette": [0.1, 0.2, 0.3], "std": 0.1}, "a list of colours of 3 numbers"),
+        ({"near": np.zeros((4, 4, 3)), "std": 0.5}, "one number per channel, got an array of shape (4, 4, 3)"),
+        ({"palette": np.zeros((4, 4, 3)), "std": 0.5}, "a list of colours, got an array of shape"),
         ({"palette": [], "std": 0.1}, "a list of colours of 3 numbers"),
         ({"palette": "red", "std": 0.1}, "finite numbers"),
         ({"smoothness": 0.1}, "need a texture, a volume or vertices"),

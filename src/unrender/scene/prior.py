@@ -18,6 +18,9 @@ from unrender.preconditioners.mesh import MeshTopology
 _CORNER = 0.1
 """Size of a difference, in units of `total_variation`, below which its norm is rounded to have a derivative at 0."""
 
+_ARRAYS = (("near", 1, "a number or one number per channel"), ("palette", 2, "a list of colours"))
+"""(field, largest number of axes of an array, what it is)."""
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -42,7 +45,7 @@ class Prior:
         weight: Factor of all terms, > 0.
 
     Raises:
-        InputError: No term, a term without its `std`, or a number out of range.
+        InputError: No term, a term without its `std`, an array with too many axes, or a number out of range.
     """
 
     near: float | Sequence[float] | str | None = None
@@ -54,6 +57,10 @@ class Prior:
     _unknown: _Unknown | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self):
+        for name, axes, kind in _ARRAYS:  # before an array of an image's size becomes tuples, which takes 0.4 s
+            value = getattr(self, name)
+            if isinstance(value, np.ndarray) and value.ndim > axes:
+                raise InputError(f"prior: {name}: expected {kind}, got an array of shape {value.shape}")
         for name in ("near", "std", "palette", "smoothness", "total_variation", "weight"):
             object.__setattr__(self, name, _frozen(getattr(self, name)))
         for name in ("std", "smoothness", "total_variation", "weight"):
