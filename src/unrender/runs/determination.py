@@ -16,7 +16,7 @@ from unrender.runs.field_directions import TOO_SHORT
 from unrender.runs.image_sensitivity import MAP_AXES, seen_cells, seen_elements, shown_elsewhere
 from unrender.runs.numbers import MOST_ELEMENTS
 from unrender.runs.result import Result
-from unrender.runs.verification import LOST, Misfit, compares, misfit, residuals_of_views
+from unrender.runs.verification import LOST, Misfit, compares, residuals_of_views
 from unrender.scene.bounds import project
 from unrender.scene.problem import Problem
 from unrender.scene.render import power_of_two, render, selected_views
@@ -36,8 +36,9 @@ _UNSEEN = 0.05
 """Fraction of unseen cells of a texture or grid from which a line is returned."""
 _SCALE = "scale"
 """Last part of the keys of factors, such as that of an environment map."""
-_EXPLAINED = 0.2
-"""Share of the square difference from the references that a map without a path gradient must have explained."""
+_EXPLAINED, _TO_EXPLAIN = 0.2, 0.02
+"""Share of the square difference from the references that a map without a path gradient must have explained, and smallest difference
+relative to the picture, with its initial values, of which it must."""
 _ROLES = ("value", "height")
 """Roles of the tested parameters; equal normals or directions are no range."""
 _STEP = 0.1
@@ -162,8 +163,8 @@ def no_better_maps(
 ) -> list[str]:
     """Return a line for each texture or grid with whose initial values the pictures are nearly as close to the references.
 
-    It is for those without a path gradient, of which nothing else tells whether the pictures determine them. Where pictures with the
-    initial values differ from the references by noise only, there is nothing to explain.
+    It is for those without a path gradient, of which nothing else tells whether the pictures determine them. Where the pictures with the
+    initial values agree with the references, there is nothing to explain.
 
     Args:
         keys: keys of textures and grids.
@@ -178,11 +179,9 @@ def no_better_maps(
             residuals_of_views(problem, views, images) for images in ([pictures(state, view) for view in views], ends)
         ]
         first, last = ((x[0::2].mean(axis=0) * x[1::2].mean(axis=0)).sum(axis=1) * weights for x, _, weights, _ in of)
-        noise = math.sqrt(float(np.square(first - last - (first - last).mean()).sum()))
-        residuals, references, weights, sizes = of[0]
-        differs = misfit(residuals[0::2], residuals[1::2], references, weights, sizes, _LEAST)
-        total = 3.0 * float(weights.sum())
-        if differs and not float((first - last).sum()) > max(_ERRORS * noise, _EXPLAINED * total * differs.error**2):
+        left, least = float(first.sum()), _TO_EXPLAIN**2 * 3.0 * float(np.square(of[0][1]).mean(axis=1) @ of[0][2])
+        start, fall = (_ERRORS * math.sqrt(float(np.square(x - x.mean()).sum())) for x in (first, first - last))
+        if left > max(start, least) and not left - float(last.sum()) > max(fall, _EXPLAINED * left):
             lines.append(
                 f"{key}: the final picture is hardly closer to the references than with its initial values: they hardly determine it, or "
                 "it needs more steps, or fewer elements"
