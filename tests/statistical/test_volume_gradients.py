@@ -140,7 +140,7 @@ def test_without_differential_ratio_tracking_black_and_empty_voxels_are_wrong(mo
     """So the test above can fail: collisions alone find no derivative where nothing collides or scatters."""
     monkeypatch.setattr(differential_tracking, "mis_density", lambda segment, t: segment.near * 0)
     renderer = MitsubaRenderer(scene(voxels(), lights="sky"), 2)
-    found = scores(renderer, own(renderer), 16)
+    found = scores(renderer, own(renderer), 64)
     wrong = {name for name, z in found.items() if abs(z) > limit(len(found))}
     assert any("empty" in name for name in wrong), found
     assert any("dense, black" in name for name in wrong), found
