@@ -33,7 +33,7 @@ from unrender.scene.problem import Problem
 
 
 def by_coordinates(estimate: Estimate, problem: Problem, parameters: Tree, free: Tree | None = None) -> Estimate:
-    """Return the estimate with respect to v, where x = φ(u) and u = S v (`problem.coordinates`); itself if it already is.
+    """Return the estimate with respect to v, where x = φ(u) and u = S v (`problem.coordinates`); unchanged if it already is.
 
     J is the diagonal matrix of φ'. Gradients become S J g, variances J² Var (a variance per element cannot be mapped by S). Second
     derivatives are exact, J H J + diag(g φ''), and the loss becomes a function of u. The σ of smoothed derivatives refers to x and is

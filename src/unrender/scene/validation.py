@@ -239,13 +239,17 @@ def texture_coordinates(renderer: Renderer, key: str, size: int) -> np.ndarray |
     return uv if len(uv) == size // 3 else None
 
 
-_GEOMETRY = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+_GEOMETRY = ("positions", "normals", "texcoords")
 
 
 def _check_attributes(remeshing: Any, key: str, known: Mapping[str, ParameterInfo]) -> None:
     """Raise `InputError` if a mesh that will be remeshed has other values at its vertices or faces."""
     parts = [name.rpartition(".") for name in known] if remeshing is not None else []
-    others = [name for owner, _, name in parts if owner == key.rpartition(".")[0] and name not in _GEOMETRY]
+    others = [
+        name
+        for owner, _, name in parts
+        if owner == key.rpartition(".")[0] and name.removeprefix("vertex_") not in _GEOMETRY
+    ]
     if attributes := [name for name in others if name.startswith(("vertex_", "face_"))]:
         raise InputError(
             f"its mesh has {listed(attributes)}, and new triangles would have none; remove them from its file"

@@ -44,8 +44,8 @@ _DARKEST = -1e-4
 _MOST_COLOUR = 0.05
 """Largest difference of a mask's channels, which compression may leave; also the largest relative one of an alpha that is no mask."""
 
-_DIMMEST = 1 / 254
-"""Largest value of a mask that is taken for an integer 1 of 8 bits."""
+_WHITES = 255, 65535
+"""White in 8 and 16 bits. A mask whose largest value is the inverse of one was stored as ones."""
 
 
 @dataclass(frozen=True)
@@ -295,7 +295,7 @@ def _unscaled(source: Any) -> tuple[np.ndarray, list[str]]:
     values, notices = image.values, list[str]()
     if image.alpha is not None and not image.alpha.min() > (1 - _MOST_COLOUR) * image.alpha.max():
         values, notices = image.alpha[..., None], ["is the alpha of the image"]
-    if 0 < values.max() <= _DIMMEST:
+    if any(np.isclose(values.max() * white, 1.0) for white in _WHITES):
         largest = "expected 1 where a pixel counts, which is 255 in 8 bits and 65535 in 16 bits; or booleans"
         raise InputError(f"its largest value is {values.max():.2g}: {largest}")
     return values, notices
