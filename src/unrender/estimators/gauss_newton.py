@@ -46,7 +46,7 @@ _SETTLED = 0.5
 _DRIFT = 0.25
 """Distance, in units of the widths, from which on mean derivative images are of another point."""
 _NARROWER = 0.7
-"""Ratio of a width to the one with which mean derivative images began, from which on they are of too wide differences."""
+"""Ratio of a width to the one with which mean derivative images began, below which they begin anew."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class GaussNewtonState:
 
     @property
     def narrowed(self) -> bool:
-        """Whether the mean derivative images are of too wide differences. They begin anew."""
+        """Whether the widths are much smaller than those of the mean derivative images, which then begin anew."""
         return any(self.widths[key] < _NARROWER * width for key, width in self.differenced.items())
 
     def upsampled(self, upsampler: Upsampler) -> GaussNewtonState:

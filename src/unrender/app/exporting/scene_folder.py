@@ -268,9 +268,8 @@ def _set_up_rendering(graph: SceneGraph, renderer: MitsubaRenderer, max_depth: i
     if renderer.light_paths.hide_emitters:
         integrator["hide_emitters"] = True
     films = {sensor.id(): sensor.film() for sensor in graph.sensors()}
-    formats = dict(
-        zip(films, renderer.formats(), strict=True)
-    )  # of the references, which stages compare with this scene
+    # Of the references, which stages compare with this scene.
+    formats = dict(zip(films, renderer.formats(), strict=True))
     for index in graph.of(mi.ObjectType.Sensor):
         graph.child(index, mi.ObjectType.Sampler, "independent")["sample_count"] = spp
         film = films[f"n{index}"]
