@@ -223,7 +223,8 @@ def test_a_file_has_worlds_and_its_run_resumes(tmp_path: Path) -> None:
     worlds += '[[views]]\nreference = "two.npy"\nscene = "other.xml"\n'
     made = ur.Problem.from_file(files(tmp_path, worlds))
     means = [ur.render(made, view=view, spp=16).mean() for view in range(3)]
-    assert means[1] == pytest.approx(means[0] / 4, rel=1e-4)
+    # Views take random numbers of their own; over seeds their ratio scatters by .17 %.
+    assert means[1] == pytest.approx(means[0] / 4, rel=0.01)
     assert means[2] > 2 * means[0]
     ur.optimize(made, "auto", steps=6, run_directory=tmp_path / "run", progress=False)
     straight = ur.optimize(made, "auto", steps=12, run_directory=tmp_path / "straight", progress=False)

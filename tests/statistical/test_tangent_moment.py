@@ -103,7 +103,7 @@ def test_in_media_it_is_the_squared_product_of_the_paths_own_gradient(name: str)
     session = renderer.prepare(list(values), None)
     rng = np.random.default_rng(0)
     tangents = {key: rng.normal(size=x.shape) * np.array(x) for key, x in values.items()}
-    paths = session.image(values, SampleRequest(0, 1, 7)).paths
+    paths = session.image(values, SampleRequest(0, 1, 8)).paths
     found = np.array(session.tangent_moment(values, paths, {k: renderer.array(x) for k, x in tangents.items()}))
     expected = np.zeros_like(found)
     for place in np.ndindex(found.shape):
