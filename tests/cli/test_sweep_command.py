@@ -147,19 +147,6 @@ def test_a_sweep_from_python_returns_doubtful_and_failed_trials(
         assert ur.app.sweep("quad", "plain", {"spp": [1, 4]}, steps=3, out=tmp_path / "s").plan.steps == 3
 
 
-def test_pruned_runs_are_run_folders_without_pictures(unrender, mitsuba_variant: str) -> None:
-    rates = "learning_rate=0.3,0.2,0.1,0.05,0.003,0.002,0.001,0.0003"
-    answer = unrender(
-        "sweep", *TOY, "--over", rates, "--prune", "--window", 1, "--out", "s", "--variant", mitsuba_variant
-    )
-    assert answer.status == 0
-    found = trials("s")
-    assert [status for _, status, _, _ in found] == ["finished"] * 4 + ["pruned"] * 4
-    assert all(steps < 20 for _, status, _, steps in found if status == "pruned")
-    assert not Path("s/trial-007-seed0/pictures.npz").exists()
-    assert "(pruned at 20%)" in answer.out
-
-
 COMPARED = ["compare", "quad", "--methods", "plain", "--seconds", 1, "--final-spp", 1]
 SWEPT = ["sweep", "quad", "--method", "plain", "--over", "learning_rate=0.03,0.3", "--seconds", 1, "--final-spp", 1]
 

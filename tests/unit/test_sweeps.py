@@ -1,4 +1,4 @@
-"""Searches, their order and pruning, on errors that a formula gives."""
+"""Searches and their order, on errors that a formula gives."""
 
 from __future__ import annotations
 
@@ -11,10 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import unrender as ur
-from tests.analytic import AnalyticRenderer
 from unrender.app.cli.sweep_driver import equally_good, run_command
-from unrender.app.sweeps import trials
 from unrender.app.sweeps.record import (
     RunOutcome,
     SweepPlan,
@@ -122,21 +119,10 @@ def test_a_grid_without_points_or_too_large_is_refused() -> None:
 # ---------------------------------------------------------------------- the order of trials
 
 
-def error_of(settings: dict[str, str], share: float = 1.0) -> float:
-    """Least at a learning rate of 0.03 and 5 samples; falls with the share of the budget."""
+def error_of(settings: dict[str, str]) -> float:
+    """Least at a learning rate of 0.03 and 5 samples."""
     rate, spp = float(settings["learning_rate"]), float(settings.get("spp", 5))
-    return (math.log10(rate / 0.03) ** 2 + 0.1 * math.log(spp / 5) ** 2) + (1 - share)
-
-
-def outcome(started: Started) -> RunOutcome:
-    errors: dict[float, float] = {}
-    status, error = "finished", error_of(started.settings)
-    for share in trials.RUNGS:
-        errors[share] = error_of(started.settings, share)
-        if trials.is_hopeless(errors, started.limits):
-            status, error = "pruned", errors[share]
-            break
-    return run(status=status, error=error, rungs={str(share): value for share, value in errors.items()})
+    return math.log10(rate / 0.03) ** 2 + 0.1 * math.log(spp / 5) ** 2
 
 
 def carry_out(trials: Trials, workers: int, order: random.Random) -> list[tuple]:
@@ -147,7 +133,7 @@ def carry_out(trials: Trials, workers: int, order: random.Random) -> list[tuple]
             running.append(started)
         one = running.pop(order.randrange(len(running)))
         message = "lost" if one.number % 7 == 3 else ""
-        runs = [] if message else [outcome(one)]
+        runs = [] if message else [run(error=error_of(one.settings))]
         trials.end(trial_record(one.number, one.settings, runs, message=message))
     return [(t.settings, t.status, t.error) for _, t in sorted(trials.ended.items())]
 
@@ -165,31 +151,29 @@ def searches(kind: str) -> Search:
 @pytest.mark.parametrize("kind", ["random", "tpe"])
 def test_the_outcome_does_not_depend_on_workers_nor_on_who_is_first(kind: str) -> None:
     found = [
-        carry_out(Trials(searches(kind), prune=True, window=6), workers, random.Random(workers))
+        carry_out(Trials(searches(kind), window=6), workers, random.Random(workers))
         for workers in (1, 2, 3, 6, 20)
     ]
     assert all(one == found[0] for one in found)
     statuses = [status for _, status, _ in found[0]]
-    assert {"finished", "pruned", "failed"} == set(statuses)
+    assert {"finished", "failed"} == set(statuses)
 
 
-def test_that_test_sees_a_trial_that_looks_at_whatever_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    def limits(self: Trials, number: int) -> dict[float, float]:
-        ended = [trial for trial in self.ended.values() if trial.status == "finished"]
-        return trials.medians(
-            {1.0: t.error, **{float(s): e for s, e in t.runs[0].rungs.items()}} for t in ended if t.error
-        )
+def test_that_test_sees_a_search_that_learns_of_whatever_has_ended() -> None:
+    class Eager(Trials):
+        def end(self, record: TrialRecord) -> None:
+            super().end(record)
+            self.search.tell(record.number, record.error)
 
-    monkeypatch.setattr(Trials, "_limits", limits)
-    one, other = (carry_out(Trials(searches("random"), True, 6), n, random.Random(n)) for n in (1, 6))
+    one, other = (carry_out(Eager(searches("tpe"), 1000), n, random.Random(n)) for n in (1, 6))
     assert one != other
 
 
 def test_a_sweep_taken_up_again_has_the_trials_it_would_have_had() -> None:
-    whole = Trials(searches("tpe"), True, 4)
+    whole = Trials(searches("tpe"), 4)
     expected = carry_out(whole, 2, random.Random(0))
     half = {n: t for n, t in whole.ended.items() if n < 9 or n == 10}
-    again = Trials(searches("tpe"), True, 4, ended=half)
+    again = Trials(searches("tpe"), 4, ended=half)
     assert carry_out(again, 3, random.Random(1)) == expected
 
 
@@ -207,37 +191,6 @@ def test_tpe_finds_more_than_random_settings_do() -> None:
     assert best("tpe") < best("random")
 
 
-def test_pruning_keeps_the_best_and_saves_steps() -> None:
-    full = carry_out(Trials(Random(axes("learning_rate=0.0003:3:log"), 64, 2)), 1, random.Random(0))
-    trials = Trials(Random(axes("learning_rate=0.0003:3:log"), 64, 2), prune=True)
-    pruned = carry_out(trials, 1, random.Random(0))
-    assert min(e for _, s, e in pruned if s == "finished") == min(e for _, s, e in full if s == "finished")
-    runs = [run for trial in trials.ended.values() for run in trial.runs]
-    reached = [1.0 if run.status == "finished" else max(map(float, run.rungs)) for run in runs]
-    assert sum(reached) < 0.6 * len(runs)
-
-
-def test_medians_are_of_those_that_came_to_their_end() -> None:
-    assert trials.medians([{0.3: 1.0}] * 3) == {}
-    assert trials.medians([{0.3: e, 1.0: 2 * e} for e in (1, 2, 3, 4)]) == {0.3: 2.5, 1.0: 5.0}
-
-
-@pytest.mark.parametrize(
-    ("errors", "hopeless"),
-    [
-        ({0.1: 9.0}, False),  # a single look tells no pace
-        ({0.1: 9.0, 0.2: 0.9}, False),  # below the median
-        ({0.1: 9.0, 0.2: 8.0}, True),  # 8 (8/9)⁸ = 3.1
-        ({0.1: 9.0, 0.2: 5.0}, False),  # 5 (5/9)⁸ = 0.05
-        ({0.1: 2.0, 0.2: 2.0}, True),
-        ({0.1: 2.0, 0.2: 3.0}, True),
-    ],
-)
-def test_those_that_fall_fast_are_spared(errors: dict[float, float], hopeless: bool) -> None:
-    assert trials.is_hopeless(errors, {0.1: 1.0, 0.2: 1.0, 1.0: 0.1}) is hopeless
-    assert not trials.is_hopeless(errors, {})
-
-
 # ---------------------------------------------------------------------- records
 
 
@@ -251,7 +204,6 @@ def test_a_trial_is_the_mean_over_its_seeds() -> None:
     assert trial.standard_error == pytest.approx(np.std([1, 2, 6], ddof=1) / math.sqrt(3))
     assert trial_record(0, {}, [run(error=1.0), run(error=None)]).status == "failed"
     assert trial_record(0, {}, [run(error=1.0, status="failed")]).status == "failed"
-    assert trial_record(0, {}, [run(error=1.0, status="pruned")]).status == "pruned"
     assert trial_record(0, {"schedule": "cosine(300)"}, []).line == "-s 'schedule=cosine(300)'"
 
 
@@ -273,7 +225,7 @@ def test_a_record_is_read_as_it_was_written_and_a_malformed_one_is_one_line(tmp_
         ({"format": 2}, "format"),
         ({"trials": [{**given["trials"][0], "error": "much"}]}, "trials.0.error"),
         (
-            {"trials": [{**given["trials"][0], "runs": [{"folder": "..", "seed": 0, "status": "pruned"}]}]},
+            {"trials": [{**given["trials"][0], "runs": [{"folder": "..", "seed": 0, "status": "failed"}]}]},
             "folder",
         ),
     ]:
@@ -354,13 +306,3 @@ def test_a_comparison_has_the_exit_status_of_its_worst_run(runs: dict[str, str],
     from unrender.app.cli.compare import status_of
 
     assert status_of([run(status=of, stopped=why) for of, why in runs.items()]) == status
-
-
-def test_an_error_during_a_run_leaves_out_the_lower_bounds_that_the_picture_reaches() -> None:
-    """As the error at the end does: saturated pixels of the references are bounds for this loss."""
-    truth, white = {"x": np.full(1, 0.9)}, 0.5
-    matrix = np.random.default_rng(0).uniform(0.1, 1.0, (192, 1))
-    renderer = AnalyticRenderer(truth, matrix, noise=0.1, shape=(8, 8))
-    reference = np.minimum(renderer.exact(truth), white)
-    problem = ur.Problem(renderer, [ur.Parameter("x")], [ur.View(reference)], ur.losses.Censored(ur.losses.L2(), white))
-    assert trials._picture_error(problem, truth) < 0.01

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 INTERRUPTED, TERMINATED, NON_FINITE = "interrupted", "terminated", "non-finite"
 """Reasons for a run to stop (`Result.stopped`) before its budget is used up: Ctrl-C or a stop command, SIGTERM, and gradients that are
 not finite."""
-PRUNED = "pruned"
-"""Reason for a sweep's run to stop because its error is above that of other runs; such a run is finished."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -40,7 +38,7 @@ class Result:
             first step after each remeshing.
         seconds: seconds of optimisation.
         warmup_seconds: seconds of tracing and compiling kernels before the first step.
-        stopped: "steps", "seconds", "callback" or "pruned" (finished); "interrupted" (Ctrl-C, or a stop command) or "terminated"
+        stopped: "steps", "seconds" or "callback" (finished); "interrupted" (Ctrl-C, or a stop command) or "terminated"
             (SIGTERM); "non-finite" (failed).
         skipped: number of steps that were not applied because the gradient or loss was not finite.
         warnings: one line each.

@@ -28,7 +28,7 @@ from unrender.runs.earlier_image import (
 )
 from unrender.runs.folder.schema import MEMORY_DISAGREES, WORSE
 from unrender.runs.number_means import averaged, normalised
-from unrender.runs.result import INTERRUPTED, PRUNED, TERMINATED, Result
+from unrender.runs.result import INTERRUPTED, TERMINATED, Result
 from unrender.runs.run import Candidate
 from unrender.runs.truth_check import further_from_truth, has_few_steps
 from unrender.runs.verification import (
@@ -116,8 +116,8 @@ class Verify(Callback):
             run.state.candidate, self._candidate = Candidate(run.step, loss, values), (run.step, picture)
 
     def on_result(self, run: Run, result: Result) -> Result:
-        """Verify the result, unless the run was interrupted, terminated or pruned."""
-        if result.stopped in (INTERRUPTED, TERMINATED, PRUNED) or not result.steps:
+        """Verify the result, unless the run was interrupted or terminated."""
+        if result.stopped in (INTERRUPTED, TERMINATED) or not result.steps:
             return result
         started = time.perf_counter()
         with phases.phase(callbacks.VERIFYING):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from unrender.display.terminal import Console, columns
 from unrender.methods import Method
 from unrender.methods.plan import PlanFile
 from unrender.runs import watches
-from unrender.runs.callbacks import RUN_PHASES, Callback
+from unrender.runs.callbacks import RUN_PHASES
 from unrender.runs.final_checks import image_name
 from unrender.runs.folder.reader import root_mean_square
 from unrender.runs.image_sensitivity import seen_cells
@@ -63,11 +63,10 @@ def execution(
     directory: Path,
     console: Console,
     progress: Progress,
-    callbacks: Sequence[Callback] = (),
 ) -> Iterator[dict[str, Any]]:
     """Print the plan, and yield the arguments of `optimize`. The files of the live page are removed if the block succeeds.
 
-    The run writes a run folder, even if it is interrupted. `callbacks` are called in addition to those of the command.
+    The run writes a run folder, even if it is interrupted.
     """
     plan = order.method.plan(problem, order.settings)
     for line in plan.lines:
@@ -77,9 +76,8 @@ def execution(
     settings = {name: value for name, value in settings.items() if value}
     for line in watches.remarks(problem, plan.optimizer):
         console.say(f"note: {line}")
-    earlier = {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}  # earlier runs
     annotations = RunAnnotations(
-        order.method.name, settings, plan.lines, order.command, order.final_spp, earlier, progress.budget_began
+        order.method.name, settings, plan.lines, order.command, order.final_spp, _earlier(progress), progress.budget_began
     )
     live = Live(directory, problem.name, order.method.name, order.command)
     yield {
@@ -88,7 +86,7 @@ def execution(
         "steps": order.steps,
         "seconds": order.seconds,
         "seed": order.seed,
-        "callbacks": [progress, live, *callbacks],
+        "callbacks": [progress, live],
         "run_directory": directory,
         "checkpoint_every": order.checkpoint_every,
         "annotations": annotations,
@@ -96,14 +94,18 @@ def execution(
     live.clear()
 
 
-def resumed(
-    stored: StoredRun, problem: Problem, callbacks: Sequence[Callback], force: bool = False, **times: Any
-) -> Result:
+def resumed(stored: StoredRun, problem: Problem, progress: Progress, force: bool = False) -> Result:
     """Continue a run, and remove the files of its live page at the end. See `resume_run` for the arguments."""
     live = Live(stored.folder, problem.name, stored.record.method, stored.record.command)
-    result = resume_run(stored, problem, force, [*callbacks, live], **times)
+    times = {"earlier": _earlier(progress), "began": progress.budget_began}
+    result = resume_run(stored, problem, force, [progress, live], **times)
     live.clear()
     return result
+
+
+def _earlier(progress: Progress) -> dict[str, float]:
+    """Return the seconds of the phases before the run, such as loading, without those of other runs of the command."""
+    return {name: spent for name, spent in progress.seconds.items() if name not in RUN_PHASES}
 
 
 def image_error(result: Result, which: str = "result") -> str:

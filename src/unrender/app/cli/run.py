@@ -274,6 +274,5 @@ def resume(
         introduce(console, problem, running)
         theirs = variant_again(variant, stored.record)
         with distributed(problem, processes, compress, theirs, threads or alone, console) as shared:
-            times = {"earlier": progress.seconds, "began": progress.budget_began}
-            result = resumed(stored, shared, [progress], force, **times)
+            result = resumed(stored, shared, progress, force)
         conclude(console, problem, result, directory, progress)

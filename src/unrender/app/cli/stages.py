@@ -237,8 +237,7 @@ def _run_stage(
         stored = load_run(folder, *stages_file.split(stages)[index])
         problem = runs.problem_of(folder)
         introduce(console, problem, run.variant)
-        times = {"earlier": progress.seconds, "began": progress.budget_began}
-        return problem, resumed(stored, problem, [progress], **times)
+        return problem, resumed(stored, problem, progress)
     with phases.phase("loading"):
         problem = run.problem.of_stage(stage, values, run.out / _SCENES / folder.name)
     introduce(console, problem, run.variant)

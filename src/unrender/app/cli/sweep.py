@@ -46,15 +46,12 @@ _SearchName = Annotated[
 _Trials = Annotated[
     int | None, typer.Option(min=1, max=arguments.MOST_TRIALS, help="Number of trials of random and tpe. [default: 16]")
 ]
-_Prune = Annotated[
-    bool, typer.Option("--prune", help="Stop runs whose error is, and would end, above the median of earlier trials.")
-]
 _Window = Annotated[
     int | None,
     typer.Option(
         min=1,
         max=arguments.MOST_TRIALS,
-        help="With --prune or tpe: limit of concurrent trials. [default: 4, or two per worker]",
+        help="With tpe: limit of concurrent trials. [default: 4, or two per worker]",
     ),
 ]
 _Steps = Annotated[int | None, typer.Option(help="Steps of each run. [default: 300 without --seconds]")]
@@ -72,7 +69,6 @@ def sweep_command(
     settings: _Settings = None,
     search: _SearchName = None,
     trials: _Trials = None,
-    prune: _Prune = False,
     window: _Window = None,
     steps: _Steps = None,
     seconds: _Seconds = None,
@@ -108,7 +104,7 @@ def sweep_command(
         run_trials(console, Session(Path(what), where, threads), record, _search_of(record.plan)[1])
         return
     values = {
-        "problem": what, "method": method_name, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
+        "problem": what, "method": method_name, "search": search, "trials": trials, "window": window, "steps": steps,
         "seconds": seconds, "seeds": seeds, "seed": seed, "final_spp": final_spp, "variant": variant, "cached": not no_cache,
         "settings": arguments.settings(settings, "--set"),
         "problem_settings": arguments.settings(problem_settings, "--problem-set"),
@@ -127,7 +123,6 @@ def sweep(
     settings: Mapping[str, Any] | None = None,
     search: Literal["grid", "random", "tpe"] | None = None,
     trials: int | None = None,
-    prune: bool = False,
     window: int | None = None,
     steps: int | None = None,
     seconds: float | None = None,
@@ -153,7 +148,7 @@ def sweep(
         over: options to vary: a list of values, or a range as text, LOW:HIGH[:log][:POINTS].
         settings, problem_settings: fixed options of the method and of a gallery problem.
         search, trials: strategy, None for a grid, or random if a range has no points; number of trials, None for 16.
-        prune, window: whether runs are stopped early; limit of concurrent trials if they depend on earlier ones, None for 4 or more.
+        window: limit of concurrent trials of tpe, which depend on earlier ones; None for 4 or more.
         steps, seconds, seeds, seed, final_spp, variant: options of each run, as in `unrender sweep`.
         workers, threads: number of processes, "auto", or an address, None for this process; threads of each.
         insecure: whether to join a cluster that other users can enter.
@@ -167,7 +162,7 @@ def sweep(
         KeyboardInterrupt: completed trials are in `out`; `unrender sweep DIR` continues.
     """
     values: dict[str, Any] = {
-        "problem": str(problem), "method": method, "search": search, "trials": trials, "prune": prune, "window": window, "steps": steps,
+        "problem": str(problem), "method": method, "search": search, "trials": trials, "window": window, "steps": steps,
         "seconds": seconds, "seeds": seeds, "seed": seed, "final_spp": final_spp, "variant": variant, "cached": True,
     }  # fmt: skip
     where = arguments.workers(None if workers is None else str(workers), insecure)

@@ -53,9 +53,7 @@ def line(trial: TrialRecord) -> str:
     what = f"trial {trial.number}: {_settings(trial.settings)}: "
     if trial.status == "failed":
         return f"{what}failed: {trial.message}"
-    share = max((float(share) for share in trial.runs[0].rungs), default=0.0)
-    where = f" (pruned at {share:.0%})" if trial.status == "pruned" else ""
-    where += "".join(f" ({status})" for status in sorted({run.status for run in trial.runs} & DOUBTFUL))
+    where = "".join(f" ({status})" for status in sorted({run.status for run in trial.runs} & DOUBTFUL))
     return f"{what}error {_error(trial)}{where}"
 
 
@@ -63,7 +61,7 @@ def show(console: Console, record: SweepRecord) -> None:
     """Print the outcome: the best trials, the number of trials, and the command for the best one."""
     if record.trials:
         console.print(_table(record.trials, _SHOWN))
-    counts = {status: sum(t.status == status for t in record.trials) for status in ("finished", "pruned", "failed")}
+    counts = {status: sum(t.status == status for t in record.trials) for status in ("finished", "failed")}
     outcome = ", ".join(f"{count} {status}" for status, count in counts.items() if count)
     console.say(f"{outcome or 'no trial has ended'}; {formatting.duration(record.wall_seconds)} in all")
     reasons: dict[str, list[int]] = {}
@@ -116,17 +114,15 @@ def run_command(record: SweepRecord) -> str:
 
 
 def _table(trials: list[TrialRecord], most: int) -> Table:
-    ranks = {"finished": 0, "pruned": 1}
-    known = [(ranks[t.status], t.error, t) for t in trials if t.error is not None and t.status in ranks]
-    ordered = [t for _, _, t in sorted(known, key=lambda entry: (entry[0], entry[1], entry[2].number))]
+    known = [(t.error, t.number, t) for t in trials if t.error is not None and t.status == "finished"]
+    ordered = [t for _, _, t in sorted(known, key=lambda entry: entry[:2])]
     names = list(ordered[0].settings) if ordered else []
     table = columns("trial", *names, "error", "steps", "seconds", "")
     for trial in ordered[:most]:
         steps = "+".join(str(run.steps) for run in trial.runs)
         seconds = f"{sum(run.seconds for run in trial.runs):.1f}"
         values = [Text(visible(trial.settings.get(name, ""))) for name in names]
-        doubts = sorted({run.status for run in trial.runs} & DOUBTFUL)
-        note = "; ".join(doubts) if trial.status == "finished" else trial.status
+        note = "; ".join(sorted({run.status for run in trial.runs} & DOUBTFUL))
         table.add_row(str(trial.number), *values, _error(trial), steps, seconds, note)
     return table
 
@@ -198,9 +194,9 @@ def run_trials(console: Console, session: Session, record: SweepRecord, search: 
         typer.Exit: with the status of an interrupted sweep, or if no trial completed, or a run of the best one is doubtful.
     """
     plan = record.plan
-    trials = Trials(search, plan.prune, plan.window or _WINDOW)
+    trials = Trials(search, plan.window or _WINDOW)
     trials.ended = {
-        t.number: t for t in record.trials if trials.dependent or t.status != "failed"
+        t.number: t for t in record.trials if search.learns or t.status != "failed"
     }  # failed trials are repeated
     state = _State(record, trials, before=record.wall_seconds)
     lock = Lock(session.folder)
@@ -335,7 +331,7 @@ def _ended(session: Session, state: _State, ended: Ended) -> TrialRecord | None:
 
 
 def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
-    """Return the runs of a trial. Only the first one may be pruned."""
+    """Return the runs of a trial."""
     return [
         RunTask(
             run_name(started.number, plan.seed + i),
@@ -345,7 +341,6 @@ def _tasks(plan: SweepPlan, started: Started) -> list[RunTask]:
             plan.seconds,
             plan.seed + i,
             plan.final_spp,
-            (started.limits if i == 0 else {}) if plan.prune else None,
         )
         for i in range(plan.seeds)
     ]

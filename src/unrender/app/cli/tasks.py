@@ -21,20 +21,18 @@ from unrender.app.cli import arguments
 from unrender.app.cli.execute import RunOrder, execution, resumed
 from unrender.app.distributed.cluster import prepare_worker
 from unrender.app.sweeps.record import RunOutcome
-from unrender.app.sweeps.trials import RUNG_FILE, Pruning, initial_errors, read_rungs, stated_error
+from unrender.app.sweeps.trials import initial_errors, stated_error
 from unrender.core.errors import InputError
 from unrender.core.text import visible
 from unrender.display import formatting
 from unrender.display.terminal import Console, Group, Renderable, columns
 from unrender.io import bounded_files, files
 from unrender.methods import method
-from unrender.runs.callbacks import Callback
 from unrender.runs.folder import reader, schema
 from unrender.runs.folder.lock import holder
 from unrender.runs.folder.schema import CHECKPOINTS, ENDED, LIVE, LIVE_STATUS, RECORD, LiveStatus
 from unrender.runs.optimize import optimize
 from unrender.runs.progress import Progress
-from unrender.runs.result import PRUNED
 from unrender.runs.resume import load_run
 from unrender.scene.problem import Problem
 
@@ -72,7 +70,6 @@ class RunTask:
     Attributes:
         method, settings: as typed.
         steps, seconds, seed, final_spp: see `RunOrder`.
-        limits: see `Pruning`; None for a run whose intermediate errors are not evaluated.
     """
 
     name: str
@@ -82,7 +79,6 @@ class RunTask:
     seconds: float | None
     seed: int
     final_spp: int | None
-    limits: Mapping[float, float] | None = None
 
 
 @contextlib.contextmanager
@@ -96,24 +92,20 @@ def open_job(job: Job) -> Iterator[None]:
         mark.unlink(missing_ok=True)
 
 
-def carry_out(
-    job: Job, task: RunTask, problem: Problem, console: Console, progress: Progress, callbacks: Sequence[Callback] = ()
-) -> RunOutcome:
+def carry_out(job: Job, task: RunTask, problem: Problem, console: Console, progress: Progress) -> RunOutcome:
     """Run a task, or continue its earlier attempt, and return its outcome. Raise `InputError` as `optimize` and `resume_run` do."""
     folder = Path(job.folder, task.name)
     _wait_until_free(folder)
     record = reader.read_run_record(folder) if (folder / RECORD).is_file() else None
     started = progress.budget_began = time.perf_counter()
     if record is None or record.status not in ENDED:
-        looking = [] if task.limits is None else [Pruning(folder, task.limits)]
-        listeners = [progress, *looking, *callbacks]
-        if record is None or record.steps == 0 or not _resumed(folder, problem, listeners):
+        if record is None or record.steps == 0 or not _resumed(folder, problem, progress):
             chosen = method(task.method)
             order = RunOrder(
                 chosen, task.settings, task.steps, task.seconds, task.seed, task.final_spp, job.command,
                 job.problem_settings,
             )  # fmt: skip
-            with execution(problem, order, folder, console, progress, listeners[1:]) as arguments_of_run:
+            with execution(problem, order, folder, console, progress) as arguments_of_run:
                 optimize(**arguments_of_run)
         return outcome(folder, task, initial_errors(problem), time.perf_counter() - started)
     return outcome(folder, task, initial_errors(problem), 0.0)
@@ -123,25 +115,17 @@ def outcome(folder: Path, task: RunTask, start: Mapping[str, float], wall_second
     """Return the outcome of a run from its folder; `start`: see `stated_error`. Raise `InputError`."""
     run = reader.read(folder)
     record = run.record
-    rungs = read_rungs(folder / RUNG_FILE)
-    error: float | None
-    standard_error: float | None
-    status = "pruned" if record.stopped == PRUNED else record.status
-    if status == "pruned" and rungs:
-        error, standard_error = rungs[max(rungs)], None
-    else:
-        try:
-            error, standard_error = stated_error(run, start)
-        except InputError:
-            error = standard_error = None
+    try:
+        error, standard_error = stated_error(run, start)
+    except InputError:
+        error = standard_error = None
     return RunOutcome(
         folder=task.name,
         seed=task.seed,
-        status="failed" if status == "running" else status,
+        status="failed" if record.status == "running" else record.status,
         stopped=record.stopped,
         error=_finite(error),
         standard_error=_finite(standard_error),
-        rungs={str(share): value for share, value in rungs.items()},
         steps=record.steps,
         samples=int(run.history.samples[-1]) if len(run.history) else 0,
         seconds=record.seconds,
@@ -199,10 +183,10 @@ def _problem(name: str, options: tuple[tuple[str, str], ...], cached: bool) -> P
 # ---------------------------------------------------------------------- parts
 
 
-def _resumed(folder: Path, problem: Problem, callbacks: Sequence[Callback]) -> bool:
+def _resumed(folder: Path, problem: Problem, progress: Progress) -> bool:
     """Resume the run from its last checkpoint if possible; return whether this succeeded."""
     try:
-        resumed(load_run(folder), problem, callbacks, began=time.perf_counter())
+        resumed(load_run(folder), problem, progress)
     except InputError:
         return False
     return True

@@ -75,7 +75,6 @@ STOP_REASONS = {
     "seconds": "stopped when time was up",
     "interrupted": "interrupted: this is the state at the interruption",
     "terminated": "terminated: this is the state at the termination",
-    "pruned": "pruned: its error was above the median of the sweep's trials",
     "callback": "stopped by a callback",
     "non-finite": "failed: gradients were not finite, and the run was stopped; these are the last finite values",
 }

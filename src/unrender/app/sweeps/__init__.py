@@ -1,1 +1,1 @@
-"""Sweeps over the options of a method: the search, the early stopping of runs, and the record of the results."""
+"""Sweeps over the options of a method: the search, the order of the trials, and the record of the results."""

@@ -29,8 +29,7 @@ class SweepPlan(BaseModel):
         trials: number of trials; None for all points of a grid.
         seed, seeds: seed of the first run of each trial and of the search; number of runs of a trial, with consecutive seeds.
         steps, seconds: the budget of each run.
-        prune: whether runs with an error above the median are stopped early.
-        window: the window of a sweep whose trials depend on earlier ones, see `Trials`; None before it is chosen.
+        window: the window of a search that learns, see `Trials`; None before it is chosen.
         final_spp, variant: see `unrender run`.
         cached: whether references may come from the cache.
     """
@@ -48,7 +47,6 @@ class SweepPlan(BaseModel):
     seeds: Annotated[StrictInt, Field(ge=1, le=10_000)] = 1
     steps: _Positive | None = None
     seconds: Annotated[FiniteFloat, Field(gt=0)] | None = None
-    prune: StrictBool = False
     window: _Positive | None = None
     final_spp: _Positive | None = None
     variant: _Text = "auto"
@@ -61,10 +59,9 @@ class RunOutcome(BaseModel):
     Attributes:
         folder: its run folder, within the folder of the sweep.
         seed: seed of its random numbers.
-        status: "pruned", or the status in the run folder at the end of the run.
+        status: the status in the run folder at the end of the run.
         stopped: see `Result.stopped`.
         error, standard_error: see `trials.stated_error`; None if unknown.
-        rungs: {fraction of the budget: error} during the run.
         steps, samples, seconds: its work; the seconds are those of the optimisation.
         wall_seconds: duration including compilation and pictures; 0 for a run that existed before the session.
         message: the error message; "" for none.
@@ -74,13 +71,10 @@ class RunOutcome(BaseModel):
 
     folder: _Name
     seed: _Count
-    status: Literal[
-        "finished", "worse than start", "memory disagrees", "does not fit", "pruned", "failed", "interrupted"
-    ]
+    status: Literal["finished", "worse than start", "memory disagrees", "does not fit", "failed", "interrupted"]
     stopped: StrictStr = ""
     error: FiniteFloat | None = None
     standard_error: FiniteFloat | None = None
-    rungs: dict[StrictStr, FiniteFloat] = {}
     steps: _Count = 0
     samples: _Count = 0
     seconds: FiniteFloat = 0.0
@@ -94,10 +88,10 @@ class TrialRecord(BaseModel):
     Attributes:
         number: index of the trial, from 0.
         settings: values of the axes.
-        status: "finished", "pruned" or "failed".
+        status: "finished" or "failed".
         error: mean over its runs; None for a failed trial.
         standard_error: standard error of the mean, from the spread over runs, or that of a single run; None if unknown.
-        runs: its runs, in order of their seeds; fewer than planned in a pruned or failed trial.
+        runs: its runs, in order of their seeds; fewer than planned in a failed trial.
         attempts: number of attempts: more than one if workers died.
         message: the error message; "" for none.
     """
@@ -106,7 +100,7 @@ class TrialRecord(BaseModel):
 
     number: _Count
     settings: dict[_Text, _Text]
-    status: Literal["finished", "pruned", "failed"]
+    status: Literal["finished", "failed"]
     error: FiniteFloat | None = None
     standard_error: FiniteFloat | None = None
     runs: list[RunOutcome] = []

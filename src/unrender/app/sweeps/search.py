@@ -188,21 +188,6 @@ def _is_integer(name: str, method: Method) -> bool:
 _MOST_TRIALS = 100_000
 
 
-@dataclass(frozen=True)
-class TrialOutcome:
-    """The outcome of a trial.
-
-    Attributes:
-        status: "finished", "pruned" or "failed".
-        error: the error to minimise; None for a failed trial.
-        rungs: {fraction of the budget: error} during the trial.
-    """
-
-    status: str
-    error: float | None
-    rungs: dict[float, float]
-
-
 class Search(Protocol):
     """A search that proposes settings by number. `ask` and `tell` are called in ascending order of the numbers, once for each."""
 
@@ -220,8 +205,8 @@ class Search(Protocol):
         """Return {option: value as text} of a trial."""
         ...
 
-    def tell(self, number: int, outcome: TrialOutcome) -> None:
-        """Report the outcome of a trial that `ask` proposed."""
+    def tell(self, number: int, error: float | None) -> None:
+        """Report the error to minimise of a trial that `ask` proposed; None for a failed one."""
         ...
 
 
@@ -252,7 +237,7 @@ class Grid:
             values[axis.name] = points[index]
         return {axis.name: values[axis.name] for axis in self.axes}
 
-    def tell(self, number: int, outcome: TrialOutcome) -> None:
+    def tell(self, number: int, error: float | None) -> None:
         """Do nothing: the settings do not depend on outcomes."""
 
 
@@ -270,7 +255,7 @@ class Random:
         key = Key(self.seed, number)
         return {axis.name: axis.at(key.fold(i).uint32() / 2**32) for i, axis in enumerate(self.axes)}
 
-    def tell(self, number: int, outcome: TrialOutcome) -> None:
+    def tell(self, number: int, error: float | None) -> None:
         """Do nothing: the settings do not depend on outcomes."""
 
 
@@ -312,19 +297,10 @@ class TPE:
         proposed = [(axis, trial.params[axis.name]) for axis in self.axes]
         return {axis.name: value if axis.choices else axis.typed(value) for axis, value in proposed}
 
-    def tell(self, number: int, outcome: TrialOutcome) -> None:
+    def tell(self, number: int, error: float | None) -> None:
         from optuna.trial import TrialState
 
-        trial = self._asked.pop(number)
-        if outcome.error is None:
-            self._study.tell(trial, state=TrialState.FAIL)
-            return
-        if outcome.status == "finished":
-            self._study.tell(trial, outcome.error)
-            return
-        for share, error in outcome.rungs.items():
-            trial.report(error, round(1000 * share))
-        self._study.tell(trial, state=TrialState.PRUNED)
+        self._study.tell(self._asked.pop(number), error, TrialState.FAIL if error is None else TrialState.COMPLETE)
 
 
 def _distributions(axes: Sequence[Axis]) -> dict[str, Any]:

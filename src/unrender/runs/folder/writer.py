@@ -51,7 +51,7 @@ from unrender.runs.folder.schema import (
     TRUTH,
 )
 from unrender.runs.folder.state import not_finite, pack
-from unrender.runs.result import PRUNED, TERMINATED, Result
+from unrender.runs.result import TERMINATED, Result
 from unrender.runs.truth_check import has_few_steps
 from unrender.runs.verification import fit_status
 from unrender.scene import serialization
@@ -175,10 +175,10 @@ class RunWriter(Callback):
     def on_result(self, run: Run, result: Result) -> Result:
         """Write the last checkpoint and the result, render the final images, and write the result with them.
 
-        A terminated run has no final images, because its caller waits for seconds only, nor does a pruned one.
+        A terminated run has no final images, because its caller waits for seconds only.
         """
         self.write_checkpoint(run, result)
-        if result.stopped not in (TERMINATED, PRUNED):
+        if result.stopped != TERMINATED:
             if result.status not in ENDED or self._written_step != result.steps:
                 # Save the long computation and its outcome before the final images take more time.
                 self._save(result, "running" if result.status in ENDED else result.status)
